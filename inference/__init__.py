@@ -1,0 +1,1 @@
+"""What is learned or measured. Import the leaf modules."""

@@ -1,0 +1,1 @@
+"""Generative models of scenes, one domain a file. Import the leaf modules."""

@@ -1,0 +1,191 @@
+"""Drawing primitives: what a scene model builds and a renderer reads.
+
+Coordinates are pixels with the origin in the upper left corner of the canvas, x to the right, y down; the centre of the
+pixel in row i and column j is (j + 0.5, i + 0.5). Axis letters: N scenes, M nodes.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from probscene.errors import ModelError
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """An immutable set of sprites.
+
+    Args:
+        sprites: uint8 arrays ``(h, w, 4)``, RGBA with straight alpha; sizes may differ.
+
+    Raises:
+        ModelError: no sprite, or one of another shape or type.
+    """
+
+    sprites: tuple[np.ndarray, ...]
+
+    def __post_init__(self):
+        if not self.sprites:
+            raise ModelError("Expected at least one sprite in an Atlas, actual none.")
+        frozen = []
+        for i, sprite in enumerate(self.sprites):
+            if sprite.ndim != 3 or sprite.shape[2] != 4 or sprite.dtype != np.uint8 or sprite.size == 0:
+                raise ModelError(
+                    f"Expected sprite {i} as uint8 (h, w, 4) RGBA, actual {sprite.dtype} {sprite.shape}; "
+                    "add an alpha channel and convert it to uint8."
+                )
+            copy = np.ascontiguousarray(sprite).copy()
+            copy.flags.writeable = False
+            frozen.append(copy)
+        object.__setattr__(self, "sprites", tuple(frozen))
+
+    def __len__(self) -> int:
+        return len(self.sprites)
+
+
+def disc(size: int = 64) -> np.ndarray:
+    """A white anti-aliased disc that touches its border, ``(size, size, 4)`` uint8."""
+    axis = np.arange(size) + 0.5 - size / 2
+    distance = np.hypot(axis[:, None], axis[None, :])
+    sprite = np.full((size, size, 4), 255, np.uint8)
+    sprite[..., 3] = np.rint(255 * np.clip(size / 2 - distance, 0, 1))
+    return sprite
+
+
+def box(size: int = 8) -> np.ndarray:
+    """A white opaque square, ``(size, size, 4)`` uint8."""
+    return np.full((size, size, 4), 255, np.uint8)
+
+
+_DISC, _BOX = Atlas((disc(),)), Atlas((box(),))
+
+
+@dataclass(frozen=True, eq=False)
+class Sprites:
+    """One sprite for every node of the named kinds.
+
+    All tensors broadcast to ``(N, M)``; entries at nodes of other kinds are ignored.
+
+    Args:
+        kinds: the kinds of node that this layer draws, a name or several.
+        atlas: where the sprites are.
+        sprite: index into the atlas.
+        x, y: centre of the sprite, pixels.
+        angle: radians, anticlockwise as seen on the screen.
+        scale: canvas pixels per sprite pixel; ``scale_y`` differs from it where given.
+        tint: RGB in 0..1 that multiplies the sprite's colour, ``(3,)`` or ``(N, M, 3)``.
+        labelled: whether nodes get an instance id; decoration that only covers others says False.
+    """
+
+    kinds: str | tuple[str, ...]
+    atlas: Atlas
+    sprite: Tensor | int
+    x: Tensor
+    y: Tensor
+    angle: Tensor | float = 0.0
+    scale: Tensor | float = 1.0
+    scale_y: Tensor | float | None = None
+    tint: Tensor | tuple[float, float, float] = (1.0, 1.0, 1.0)
+    labelled: bool = True
+
+    @staticmethod
+    def disc(kinds, x, y, radius, tint=(1.0, 1.0, 1.0), labelled: bool = True) -> "Sprites":
+        """Discs of ``radius`` pixels."""
+        return Sprites(kinds, _DISC, 0, x, y, scale=radius * 2 / 64, tint=tint, labelled=labelled)
+
+    @staticmethod
+    def box(kinds, x, y, width, height, angle=0.0, tint=(1.0, 1.0, 1.0), labelled: bool = True) -> "Sprites":
+        """Rectangles of ``width`` by ``height`` pixels, turned by ``angle``."""
+        return Sprites(kinds, _BOX, 0, x, y, angle, width / 8, height / 8, tint, labelled)
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """``Sprites`` resolved on a batch of scenes: every tensor has its full shape.
+
+    ``present (N, M)`` bool; ``sprite (N, M)`` int64; ``x, y, angle, scale_x, scale_y (N, M)`` float32; ``tint (N, M, 3)``.
+    """
+
+    atlas: Atlas
+    present: Tensor
+    sprite: Tensor
+    x: Tensor
+    y: Tensor
+    angle: Tensor
+    scale_x: Tensor
+    scale_y: Tensor
+    tint: Tensor
+    labelled: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A batch of scenes, ready to be rendered: layers from the back to the front, nodes in order within a layer.
+
+    Args:
+        kind: ``(N, M)`` int64, index into ``kinds``; -1 pads.
+        kinds: the grammar's object names.
+        layers: what to draw, in painter's order.
+        background: RGB in 0..1.
+    """
+
+    kind: Tensor
+    kinds: tuple[str, ...]
+    layers: tuple[Layer, ...]
+    background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
+
+    def __len__(self) -> int:
+        return self.kind.shape[0]
+
+    def __getitem__(self, scenes: slice) -> "Drawing":
+        """The same drawing of some of the scenes."""
+        layers = tuple(
+            replace(layer, **{k: v[scenes] for k, v in vars(layer).items() if isinstance(v, Tensor)})
+            for layer in self.layers
+        )
+        return replace(self, kind=self.kind[scenes], layers=layers)
+
+
+def resolve(sprites: Sprites, present: Tensor) -> Layer:
+    """Broadcast a ``Sprites`` to ``present (N, M)`` and check what a renderer relies on.
+
+    Raises:
+        ModelError: a tensor that does not broadcast, a sprite index outside the atlas, or a value that is not finite.
+    """
+    shape = present.shape
+
+    def full(name, value, dtype=torch.float32, tail=()):
+        value = torch.as_tensor(value, dtype=dtype).detach()
+        try:
+            value = value.expand(*shape, *tail)
+        except RuntimeError:
+            raise ModelError(
+                f"Expected Sprites({sprites.kinds!r}).{name} to broadcast to (scenes, nodes) = {tuple(shape)}, "
+                f"actual shape {tuple(value.shape)}."
+            ) from None
+        if value.is_floating_point() and not torch.isfinite(value[present]).all():
+            raise ModelError(f"Expected finite values in Sprites({sprites.kinds!r}).{name}, actual NaN or infinity.")
+        return value.contiguous()
+
+    index = full("sprite", sprites.sprite, torch.int64)
+    chosen = index[present]
+    if chosen.numel() and not (0 <= int(chosen.min()) and int(chosen.max()) < len(sprites.atlas)):
+        raise ModelError(
+            f"Expected sprite indices of {sprites.kinds!r} in 0..{len(sprites.atlas) - 1}, "
+            f"actual {int(chosen.min())}..{int(chosen.max())}."
+        )
+    scale_y = sprites.scale if sprites.scale_y is None else sprites.scale_y
+    return Layer(
+        atlas=sprites.atlas,
+        present=present,
+        sprite=index,
+        x=full("x", sprites.x),
+        y=full("y", sprites.y),
+        angle=full("angle", sprites.angle),
+        scale_x=full("scale", sprites.scale),
+        scale_y=full("scale_y", scale_y),
+        tint=full("tint", sprites.tint, tail=(3,)),
+        labelled=sprites.labelled,
+    )

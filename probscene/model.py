@@ -1,0 +1,55 @@
+"""What a domain file exports: a ``SceneModel``."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from probscene.drawing import Drawing
+from probscene.errors import ModelError
+from probscene.grammar import Grammar
+from probscene.policy import Policy
+
+
+@dataclass(frozen=True, eq=False)
+class SceneModel:
+    """A generative model of one domain.
+
+    Args:
+        name: how the command line and the run folder call it.
+        grammar: its structures.
+        prior: a policy over derivations, the structure prior.
+        program: ``program(num_scenes, structure)``, a Pyro program that derives structures under the policy
+            ``structure``, samples parameters on the nodes and returns what to draw.
+        canvas: height and width of the image, pixels.
+        max_steps: T_max; a longer derivation is redrawn.
+        classes: the kinds that are labelled and counted, in the order of the categories.
+        channels: 1 if colour carries nothing (images are then read as grey), else 3.
+        target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
+
+    Raises:
+        ModelError: a class that the grammar has no object of, a canvas or ``max_steps`` that is not positive.
+    """
+
+    name: str
+    grammar: Grammar
+    prior: Policy
+    program: Callable[..., Drawing]
+    canvas: tuple[int, int]
+    max_steps: int
+    classes: tuple[str, ...]
+    channels: int = 3
+    target: Callable[[int], "SceneModel"] | None = None
+
+    def __post_init__(self):
+        unknown = [c for c in self.classes if c not in self.grammar.kinds]
+        if unknown or not self.classes:
+            raise ModelError(
+                f"Expected the classes of model {self.name!r} among the grammar's objects {list(self.grammar.kinds)}, "
+                f"actual {unknown or 'none'}."
+            )
+        if min(self.canvas) < 1 or self.max_steps < 1:
+            raise ModelError(
+                f"Expected a positive canvas and max_steps in model {self.name!r}, "
+                f"actual canvas {self.canvas} and max_steps {self.max_steps}."
+            )
+        if self.channels not in (1, 3):
+            raise ModelError(f"Expected channels 1 or 3 in model {self.name!r}, actual {self.channels}.")

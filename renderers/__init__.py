@@ -1,0 +1,1 @@
+"""Scenes to labelled pixels. Import the leaf modules."""
