@@ -1,0 +1,205 @@
+"""``derive``, the one Pyro program behind prior, PCFG and guide: leftmost derivations of many scenes at once.
+
+A tensor holds a last-in-first-out stack of nonterminals for every scene (Meta-Sim2, section 3.2); each step pops one,
+samples a rule at the site ``rule_t`` from the masked Categorical and pushes what the rule produces. There is no Python
+loop over scenes. Axis letters: N scenes, T steps, M nodes, K rules, R nonterminals and J objects of one rule.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from probscene.errors import GrammarError, SamplingError
+from probscene.grammar import Grammar
+from probscene.policy import Frontier, Policy, masked
+
+
+@dataclass(frozen=True, eq=False)
+class Derivation:
+    """A batch of derivations.
+
+    Attributes:
+        rules: ``(N, T)`` int64, -1 pads.
+        complete: ``(N,)`` bool, whether no nonterminal is left.
+        kind: ``(N, M)`` int64 the scene graph's objects in the order they were derived, -1 pads; M >= 1.
+        parent: ``(N, M)`` int64 index of the parent node, -1 for none; a parent comes before its children.
+        frontier: three ``(N, T)`` tensors, what each step expanded.
+    """
+
+    rules: Tensor
+    complete: Tensor
+    kind: Tensor
+    parent: Tensor
+    frontier: Frontier
+
+    @staticmethod
+    def of(grammar: Grammar, rules: Tensor) -> "Derivation":
+        """The derivations that given rules ``(N, T)`` spell; -1 pads.
+
+        Raises:
+            GrammarError: a rule that does not expand the nonterminal on top of the stack, or rules after the end.
+        """
+        given = rules.long()
+
+        def choose(t, frontier, previous):
+            rule = given[:, t]
+            wrong = ~grammar.legal[frontier.symbol, rule.clamp(min=0)] & (rule >= 0)
+            wrong |= (frontier.symbol == len(grammar.nonterminals)) & (rule >= 0)
+            if wrong.any():
+                i = int(wrong.nonzero()[0])
+                names = (*grammar.nonterminals, "the end of the derivation")
+                raise GrammarError(
+                    f"Expected a rule of {names[int(frontier.symbol[i])]} at step {t} of scene {i}, "
+                    f"actual {int(rule[i])} ({grammar.rules[int(rule[i])]})."
+                )
+            return rule
+
+        return _expand(grammar, choose, len(given), given.shape[1])
+
+    def __len__(self) -> int:
+        return self.rules.shape[0]
+
+    def __getitem__(self, scenes: Tensor | slice) -> "Derivation":
+        """The derivations of some of the scenes."""
+        frontier = Frontier(*(x[scenes] for x in self.frontier))
+        return Derivation(self.rules[scenes], self.complete[scenes], self.kind[scenes], self.parent[scenes], frontier)
+
+    @property
+    def previous_rules(self) -> Tensor:
+        """``(N, T)`` the rule before each step, -1 before the first and after the end."""
+        return torch.cat([torch.full_like(self.rules[:, :1], -1), self.rules[:, :-1]], 1)
+
+    @property
+    def lengths(self) -> Tensor:
+        """``(N,)`` number of rules."""
+        return (self.rules >= 0).sum(1)
+
+    def sites(self) -> dict[str, Tensor]:
+        """The values of the sites ``rule_t``, each ``(N, 1)``, for ``poutine.condition``."""
+        return {f"rule_{t}": self.rules[:, t : t + 1].clamp(min=0) for t in range(self.rules.shape[1])}
+
+    def counts(self, num_kinds: int) -> Tensor:
+        """``(N, num_kinds)`` int64, how many nodes of each kind."""
+        padded = torch.zeros(len(self), num_kinds + 1, dtype=torch.int64)
+        padded.scatter_add_(1, self.kind.where(self.kind >= 0, num_kinds), torch.ones_like(self.kind))
+        return padded[:, :num_kinds]
+
+
+def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) -> Derivation:
+    """Sample derivations: a Pyro program with sites ``rule_0``, ``rule_1``, ... of shape ``(N, 1)``.
+
+    Call it inside ``pyro.plate("scenes", num_scenes, dim=-2)``. It stops when every scene is complete, at the latest
+    after ``max_steps``; what is not complete by then says so in ``Derivation.complete`` and is for the caller to redraw.
+
+    Args:
+        policy: the structure prior, a PCFG, or a guide.
+    """
+    memory = policy.start(num_scenes)
+
+    def choose(t, frontier, previous):
+        nonlocal memory
+        logits, memory = policy.step(memory, frontier, previous)
+        active = frontier.symbol < len(grammar.nonterminals)
+        rule = dist.Categorical(logits=masked(grammar, logits, frontier.symbol).unsqueeze(-2), validate_args=False)
+        value = pyro.sample(f"rule_{t}", rule.mask(active.unsqueeze(-1))).squeeze(-1)
+        return value.where(active, -1)
+
+    return _expand(grammar, choose, num_scenes, max_steps)
+
+
+def derive_complete(
+    grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int, attempts: int = 100
+) -> tuple[Derivation, Tensor]:
+    """Derivations that are all complete: what is longer than ``max_steps`` is redrawn (section 3.3). No Pyro sites.
+
+    Returns:
+        The derivations, and the failed attempts of each scene ``(N,)`` int64.
+
+    Raises:
+        SamplingError: some scene failed ``attempts`` times.
+    """
+    rules = torch.full((num_scenes, max_steps), -1)
+    failures = torch.zeros(num_scenes, dtype=torch.int64)
+    todo = torch.arange(num_scenes)
+    with torch.no_grad(), pyro.poutine.block():
+        for _ in range(attempts):
+            if not len(todo):
+                break
+            drawn = derive(grammar, policy, len(todo), max_steps)
+            done = todo[drawn.complete]
+            rules[done] = -1
+            rules[done, : drawn.rules.shape[1]] = drawn.rules[drawn.complete]
+            todo = todo[~drawn.complete]
+            failures[todo] += 1
+    if len(todo):
+        raise SamplingError(
+            f"Expected every scene to end within max_steps = {max_steps}, actual {len(todo)} of {num_scenes} scenes "
+            f"still open after {attempts} attempts; raise max_steps or make the lists shorter."
+        )
+    longest = int((rules >= 0).sum(1).max()) if num_scenes else 0
+    return Derivation.of(grammar, rules[:, : max(1, longest)]), failures
+
+
+def _expand(grammar: Grammar, choose: Callable[..., Tensor], N: int, max_steps: int) -> Derivation:
+    """Run the stack machine; ``choose(t, frontier, previous_rule)`` gives the rules ``(N,)``, -1 where finished."""
+    V, R = len(grammar.nonterminals), grammar.children.shape[1]
+    finished = torch.tensor([V, 0, 0, -1])
+    # A stack entry is (symbol, repeat, parent_repeat, owner node); entry 0 is the finished scene and is never popped.
+    stack = finished.repeat(N, 2 + (max_steps + 1) * max(1, R - 1) + R, 1)
+    stack[:, 1] = torch.tensor([0, 0, 0, -1])
+    top = torch.ones(N, dtype=torch.int64)
+    previous = torch.full((N,), -1)
+    nodes = torch.zeros(N, dtype=torch.int64)
+    slots = torch.arange(R)
+    history = []
+    for t in range(max_steps):
+        entry = stack.gather(1, top.view(N, 1, 1).expand(N, 1, 4)).squeeze(1)
+        symbol, repeat, parent_repeat, owner = entry.unbind(1)
+        if not (symbol < V).any():
+            break
+        rule = choose(t, Frontier(symbol, repeat, parent_repeat), previous)
+        k = rule.clamp(min=0)
+        active = rule >= 0
+        history.append((rule, nodes, owner, symbol, repeat, parent_repeat))
+        child, below = grammar.children[k], grammar.child_owner[k]  # (N, R)
+        same = child == symbol.unsqueeze(1)
+        around = repeat.where(grammar.recursive[symbol], parent_repeat).unsqueeze(1)
+        pushed = torch.stack(
+            [
+                child,
+                (repeat.unsqueeze(1) + 1) * same,
+                parent_repeat.unsqueeze(1).where(same, around),
+                owner.unsqueeze(1).where(below < 0, nodes.unsqueeze(1) + below),
+            ],
+            -1,
+        )
+        # Writing the padding too is harmless: what lies above the new top is overwritten before it is popped.
+        at = (top.unsqueeze(1) + slots).where(active.unsqueeze(1), stack.shape[1] - R + slots)
+        stack = stack.scatter(1, at.unsqueeze(-1).expand(N, R, 4), pushed)
+        top = top + (grammar.num_children[k] - 1) * active
+        nodes = nodes + grammar.num_objects[k] * active
+        previous = rule
+    if not history:
+        history.append((torch.full((N,), -1), nodes, nodes, torch.full((N,), V), nodes, nodes))
+    rules, base, owner, symbol, repeat, parent_repeat = (torch.stack(x, 1) for x in zip(*history, strict=True))
+    kind, parent = _scene_graph(grammar, rules, base, owner, nodes)
+    return Derivation(rules, top == 0, kind, parent, Frontier(symbol, repeat, parent_repeat))
+
+
+def _scene_graph(grammar: Grammar, rules: Tensor, base: Tensor, owner: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    """``kind`` and ``parent``, ``(N, M)``, from the rules, the node count before each step and what each step hangs
+    below."""
+    N, T = rules.shape
+    M = max(1, int(nodes.max())) if N else 1
+    k = rules.clamp(min=0)
+    objects, below = grammar.objects[k], grammar.object_owner[k]  # (N, T, J)
+    exists = (objects >= 0) & (rules >= 0).unsqueeze(-1)
+    parents = (base.unsqueeze(-1) + below).where(below >= 0, owner.unsqueeze(-1))
+    at = (base.unsqueeze(-1) + torch.arange(objects.shape[-1])).where(exists, M).flatten(1)
+    kind = torch.full((N, M + 1), -1).scatter(1, at, objects.flatten(1))
+    parent = torch.full((N, M + 1), -1).scatter(1, at, parents.flatten(1))
+    return kind[:, :M].contiguous(), parent[:, :M].contiguous()

@@ -1,0 +1,75 @@
+"""Policies: who decides which rule comes next. The prior's table, a PCFG and the LSTM guide are all policies.
+
+Axis letters: N scenes, T steps, K rules, V nonterminals.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from probscene.grammar import Grammar
+
+if TYPE_CHECKING:
+    from probscene.derivation import Derivation
+
+MASKED = -1e9  # finite, so that a masked logit has no gradient that is NaN
+
+
+class Frontier(NamedTuple):
+    """What is about to be expanded, one nonterminal a scene.
+
+    Attributes:
+        symbol: ``(N,)`` int64 nonterminal; V where the scene is finished.
+        repeat: ``(N,)`` how often this list has repeated: a child with its parent's nonterminal counts one more, any
+            other child starts at 0.
+        parent_repeat: ``(N,)`` the ``repeat`` of the nearest list around it.
+    """
+
+    symbol: Tensor
+    repeat: Tensor
+    parent_repeat: Tensor
+
+
+class Policy:
+    """A distribution over derivations: logits over all K rules at every step; ``derive`` masks the illegal ones.
+
+    Subclasses give ``start`` and ``step``, and may give a faster ``logits``.
+    """
+
+    grammar: Grammar
+
+    def start(self, num_scenes: int) -> Any:
+        """The memory before the first step."""
+        return None
+
+    def step(self, memory: Any, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, Any]:
+        """Logits ``(N, K)`` and the next memory; ``previous_rule (N,)`` is -1 before the first step."""
+        raise TypeError(f"Expected a policy with a 'step' method, actual {type(self).__name__}.")
+
+    def logits(self, derivation: "Derivation") -> Tensor:
+        """Logits ``(N, T, K)`` at every step of given derivations, unmasked."""
+        memory = self.start(len(derivation))
+        out = []
+        for t in range(derivation.rules.shape[1]):
+            frontier = Frontier(*(x[:, t] for x in derivation.frontier))
+            step, memory = self.step(memory, frontier, derivation.previous_rules[:, t])
+            out.append(step)
+        return torch.stack(out, 1)
+
+    def log_prob(self, derivation: "Derivation") -> Tensor:
+        """``log q(T)``, ``(N,)``: the sum over steps of the masked log-probability of each rule (section 3.2; a product
+        of probabilities, where the paper prints a sum)."""
+        return rule_log_probs(self.grammar, self.logits(derivation), derivation).sum(1)
+
+
+def masked(grammar: Grammar, logits: Tensor, symbol: Tensor) -> Tensor:
+    """Logits ``(..., K)`` with the rules that do not expand ``symbol (...)`` masked (section 3.2)."""
+    return torch.where(grammar.legal[symbol], logits, MASKED)
+
+
+def rule_log_probs(grammar: Grammar, logits: Tensor, derivation: "Derivation") -> Tensor:
+    """Log-probability ``(N, T)`` of each chosen rule; 0 on padding."""
+    logp = torch.log_softmax(masked(grammar, logits, derivation.frontier.symbol), -1)
+    rules = derivation.rules
+    return logp.gather(-1, rules.clamp(min=0).unsqueeze(-1)).squeeze(-1).masked_fill(rules < 0, 0.0)

@@ -1,0 +1,106 @@
+"""From a structure to a drawing and back: run a model's Pyro program on given derivations.
+
+Axis letters: N scenes, M nodes.
+"""
+
+from dataclasses import dataclass
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from probscene.derivation import Derivation, derive_complete
+from probscene.drawing import Drawing
+from probscene.errors import ModelError
+from probscene.model import SceneModel
+from probscene.policy import Policy
+
+
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """A batch of scenes.
+
+    Attributes:
+        derivation: their structures T.
+        parameters: alpha, the values of the program's other sites, each ``(N, M)``, ``(N, 1)`` or with an event tail.
+        counted: where each parameter exists, the mask of its site, ``(N, M)`` or ``(N, 1)`` bool.
+        log_prob: ``(N,)`` log q(alpha | T).
+        drawing: what to render.
+        failures: ``(N,)`` failed attempts at a complete derivation; zeros if the derivations were given.
+    """
+
+    derivation: Derivation
+    parameters: dict[str, Tensor]
+    counted: dict[str, Tensor]
+    log_prob: Tensor
+    drawing: Drawing
+    failures: Tensor
+
+
+def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
+    """Scenes with complete structures from ``policy`` and parameters from the model's program.
+
+    Raises:
+        SamplingError: the policy hardly ever ends within the model's ``max_steps``.
+        ModelError: see ``realise``.
+    """
+    derivation, failures = derive_complete(model.grammar, policy, num_scenes, model.max_steps)
+    return realise(model, derivation, failures=failures)
+
+
+def realise(
+    model: SceneModel,
+    derivation: Derivation,
+    parameters: dict[str, Tensor] | None = None,
+    failures: Tensor | None = None,
+) -> Scenes:
+    """Run the model's program on given derivations, and on given parameters where there are any.
+
+    Raises:
+        ModelError: the program's sites are not what a scene model's must be, or it returns no ``Drawing``.
+    """
+    N = len(derivation)
+    sites = derivation.sites()
+    with torch.no_grad(), poutine.block():
+        program = poutine.condition(model.program, data={**sites, **(parameters or {})})
+        trace = poutine.trace(program).get_trace(N, model.prior)
+    drawing = trace.nodes["_RETURN"]["value"]
+    if not isinstance(drawing, Drawing) or len(drawing) != N:
+        raise ModelError(
+            f"Expected the program of model {model.name!r} to return a Drawing of {N} scenes (scene.draw(...)), "
+            f"actual {type(drawing).__name__}."
+        )
+    values, counted = {}, {}
+    log_prob = torch.zeros(N)
+    for name, site in trace.nodes.items():
+        if site["type"] != "sample" or name in sites or isinstance(site["fn"], poutine.subsample_messenger._Subsample):
+            continue
+        value, mask = site["value"], site["mask"]
+        if value.ndim < 2 or value.shape[0] != N:
+            raise ModelError(
+                f"Expected site {name!r} of model {model.name!r} inside the scenes plate, shape ({N}, nodes), "
+                f"actual {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
+            )
+        logp = site["fn"].log_prob(value)
+        mask = torch.ones(logp.shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(logp.shape)
+        values[name], counted[name] = value, mask
+        log_prob = log_prob + logp.where(mask, 0.0).sum(-1)
+    return Scenes(
+        derivation,
+        values,
+        counted,
+        log_prob,
+        drawing,
+        torch.zeros(N, dtype=torch.int64) if failures is None else failures,
+    )
+
+
+def log_prob(policy: Policy, scenes: Scenes) -> Tensor:
+    """``log q(T, alpha) = log q(T) + log q(alpha | T)``, ``(N,)`` (section 3.2)."""
+    return policy.log_prob(scenes.derivation) + scenes.log_prob
+
+
+def seed_everything(seed: int) -> None:
+    """Seed torch, numpy and ``random`` through Pyro."""
+    pyro.set_rng_seed(seed)

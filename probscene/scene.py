@@ -1,0 +1,76 @@
+"""Scene graphs: parameters as Pyro sites on a plate of nodes, relative to the parent (section 3.1).
+
+Axis letters: N scenes, M nodes.
+"""
+
+from contextlib import contextmanager
+
+import pyro
+import torch
+from torch import Tensor
+
+from probscene.derivation import Derivation
+from probscene.drawing import Drawing, Sprites, resolve
+from probscene.grammar import Grammar
+
+
+class SceneGraph:
+    """The nodes of a batch of derived scenes. Build it inside ``pyro.plate("scenes", N, dim=-2)``.
+
+    Args:
+        grammar: the grammar.
+        derivation: its derivations.
+
+    Attributes:
+        kind: ``(N, M)`` int64, -1 pads.
+        parent: ``(N, M)`` int64 node index, -1 for none.
+    """
+
+    def __init__(self, grammar: Grammar, derivation: Derivation):
+        self.grammar, self.derivation = grammar, derivation
+        self.kind, self.parent = derivation.kind, derivation.parent
+        self._plate = pyro.plate("nodes", self.kind.shape[1], dim=-1)
+
+    def mask(self, *kinds: str) -> Tensor:
+        """``(N, M)`` bool, the nodes of the named kinds."""
+        wanted = torch.tensor([self.grammar.kind(name) for name in kinds])
+        return torch.isin(self.kind, wanted)
+
+    @contextmanager
+    def nodes(self, *kinds: str):
+        """A plate over M in which only nodes of the named kinds count: sites are ``(N, M)``, others have log-prob 0.
+
+        Raises:
+            GrammarError: the grammar has no such object.
+        """
+        with self._plate, pyro.poutine.mask(mask=self.mask(*kinds)):
+            yield
+
+    def of_parent(self, value: Tensor, default: float = 0.0) -> Tensor:
+        """Each node's parent's entry of ``value (N, M)``; ``default`` where there is no parent."""
+        value = torch.as_tensor(value).expand(self.kind.shape)
+        return value.gather(1, self.parent.clamp(min=0)).where(self.parent >= 0, default)
+
+    def rank(self, *kinds: str) -> Tensor:
+        """``(N, M)`` int64, how many nodes of these kinds and of the same parent come before a node."""
+        return self._siblings(*kinds).tril(-1).sum(-1)
+
+    def count(self, *kinds: str) -> Tensor:
+        """``(N, M)`` int64, how many nodes of these kinds have the same parent as a node."""
+        return self._siblings(*kinds).sum(-1)
+
+    def _siblings(self, *kinds: str) -> Tensor:
+        mask = self.mask(*kinds)
+        return (self.parent.unsqueeze(-1) == self.parent.unsqueeze(-2)) & mask.unsqueeze(-2)
+
+    def draw(self, *layers: Sprites, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drawing:
+        """What to render: layers from the back to the front.
+
+        Raises:
+            ModelError: values of a wrong shape, out of range or not finite.
+        """
+        resolved = []
+        for layer in layers:
+            kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds
+            resolved.append(resolve(layer, self.mask(*kinds)))
+        return Drawing(self.kind, self.grammar.kinds, tuple(resolved), background)

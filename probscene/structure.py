@@ -1,0 +1,138 @@
+"""Structure priors as tables: rule weights, and length distributions that no rule weight can express.
+
+A list ``Plates -> Plate Plates | ε`` with weights on its two rules has geometric lengths. ``counts(p0, p1, ...)`` gives
+P(n = c) instead: the frontier carries how often the list has repeated, and the list stops after c repeats with the
+hazard h(c) = P(n = c) / P(n >= c).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from probscene.errors import GrammarError
+from probscene.grammar import Grammar
+from probscene.policy import Frontier, Policy
+
+
+@dataclass(frozen=True)
+class Counts:
+    """A distribution over how often a list repeats; ``weights`` share out its recursive productions."""
+
+    probs: tuple[float, ...]
+    weights: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Probabilities of a nonterminal's productions, in the order they are written, up to a factor."""
+
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Another distribution by the rank of the list around (``Frontier.parent_repeat``); the last one goes on."""
+
+    each: tuple[Counts | Weights, ...]
+
+
+def counts(*probs: float, weights: tuple[float, ...] | None = None) -> Counts:
+    """``counts(.2, .4, .4)``: no repeat with probability .2, one with .4, two with .4; normalised."""
+    return Counts(tuple(map(float, probs)), weights)
+
+
+def weights(*values: float) -> Weights:
+    """``weights(1, 1, 2)``: the third production twice as likely as either other."""
+    return Weights(tuple(map(float, values)))
+
+
+def ranked(*each: Counts | Weights) -> Ranked:
+    """``ranked(counts(...), counts(...))``: the first for the first element of the list around, and so on."""
+    return Ranked(each)
+
+
+class StructurePrior(Policy):
+    """A table of rule probabilities by nonterminal, repeat of its list, and rank of the list around.
+
+    Args:
+        grammar: the grammar.
+        distributions: by nonterminal; one that is not named takes its productions with equal probability.
+
+    Attributes:
+        table: ``(V + 1, P, C, K)`` float32 log-probabilities; -inf where impossible.
+
+    Raises:
+        GrammarError: a nonterminal that the grammar lacks, a wrong number of weights, a negative or zero total, or
+            ``counts`` of a nonterminal that is not a list.
+    """
+
+    def __init__(self, grammar: Grammar, **distributions: Counts | Weights | Ranked):
+        self.grammar = grammar
+        given = {name: d.each if isinstance(d, Ranked) else (d,) for name, d in distributions.items()}
+        if any(not each for each in given.values()):
+            raise GrammarError("Expected at least one distribution in ranked(...), actual none.")
+        P = max([1, *(len(each) for each in given.values())])
+        C = max([1, *(len(d.probs) for each in given.values() for d in each if isinstance(d, Counts))])
+        V, K = len(grammar.nonterminals), len(grammar.rules)
+        table = torch.zeros(V + 1, P, C, K, dtype=torch.float64)
+        for v, name in enumerate(grammar.nonterminals):
+            rules = grammar.rules_of(name)
+            each = given.pop(name, (Weights((1.0,) * len(rules)),))
+            for p in range(P):
+                table[v, p][:, rules] = _rule_probs(grammar, name, each[min(p, len(each) - 1)], C)
+        if given:
+            raise GrammarError(
+                f"Expected distributions of nonterminals among {list(grammar.nonterminals)}, actual {sorted(given)}."
+            )
+        table[V, :, :, 0] = 1.0
+        self.table = table.log().float()
+
+    def step(self, memory: None, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, None]:
+        """Log-probabilities ``(N, K)``; there is no memory."""
+        return self._look_up(frontier), None
+
+    def logits(self, derivation) -> Tensor:
+        """``(N, T, K)`` at once."""
+        return self._look_up(derivation.frontier)
+
+    def _look_up(self, frontier: Frontier) -> Tensor:
+        _, P, C, _ = self.table.shape
+        return self.table[frontier.symbol, frontier.parent_repeat.clamp(max=P - 1), frontier.repeat.clamp(max=C - 1)]
+
+
+def hazards(probs: Tensor) -> Tensor:
+    """Stop probabilities ``h(c) = P(n = c) / P(n >= c)``, ``(C,)``; 1 where ``P(n >= c)`` is 0."""
+    tail = probs.flip(0).cumsum(0).flip(0)
+    return torch.where(tail > 0, probs / tail.clamp(min=1e-300), torch.ones_like(probs)).clamp(max=1.0)
+
+
+def _rule_probs(grammar: Grammar, name: str, distribution: Counts | Weights, C: int) -> Tensor:
+    """Probabilities ``(C, rules of name)`` of a nonterminal's rules after c repeats."""
+    rules = grammar.rules_of(name)
+    if isinstance(distribution, Weights):
+        return _normalised(distribution.values, len(rules), f"weights of {name}").expand(C, -1)
+    v = grammar.nonterminals.index(name)
+    again = [(grammar.children[k] == v).sum().item() for k in rules]
+    if sorted(set(again)) != [0, 1]:
+        raise GrammarError(
+            f"Expected a list such as '{name} -> item {name} | ε' for counts of {name}, actual "
+            f"'{'; '.join(str(grammar.rules[k]) for k in rules)}'; use weights(...) here."
+        )
+    recursive = torch.tensor(again, dtype=torch.float64)
+    probs = _normalised(distribution.probs, None, f"counts of {name}")
+    stop = torch.ones(C, 1, dtype=torch.float64)
+    stop[: len(probs), 0] = hazards(probs)
+    shares = distribution.weights or (1.0,) * int(recursive.sum())
+    split = torch.zeros(len(rules), dtype=torch.float64)
+    split[recursive > 0] = _normalised(shares, int(recursive.sum()), f"weights of {name}'s recursive productions")
+    return stop * (1 - recursive) / (1 - recursive).sum() + (1 - stop) * split
+
+
+def _normalised(values: tuple[float, ...], number: int | None, what: str) -> Tensor:
+    probs = torch.tensor(values, dtype=torch.float64)
+    if number is not None and len(values) != number:
+        raise GrammarError(f"Expected {number} {what}, one a production, actual {len(values)}.")
+    if not len(values) or not torch.isfinite(probs).all() or (probs < 0).any() or probs.sum() <= 0:
+        raise GrammarError(f"Expected non-negative {what} with a positive sum, actual {values}.")
+    return probs / probs.sum()
