@@ -1,0 +1,42 @@
+.PHONY: install demo test lint benchmark clean
+
+BIN := .venv/bin
+STAMP := .venv/.installed
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+install: $(STAMP)
+
+$(BIN)/python:
+	@for python in "$$PYTHON" python3.11 python3.12 python3.13 python3; do \
+	    if "$$python" -c 'import sys, ensurepip, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then \
+	        exec "$$python" -m venv .venv; \
+	    fi; \
+	done; \
+	echo "Expected Python 3.11, 3.12 or 3.13 with its venv module, actual none on the PATH;" \
+	    "install one (Debian, Ubuntu: python3.11-venv) or run: make install PYTHON=/path/to/python3.11" >&2; \
+	exit 2
+
+$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "Installing into .venv; the first time this downloads about 3 GB and takes a few minutes."
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[test]'
+	@touch $@
+
+demo: install
+	@$(BIN)/probscene demo
+	@echo "Everything it made is in the folder demo."
+
+lint: install
+	@$(BIN)/ruff check --quiet
+
+# One thread a process: two processes with one thread each are faster than one with two.
+test: export OMP_NUM_THREADS := 1
+test: lint
+	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile
+
+benchmark: install
+	@set -e; for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script"; done
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

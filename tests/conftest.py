@@ -1,0 +1,29 @@
+"""What every test has: one thread, a seed, an empty parameter store, and the folder of outside data where there is one."""
+
+import os
+from pathlib import Path
+
+import pyro
+import pytest
+import torch
+from hypothesis import settings
+
+torch.set_num_threads(1)
+settings.register_profile("probscene", deadline=None, max_examples=25, derandomize=os.environ.get("CI") == "true")
+settings.load_profile("probscene")
+
+
+@pytest.fixture(autouse=True)
+def _fresh_pyro():
+    pyro.set_rng_seed(0)  # torch, numpy and random
+    pyro.clear_param_store()
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of outside data: ``PROBSCENE_DATA``, or ``shared/data`` beside the checkout."""
+    named = os.environ.get("PROBSCENE_DATA")
+    folder = Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no outside data in {folder}; name its folder in PROBSCENE_DATA")
+    return folder
