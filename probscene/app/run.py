@@ -1,0 +1,158 @@
+"""The run folder: what ``fit`` writes and every other command reads.
+
+    run.json               the configuration, the model, the target, the version that wrote it
+    model.py               a copy of the model's file, where it is not a built-in one
+    guide.safetensors      the learnt guide; there once the fit is finished
+    features.safetensors   the feature network
+    real.safetensors       features of the target images
+    log.jsonl              one line an update
+    checkpoint.safetensors what ``--resume`` goes on from
+"""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+from torch import Tensor
+
+from probscene.app.files import make_folder, write_json, write_whole
+from probscene.app.loading import BUILT_IN, load_model
+from probscene.errors import ModelError, RunError
+from probscene.inference.guide import LSTMGuide
+from probscene.model import SceneModel
+
+FORMAT = 1  # of the run folder; another number is not read
+
+
+class Run:
+    """A run folder.
+
+    Attributes:
+        path: the folder.
+        record: the contents of ``run.json``.
+    """
+
+    def __init__(self, path: Path, record: dict[str, Any]):
+        self.path, self.record = Path(path), record
+        self._model: SceneModel | None = None
+
+    @staticmethod
+    def create(path: Path, model: str, record: dict[str, Any]) -> "Run":
+        """A new run folder; ``record`` is kept in ``run.json``.
+
+        Raises:
+            RunError: the folder holds a run or other files already.
+            MachineError: it cannot be written.
+        """
+        path = Path(path)
+        if (path / "run.json").exists():
+            raise RunError(f"Expected a new folder for the run, actual {path} holds one; add --resume or name another.")
+        if path.is_dir() and any(path.iterdir()):
+            raise RunError(f"Expected a new or empty folder for the run, actual {path} holds other files.")
+        make_folder(path)
+        reference = model
+        digest = None
+        if model not in BUILT_IN:
+            reference = str(Path(model).resolve())
+            digest = _sha256(Path(model))
+            write_whole(path / "model.py", lambda temporary: shutil.copyfile(model, temporary))
+        run = Run(path, {**record, "format": FORMAT, "model": reference, "model_sha256": digest})
+        write_json(path / "run.json", run.record)
+        return run
+
+    @staticmethod
+    def open(path: Path) -> "Run":
+        """An existing run folder.
+
+        Raises:
+            RunError: there is none, it is damaged, or another version wrote it.
+        """
+        path = Path(path)
+        file = path / "run.json"
+        if not file.is_file():
+            raise RunError(f"Expected a run folder with a run.json, actual {path}; make one with 'probscene fit'.")
+        try:
+            record = json.loads(file.read_text(encoding="utf-8"))
+            written = record["format"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise RunError(f"Expected JSON of a run in {file}, actual something else; fit again.") from error
+        if written != FORMAT:
+            raise RunError(
+                f"Expected a run of format {FORMAT}, actual format {written} in {path}: another version of probscene "
+                f"({record.get('version', 'unknown')}) wrote it. Use that version, or fit again."
+            )
+        return Run(path, record)
+
+    @property
+    def model(self) -> SceneModel:
+        """The scene model, loaded once.
+
+        Raises:
+            RunError: the model's file is gone or has changed since the fit.
+        """
+        if self._model is None:
+            reference, digest = self.record["model"], self.record["model_sha256"]
+            if digest is not None and (not Path(reference).is_file() or _sha256(Path(reference)) != digest):
+                raise RunError(
+                    f"Expected the model file {reference} as it was when {self.path} was fitted, actual a missing or "
+                    f"changed file. A copy is in {self.path / 'model.py'}: put it back, or fit again."
+                )
+            self._model = load_model(reference)
+        return self._model
+
+    def guide(self) -> LSTMGuide:
+        """The learnt guide.
+
+        Raises:
+            RunError: the fit is not finished, or the file does not hold this run's guide.
+        """
+        tensors = self.load("guide")
+        if tensors is None:
+            raise RunError(f"Expected a finished fit in {self.path}, actual an unfinished one; go on with --resume.")
+        guide = LSTMGuide(self.model.grammar, self.model.max_steps, **self.record["guide"])
+        try:
+            guide.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise RunError(f"Expected a guide for model {self.model.name} in {self.path}, actual another.") from error
+        return guide.eval()
+
+    def guide_hash(self) -> str:
+        """SHA-256 of the learnt guide's file, hexadecimal; provenance names it."""
+        return _sha256(self.path / "guide.safetensors")
+
+    def load(self, name: str) -> dict[str, Tensor] | None:
+        """The tensors of ``name.safetensors``, or None where there is no such file.
+
+        Raises:
+            RunError: the file is damaged.
+        """
+        file = self.path / f"{name}.safetensors"
+        if not file.is_file():
+            return None
+        try:
+            return safetensors.torch.load_file(file)
+        except (safetensors.SafetensorError, OSError) as error:
+            raise RunError(f"Expected tensors in {file}, actual a damaged file ({error}); delete it.") from error
+
+    def save(self, name: str, tensors: dict[str, Tensor]) -> None:
+        """Write ``name.safetensors``, whole or not at all."""
+        whole = {key: value.detach().contiguous() for key, value in tensors.items()}
+        write_whole(
+            self.path / f"{name}.safetensors", lambda temporary: safetensors.torch.save_file(whole, str(temporary))
+        )
+
+
+def is_run(path: str) -> bool:
+    """Whether a command's MODEL_OR_RUN names a run folder."""
+    return path not in BUILT_IN and (Path(path) / "run.json").is_file()
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ModelError(f"Could not read {path}: {error.strerror}.") from error
