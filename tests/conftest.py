@@ -1,4 +1,4 @@
-"""What every test has: one thread, a seed, an empty parameter store, and the folder of outside data where there is one."""
+"""What every test has: one thread, a seed, an empty parameter store, and outside data where there is any."""
 
 import os
 from pathlib import Path

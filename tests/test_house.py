@@ -1,0 +1,217 @@
+"""The house rules: who imports whom, what is installed, what no file may name."""
+
+import ast
+import json
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import probscene
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = {
+    "probscene": ROOT / "probscene",
+    "probscene.models": ROOT / "models",
+    "probscene.renderers": ROOT / "renderers",
+    "probscene.inference": ROOT / "inference",
+}
+ENGINE = "probscene.renderers.engine"
+
+
+def library() -> dict[str, Path]:
+    """Every module of the library by its installed name."""
+    modules = {}
+    for package, folder in PACKAGES.items():
+        for path in folder.rglob("*.py"):
+            parts = [p for p in path.relative_to(folder).with_suffix("").parts if p != "__init__"]
+            modules[".".join([package, *parts])] = path
+    return modules
+
+
+def imported(path: Path) -> set[str]:
+    """Dotted names that a file imports anywhere in it, but for type checking; ``from a import b`` counts as ``a.b``."""
+    names, todo = set(), [ast.parse(path.read_text(encoding="utf-8"))]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            todo += node.orelse
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        else:
+            todo += ast.iter_child_nodes(node)
+    return names
+
+
+def graph() -> dict[str, set[str]]:
+    """The library's modules, each with those that it imports."""
+    modules = library()
+
+    def module(name):
+        while name and name not in modules:
+            name = name.rpartition(".")[0]
+        return name
+
+    return {name: {module(x) for x in imported(path)} - {""} for name, path in modules.items()}
+
+
+def floor(module: str) -> str:
+    """The folder that a module belongs to: probscene.app, a spoke, or the hub."""
+    rooms = [room for room in ("probscene.app", *PACKAGES) if f"{module}.".startswith(f"{room}.")]
+    return max(rooms, key=len)
+
+
+def test_no_import_circle():
+    TopologicalSorter(graph()).prepare()
+
+
+def test_imports_only_go_down():
+    for module, uses in graph().items():
+        allowed = {"probscene", floor(module)} if floor(module) != "probscene.app" else {"probscene.app", *PACKAGES}
+        assert {floor(used) for used in uses} <= allowed, module
+
+
+def test_only_the_engine_imports_taichi():
+    files = [
+        path
+        for folder in (*PACKAGES.values(), ROOT / "tests", ROOT / "examples", ROOT / "benchmarks")
+        for path in folder.rglob("*.py")
+    ]
+    importers = {path for path in files if any(f"{name}.".startswith("taichi.") for name in imported(path))}
+    assert importers <= {library().get(ENGINE)}
+
+
+def tidy_codes(filename: str, source: str) -> set[str]:
+    """Which of ruff's import rules (TID) a source breaks as if it stood in that file."""
+    run = subprocess.run(
+        [sys.executable, "-m", "ruff", "check", "--output-format", "json", "--stdin-filename", filename, "-"],
+        cwd=ROOT, input=source, capture_output=True, text=True,
+    )  # fmt: skip
+    assert run.returncode in (0, 1), run.stderr
+    return {fault["code"] for fault in json.loads(run.stdout) if fault["code"].startswith("TID")}
+
+
+WRONG = {
+    "probscene/x.py": [
+        "import taichi as ti", "import torchvision", "from torchvision.models import resnet18",
+        "import probscene.models.multi_mnist", "from probscene.renderers.engine import render",
+        "from probscene.inference import features", "from probscene import models",
+        "from probscene.app.cli import main", "from probscene import app", "def f():\n    import probscene.app.cli",
+    ],
+    "models/x.py": [
+        "import taichi", "from probscene.renderers.engine import render", "import probscene.inference.lstm",
+        "from probscene import renderers", "from probscene.app.cli import main",
+    ],
+    "renderers/x.py": [
+        "import taichi", "from taichi import kernel", "import pyro\n\npyro.sample('x', None)",
+        "from pyro import sample", "from probscene.models.multi_mnist import MODEL", "import probscene.inference.lstm",
+        "from probscene.app.cli import main",
+    ],
+    "inference/x.py": [
+        "import taichi", "from probscene.models.multi_mnist import MODEL", "import probscene.renderers.engine",
+        "from probscene.app.cli import main",
+    ],
+    "probscene/app/x.py": ["import taichi"],
+    "tests/x.py": ["import taichi"],
+    "examples/x.py": ["import taichi"],
+    "benchmarks/x.py": ["import taichi"],
+}  # fmt: skip
+EVERYWHERE = ["import models.multi_mnist", "from renderers.engine import render", "from inference import lstm",
+              "import examples.tabletop", "from tests.reference import parse", "import benchmarks.render"]  # fmt: skip
+
+RIGHT = {
+    "probscene/x.py": "import pyro\nimport torch\n\nfrom probscene.grammar import Grammar\n\npyro.sample('x', None)\n",
+    "models/x.py": "import pyro\n\nfrom probscene.grammar import Grammar\nfrom probscene.models.y import z\n",
+    "renderers/x.py": "import numpy\n\nfrom probscene.drawing import Drawing\nimport probscene.renderers.engine\n",
+    "renderers/engine.py": "import taichi as ti\n\nfrom probscene.drawing import Drawing\n",
+    "inference/x.py": "import torchvision\n\nfrom probscene.policy import Policy\nimport probscene.inference.y\n",
+    "probscene/app/x.py": "import probscene.inference.y\nimport probscene.models.y\nimport probscene.renderers.y\n",
+    "tests/x.py": "import probscene.app.cli\nimport probscene.inference.y\nimport probscene.renderers.engine\n",
+    "examples/x.py": "import probscene.inference.y\nimport probscene.models.y\nimport probscene.renderers.engine\n",
+}
+
+
+@pytest.mark.parametrize("filename", WRONG)
+def test_lint_catches_a_wrong_import(filename):
+    for source in WRONG[filename] + EVERYWHERE:
+        assert tidy_codes(filename, source + "\n") == {"TID251"}, source
+    assert "TID252" in tidy_codes(filename, "from .y import z\n")
+
+
+@pytest.mark.parametrize("filename", RIGHT)
+def test_lint_lets_a_right_import_pass(filename):
+    assert tidy_codes(filename, RIGHT[filename]) == set()
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """The wheel, built by way of the sdist from a copy of the sources, without the network."""
+    tmp = tmp_path_factory.mktemp("wheel")
+    for folder in PACKAGES.values():
+        shutil.copytree(folder, tmp / "src" / folder.name, ignore=shutil.ignore_patterns("__pycache__", ".*"))
+    for name in ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE"):
+        if (ROOT / name).exists():
+            shutil.copy(ROOT / name, tmp / "src")
+    subprocess.run(
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp / "dist", tmp / "src"],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    (built,) = (tmp / "dist").glob("*.whl")
+    return built
+
+
+def test_wheel_holds_the_whole_library_under_one_name(wheel):
+    assert wheel.name == f"probscene-{probscene.__version__}-py3-none-any.whl"
+    names = zipfile.ZipFile(wheel).namelist()
+    info = f"probscene-{probscene.__version__}.dist-info"
+    assert {name.split("/")[0] for name in names} == {"probscene", info}
+    expected = set()
+    for package, folder in PACKAGES.items():
+        files = [p.relative_to(folder) for p in folder.rglob("*") if p.is_file() and p.name != "ruff.toml"]
+        kept = [p for p in files if "__pycache__" not in p.parts and not p.parts[0].startswith(".")]
+        expected |= {f"{package.replace('.', '/')}/{p.as_posix()}" for p in kept}
+    assert {name for name in names if not name.startswith(info)} == expected
+
+
+def test_installed_wheel_imports_away_from_the_checkout(wheel, tmp_path):
+    site = tmp_path / "site"
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--disable-pip-version-check"]
+    subprocess.run([*pip, "--target", site, wheel], check=True, capture_output=True)
+    program = (
+        "import importlib, sys\n"
+        "sys.path.insert(0, sys.argv[1])\n"
+        "for name in sys.argv[2:]:\n"
+        "    assert importlib.import_module(name).__file__.startswith(sys.argv[1]), name\n"
+    )
+    run = subprocess.run([sys.executable, "-I", "-c", program, site, "probscene.app", *PACKAGES], cwd="/",
+                         capture_output=True, text=True)  # fmt: skip
+    assert run.returncode == 0, run.stderr
+
+
+def tracked() -> list[Path]:
+    run = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    if run.returncode:
+        pytest.skip("not a git checkout")
+    return [path for name in run.stdout.split("\0") if name and (path := ROOT / name).is_file()]
+
+
+def test_no_tracked_file_names_a_registry_or_a_home():
+    named = re.compile(
+        rb"pypi\.org|python[h]osted|download\.pytorch\.org|npmjs\.|anaconda\.org|crates\.io|deb\.debian\.|--(extra-)?index-url"
+        rb"|(?<![\w.])/(root|home|Users)/\w"
+    )
+    for path in tracked():
+        assert not (found := named.search(path.read_bytes())), f"{path.relative_to(ROOT)} names {found[0]!r}"
+
+
+def test_constraints_only_pin():
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
+    assert {"torch==2.14.1", "torchvision==0.29.1"} <= set(lines)
