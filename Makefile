@@ -5,6 +5,7 @@ STAMP := .venv/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 install: $(STAMP)
+	@:
 
 $(BIN)/python:
 	@for python in "$$PYTHON" python3.11 python3.12 python3.13 python3; do \
