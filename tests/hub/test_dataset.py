@@ -1,0 +1,246 @@
+"""A folder of images reads as what was written to it, and every fault is one clear message."""
+
+import io
+import os
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+
+from probscene.dataset import ImageFolder, grey
+from probscene.errors import DataError
+
+
+def encoded(pixels, kind="PNG", mode=None, **options) -> bytes:
+    image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)
+    buffer = io.BytesIO()
+    (image.convert(mode) if mode else image).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def read(folder, data: bytes, canvas, channels=3, name="a.png", **options) -> np.ndarray:
+    """One file's pixels ``(H, W, C)`` as the folder gives them."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    (folder / name).write_bytes(data)
+    return ImageFolder(folder, canvas, channels, **options).load(0).permute(1, 2, 0).numpy()
+
+
+@pytest.fixture
+def noise() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (40, 30, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def smooth() -> np.ndarray:
+    y, x = np.mgrid[:40, :30]
+    return np.stack([6 * y, 8 * x, 3 * (x + y)], -1).astype(np.uint8)
+
+
+@given(arrays(np.uint8, (5, 7, 3)))
+def test_png_pixels_come_back(tmp_path_factory, pixels):
+    folder = tmp_path_factory.mktemp("images")
+    assert (read(folder, encoded(pixels), (5, 7)) == pixels).all()
+    assert (read(folder, encoded(pixels[..., 0]), (5, 7), 1)[..., 0] == pixels[..., 0]).all()
+    assert (read(folder, encoded(pixels[..., 0]), (5, 7), 3) == pixels[..., :1]).all()
+
+
+@given(arrays(np.uint8, (2, 3, 4, 5)))
+def test_grey_is_what_the_folder_reads(tmp_path_factory, pixels):
+    luma = grey(torch.from_numpy(pixels))
+    for one, expected in zip(pixels, luma, strict=True):
+        got = read(tmp_path_factory.mktemp("images"), encoded(one.transpose(1, 2, 0).copy()), (4, 5), 1)
+        assert (got[..., 0] == expected[0].numpy()).all()
+
+
+def test_every_kind_of_file(tmp_path, noise, smooth):
+    folder, canvas = tmp_path / "images", (40, 30)
+    few = Image.fromarray(noise).quantize(9)
+    assert (read(folder, encoded(few), canvas) == np.asarray(few.convert("RGB"))).all()
+    black = Image.fromarray(noise[..., 0] > 99)
+    assert (read(folder, encoded(black), canvas) == 255 * (noise[..., :1] > 99)).all()
+    deep = noise[..., 0].astype(np.uint16) * 257
+    assert (read(folder, encoded(deep), canvas) == noise[..., :1]).all()
+    deep = cv2.imencode(".png", noise[..., ::-1].astype(np.uint16) * 257)[1].tobytes()
+    assert (read(folder, deep, canvas) == noise).all()
+    for quality in ({"mode": "CMYK"}, {"mode": "L"}, {"progressive": True}, {}):
+        got = read(folder, encoded(smooth, "JPEG", quality=98, **quality), canvas, name="a.JpEg")
+        wanted = np.asarray(Image.fromarray(smooth).convert("L"))[..., None] if "L" in quality.values() else smooth
+        assert abs(got.astype(int) - wanted).max() <= 12
+
+
+def test_transparent_pixels_lie_on_black(tmp_path, noise):
+    folder, canvas = tmp_path / "images", (40, 30)
+    alpha = np.random.default_rng(1).integers(0, 256, (40, 30, 1), dtype=np.uint8)
+    expected = noise * (alpha / 255)
+    got = read(folder, encoded(np.concatenate([noise, alpha], -1)), canvas)
+    assert abs(got - expected).max() <= 1
+    got = read(folder, encoded(np.concatenate([noise[..., :1], alpha], -1)), canvas)
+    assert abs(got - expected[..., :1]).max() <= 1
+    palette = Image.fromarray(noise).quantize(9)
+    got = read(folder, encoded(palette, transparency=0), canvas)
+    assert not got[np.asarray(palette) == 0].any()
+    assert (got[np.asarray(palette) > 0] == np.asarray(palette.convert("RGB"))[np.asarray(palette) > 0]).all()
+
+
+def test_photos_stand_upright(tmp_path, smooth):
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was turned: the first row is the right-hand side
+    data = encoded(np.rot90(smooth).copy(), "JPEG", quality=98, exif=exif)
+    assert abs(read(tmp_path / "images", data, (40, 30), name="a.jpg").astype(int) - smooth).max() <= 12
+    assert ImageFolder(tmp_path / "images", (40, 30), 3).resized == 0
+
+
+@given(st.tuples(*[st.integers(1, 90)] * 4), st.sampled_from(["PNG", "JPEG"]))
+def test_another_size_is_stretched_to_the_canvas(tmp_path_factory, sizes, kind):
+    height, width, h, w = sizes
+    ramp = np.broadcast_to(np.linspace(0, 255, w)[None, :, None], (h, w, 3)).astype(np.uint8)
+    folder = tmp_path_factory.mktemp("images") / "x"
+    got = read(folder, encoded(ramp, kind), (height, width), name="a.jpg")
+    assert got.shape == (height, width, 3)
+    assert abs(got.mean() - ramp.mean()) < 255 / min(w, 8)
+    assert ImageFolder(folder, (height, width), 3).resized == ((h, w) != (height, width))
+
+
+def test_area_interpolation_where_it_shrinks(tmp_path, noise):
+    got = read(tmp_path / "images", encoded(noise), (10, 10))
+    blocks = noise.reshape(10, 4, 10, 3, 3).mean((1, 3))
+    assert abs(got - blocks).max() <= 1
+
+
+def test_names_are_sorted_and_the_rest_is_left_out(tmp_path, noise):
+    for name in ("b.PNG", "a.jpg", "c.jpeg", ".hidden.png"):
+        (tmp_path / name).write_bytes(encoded(noise, "JPEG"))
+    (tmp_path / "labels.csv").write_text("1,2")
+    (tmp_path / "d.png").mkdir()
+    images = ImageFolder(tmp_path, (20, 30), 1)
+    assert [path.name for path in images.paths] == ["a.jpg", "b.PNG", "c.jpeg"] and len(images) == 3
+    assert images.resized == 3
+    resized, others = images.notes
+    assert "3 of 3 images" in resized and "most often 30x40" in resized and "resized to 30x20" in resized
+    assert "1 files" in others and "labels.csv" in others
+
+
+@given(st.integers(1, 9), st.integers(1, 12))
+def test_batches_are_the_images_in_order(tmp_path_factory, number, size):
+    folder = tmp_path_factory.mktemp("images")
+    for i in range(number):
+        (folder / f"{i}.png").write_bytes(encoded(np.full((2, 3), i, np.uint8)))
+    images = ImageFolder(folder, (2, 3), 1)
+    batches = list(images.batches(size))
+    assert all(len(batch) == size for batch in batches[:-1]) and len(batches) == -(-number // size)
+    whole = torch.cat(batches)
+    assert whole.dtype == torch.uint8 and whole.shape == (number, 1, 2, 3)
+    assert (whole[:, 0, 0, 0] == torch.arange(number)).all() and not images.notes
+    with pytest.raises(DataError, match="positive batch size, actual 0"):
+        next(images.batches(0))
+
+
+def test_the_fingerprint_is_of_names_bytes_and_shape(tmp_path, noise):
+    def fingerprint(folder="one", canvas=(40, 30), channels=3):
+        return ImageFolder(tmp_path / folder, canvas, channels).fingerprint
+
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "a.png").write_bytes(encoded(noise))
+    (tmp_path / "one" / "b.png").write_bytes(encoded(noise[::-1].copy()))
+    first = fingerprint()
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    os.utime(tmp_path / "two" / "a.png", (1, 1))
+    (tmp_path / "two" / "notes.txt").write_text("x")
+    assert fingerprint("two") == first
+    (tmp_path / "two" / "a.png").rename(tmp_path / "two" / "c.png")
+    renamed = fingerprint("two")
+    (tmp_path / "one" / "a.png").write_bytes(encoded(noise + 1))
+    assert len({first, renamed, fingerprint(), fingerprint(canvas=(4, 3)), fingerprint(channels=1)}) == 5
+
+
+KINDS = [("PNG", "L", {}), ("PNG", "RGB", {}), ("PNG", "P", {}), ("PNG", "1", {}),
+         ("JPEG", "L", {}), ("JPEG", "RGB", {}), ("JPEG", "RGB", {"progressive": True})]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind, mode, options", KINDS)
+def test_every_truncation_is_found(tmp_path, smooth, kind, mode, options):
+    data = encoded(smooth[:16, :16].copy(), kind, mode, **options)
+    (tmp_path / "good.png").write_bytes(data)
+    for end in range(len(data)):
+        (tmp_path / "cut.png").write_bytes(data[:end])
+        images = ImageFolder(tmp_path, (16, 16), 1, skip_bad=True)
+        assert [path.name for path in images.paths] == ["good.png"], end
+
+
+def test_altered_bytes_of_a_png_are_found(tmp_path, smooth):
+    data = encoded(smooth)
+    (tmp_path / "good.png").write_bytes(data)
+    for at in range(0, len(data) - 12, 3):  # the last twelve bytes carry nothing
+        (tmp_path / "bad.png").write_bytes(data[:at] + bytes([data[at] ^ 0x55]) + data[at + 1 :])
+        assert len(ImageFolder(tmp_path, (40, 30), 3, skip_bad=True)) == 1, at
+
+
+def test_bad_files_are_named_and_skipped_only_when_asked(tmp_path, noise):
+    data = encoded(noise)
+    (tmp_path / "good.png").write_bytes(data)
+    whole = ImageFolder(tmp_path, (40, 30), 3).fingerprint
+    (tmp_path / "cut.png").write_bytes(data[:-20])
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    (tmp_path / "text.jpeg").write_text("not an image")
+    (tmp_path / "web.png").write_bytes(encoded(noise, "WEBP"))
+    (tmp_path / "gone.png").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="5 of 6 bad.*--skip-bad") as error:
+        ImageFolder(tmp_path, (40, 30), 3)
+    named = ("cut.png is truncated", "empty.jpg is empty", "text.jpeg is not a PNG or JPEG image",
+             "web.png is not a PNG or JPEG image", "gone.png cannot be read")  # fmt: skip
+    assert all(fault in str(error.value) for fault in named)
+    images = ImageFolder(tmp_path, (40, 30), 3, skip_bad=True)
+    assert len(images) == 1 and (images.load(0).permute(1, 2, 0).numpy() == noise).all()
+    assert images.fingerprint == whole
+    assert "5 bad files" in images.notes[0] and "cut.png is truncated" in images.notes[0]
+    assert {path.name for path in images.bad} == {"cut.png", "empty.jpg", "text.jpeg", "web.png", "gone.png"}
+    (tmp_path / "good.png").unlink()
+    with pytest.raises(DataError, match="5 of 5 bad.*no other image in the folder"):
+        ImageFolder(tmp_path, (40, 30), 3, skip_bad=True)
+
+
+def test_many_bad_files_make_a_short_message(tmp_path):
+    for i in range(300):
+        (tmp_path / f"{i:03}.png").write_bytes(b"")
+    with pytest.raises(DataError, match="004.png is empty and 295 more") as error:
+        ImageFolder(tmp_path, (4, 4), 3)
+    assert len(str(error.value)) < 500
+
+
+def test_folders_that_cannot_be_used(tmp_path, noise):
+    def message(path):
+        with pytest.raises(DataError) as error:
+            ImageFolder(path, (4, 4), 3)
+        return str(error.value)
+
+    assert "which is not there" in message(tmp_path / "missing")
+    (tmp_path / "a.png").write_bytes(encoded(noise))
+    assert "which is a file" in message(tmp_path / "a.png")
+    (tmp_path / "empty").mkdir()
+    assert "actual an empty folder" in message(tmp_path / "empty")
+    (tmp_path / "notes" / "images").mkdir(parents=True)
+    (tmp_path / "notes" / "annotations.json").write_text("{}")
+    assert "only images/, annotations.json; images in subfolders are not read" in message(tmp_path / "notes")
+
+
+def test_a_file_that_goes_bad_later_is_named(tmp_path, noise):
+    (tmp_path / "a.png").write_bytes(encoded(noise))
+    images = ImageFolder(tmp_path, (40, 30), 3)
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(DataError, match="a.png as it was, actual a file that is empty"):
+        next(images.batches(8))
+
+
+def test_progress_is_told_of_every_file(tmp_path, noise):
+    for i in range(3):
+        (tmp_path / f"{i}.png").write_bytes(encoded(noise))
+    seen = []
+    ImageFolder(tmp_path, (4, 4), 3, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
