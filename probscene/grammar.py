@@ -15,6 +15,7 @@ from torch import Tensor
 
 from probscene.errors import GrammarError
 
+_NAME = re.compile(r"[\w\-]+")
 _TOKEN = re.compile(r"\s*([\w\-]+|[()|])")
 _EMPTY = {"ε", "eps"}
 
@@ -35,10 +36,13 @@ class Rule:
     Args:
         lhs: the nonterminal.
         rhs: nonterminals and terminals by name, or ``Node``.
+
+    Raises:
+        GrammarError: a name that could not stand in text, or a ``Node`` that is no object with a tuple of children.
     """
 
     def __init__(self, lhs: str, *rhs: str | Node):
-        self.lhs, self.rhs = lhs, tuple(s if isinstance(s, str) or s.children else s.name for s in rhs)
+        self.lhs, self.rhs = _checked_name(lhs), tuple(map(_normal, rhs))
 
     def __eq__(self, other) -> bool:
         return isinstance(other, Rule) and (self.lhs, self.rhs) == (other.lhs, other.rhs)
@@ -65,6 +69,27 @@ class Rule:
 
         walk(self.rhs, -1)
         return objects, nonterminals
+
+
+def _normal(symbol: str | Node) -> str | Node:
+    """One form for equal symbols: a node without children is its name."""
+    if isinstance(symbol, str) or not symbol.children:
+        return _checked_name(symbol if isinstance(symbol, str) else symbol.name)
+    name, children = symbol
+    if not isinstance(children, tuple):
+        raise GrammarError(f"Expected a tuple of children, actual Node({name!r}, {children!r}).")
+    if is_nonterminal(_checked_name(name)):
+        raise GrammarError(f"Expected children below an object (first letter lower-case), actual '{symbol}'.")
+    return Node(name, tuple(map(_normal, children)))
+
+
+def _checked_name(name: str) -> str:
+    if not _NAME.fullmatch(name) or name in _EMPTY:
+        raise GrammarError(
+            f"Expected names of letters, digits, '_' and '-', actual {name!r}; give each symbol as an argument of its "
+            "own, what hangs below an object as Node(name, children), and no symbols for the empty production."
+        )
+    return name
 
 
 def is_nonterminal(name: str) -> bool:
@@ -221,7 +246,7 @@ def parse(text: str) -> list[Rule]:
         else:
             left, arrow, right = (line if "->" in line else line.replace("→", "->")).partition("->")
             lhs = left.strip()
-            if not arrow or not re.fullmatch(r"[\w\-]+", lhs):
+            if not arrow or not _NAME.fullmatch(lhs):
                 raise GrammarError(f"Line {number}: expected 'Name -> symbols | symbols', actual '{line}'.")
         rules += _alternatives(lhs, right, number)
     return rules
