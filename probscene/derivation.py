@@ -41,9 +41,16 @@ class Derivation:
         """The derivations that given rules ``(N, T)`` spell; -1 pads.
 
         Raises:
-            GrammarError: a rule that does not expand the nonterminal on top of the stack, or rules after the end.
+            GrammarError: a rule that does not expand the nonterminal on top of the stack, rules after the end or after
+                padding, or numbers that are no rule's.
         """
-        given = rules.long()
+        given, K = rules.long(), len(grammar.rules)
+        if ((given < -1) | (given >= K)).any():
+            raise GrammarError(
+                f"Expected rules among 0..{K - 1}, or -1 for padding, actual {int(given.min())}..{int(given.max())}."
+            )
+        if ((given[:, 1:] >= 0) & (given[:, :-1] < 0)).any():
+            raise GrammarError("Expected padding (-1) only after a scene's last rule, actual rules after padding.")
 
         def choose(t, frontier, previous):
             rule = given[:, t]
@@ -93,7 +100,7 @@ def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) ->
     """Sample derivations: a Pyro program with sites ``rule_0``, ``rule_1``, ... of shape ``(N, 1)``.
 
     Call it inside ``pyro.plate("scenes", num_scenes, dim=-2)``. It stops when every scene is complete, at the latest
-    after ``max_steps``; what is not complete by then says so in ``Derivation.complete`` and is for the caller to redraw.
+    after ``max_steps``; what is not complete by then says so in ``Derivation.complete``, for the caller to redraw.
 
     Args:
         policy: the structure prior, a PCFG, or a guide.
