@@ -14,7 +14,8 @@ class RenderBatch(NamedTuple):
         image: ``(N, 3, H, W)`` uint8 RGB (a view of interleaved storage, channels last).
         instance: ``(N, H, W)`` int16, node index + 1 of the visible node, 0 where there is none.
         kind: ``(N, M)`` int64 index into the drawing's kinds; -1 pads and at nodes that are not drawn with a label.
-        box: ``(N, M, 4)`` float32 x0, y0, x1, y1 in pixels, the extent of the visible mask, ends exclusive; zeros if none.
+        box: ``(N, M, 4)`` float32 x0, y0, x1, y1 in pixels, the extent of the visible mask, ends exclusive; zeros if
+            there is none.
         amodal_box: ``(N, M, 4)`` the extent of the whole silhouette, what others cover and what lies outside the canvas
             included; zeros if the silhouette is empty.
         pixels: ``(N, M)`` int64, visible pixels.
@@ -31,6 +32,6 @@ class RenderBatch(NamedTuple):
 
 
 class Renderer(Protocol):
-    """Turns a drawing into labelled pixels; the same drawing gives the same bytes, for any batch size and thread count."""
+    """Turns a drawing into labelled pixels; a drawing gives the same bytes for any batch size and thread count."""
 
     def __call__(self, drawing: Drawing) -> RenderBatch: ...

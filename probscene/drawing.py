@@ -105,7 +105,8 @@ class Sprites:
 class Layer:
     """``Sprites`` resolved on a batch of scenes: every tensor has its full shape.
 
-    ``present (N, M)`` bool; ``sprite (N, M)`` int64; ``x, y, angle, scale_x, scale_y (N, M)`` float32; ``tint (N, M, 3)``.
+    ``present (N, M)`` bool; ``sprite (N, M)`` int64; ``x, y, angle, scale_x, scale_y (N, M)`` float32; ``tint
+    (N, M, 3)``.
     """
 
     atlas: Atlas

@@ -3,11 +3,13 @@
 Axis letters: N scenes, M nodes.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import pyro
 import torch
 from pyro import poutine
+from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from probscene.derivation import Derivation, derive_complete
@@ -50,41 +52,45 @@ def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
 
 
 def realise(
-    model: SceneModel,
+    model: SceneModel | Callable[[int], Drawing],
     derivation: Derivation,
     parameters: dict[str, Tensor] | None = None,
     failures: Tensor | None = None,
 ) -> Scenes:
-    """Run the model's program on given derivations, and on given parameters where there are any.
+    """Run a model's program on given derivations, and on given parameters where there are any.
+
+    Args:
+        model: a scene model, or a Pyro program that is called with the number of scenes.
 
     Raises:
         ModelError: the program's sites are not what a scene model's must be, or it returns no ``Drawing``.
     """
     N = len(derivation)
     sites = derivation.sites()
+    name = getattr(model, "name", getattr(model, "__name__", "?"))
     with torch.no_grad(), poutine.block():
-        program = poutine.condition(model.program, data={**sites, **(parameters or {})})
-        trace = poutine.trace(program).get_trace(N, model.prior)
+        program = poutine.condition(model, data={**sites, **(parameters or {})})
+        trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"]["value"]
     if not isinstance(drawing, Drawing) or len(drawing) != N:
         raise ModelError(
-            f"Expected the program of model {model.name!r} to return a Drawing of {N} scenes (scene.draw(...)), "
+            f"Expected the program of model {name!r} to return a Drawing of {N} scenes (scene.draw(...)), "
             f"actual {type(drawing).__name__}."
         )
     values, counted = {}, {}
     log_prob = torch.zeros(N)
-    for name, site in trace.nodes.items():
-        if site["type"] != "sample" or name in sites or isinstance(site["fn"], poutine.subsample_messenger._Subsample):
+    for key, site in trace.nodes.items():
+        if site["type"] != "sample" or key in sites or site_is_subsample(site):
             continue
         value, mask = site["value"], site["mask"]
         if value.ndim < 2 or value.shape[0] != N:
             raise ModelError(
-                f"Expected site {name!r} of model {model.name!r} inside the scenes plate, shape ({N}, nodes), "
+                f"Expected site {key!r} of model {name!r} inside the scenes plate, shape ({N}, nodes), "
                 f"actual {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
             )
         logp = site["fn"].log_prob(value)
         mask = torch.ones(logp.shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(logp.shape)
-        values[name], counted[name] = value, mask
+        values[key], counted[key] = value, mask
         log_prob = log_prob + logp.where(mask, 0.0).sum(-1)
     return Scenes(
         derivation,

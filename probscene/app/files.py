@@ -67,7 +67,7 @@ def make_folder(path: Path) -> Path:
 def machine_error(error: OSError, path: Path) -> MachineError:
     """The message for an ``OSError`` while writing ``path``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return MachineError(f"The disk is full: could not write {path}. Free some space and run the same command again.")
+        return MachineError(f"The disk is full: could not write {path}. Free some space and run the command again.")
     return MachineError(f"Could not write {path}: {error.strerror or error}.")
 
 

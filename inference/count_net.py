@@ -1,0 +1,109 @@
+"""A network that counts: how many objects of each class an image shows, wherever they stand.
+
+Fully convolutional, so it is indifferent to place. Every cell of a coarse map holds a distribution over background and
+classes; an object spreads one unit over the four cells nearest to its centre, and the features are the sums of the map:
+soft counts of each class, and their total. Not in the paper, whose presence network (``presence_net``) never learns
+which classes there are in the time that a laptop has. ``count_training`` trains it.
+"""
+
+import copy
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from probscene.inference.features import enter
+
+STRIDE = 8  # pixels of the reduced image a cell
+
+
+class CountNet(nn.Module):
+    """Soft counts of the classes and their total: D = classes + 1.
+
+    Args:
+        classes: the kinds that are counted.
+        channels: of the image, 1 or 3.
+        canvas: height and width of the images; they are reduced by 2, 4 or 8 to about 128.
+        width: channels at strides 2, 4 and 8.
+        blocks: residual blocks at strides 4 and 8.
+    """
+
+    def __init__(
+        self,
+        classes: tuple[str, ...],
+        channels: int,
+        canvas: tuple[int, int],
+        width: tuple[int, int, int] = (16, 32, 64),
+        blocks: tuple[int, int] = (1, 1),
+    ):
+        super().__init__()
+        self.names = (*classes, "total")
+        self.channels = channels
+        self.reduce = min(8, 2 ** max(0, round(math.log2(max(canvas) / 128))))
+        a, b, c = width
+        self.body = nn.Sequential(
+            *_conv(channels, a, 5, 2),
+            *_conv(a, b, 3, 2),
+            *(_Residual(b) for _ in range(blocks[0])),
+            *_conv(b, c, 3, 2),
+            *(_Residual(c) for _ in range(blocks[1])),
+            nn.Conv2d(c, len(classes) + 1, 1),
+        )
+        with torch.no_grad():  # start from "nothing here", which nearly every cell holds
+            self.body[-1].weight.mul_(0.3)
+            self.body[-1].bias.zero_()
+            self.body[-1].bias[0] = 3.0
+        self._fused: nn.Module | None = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Logits ``(N, 1 + classes, h, w)`` of the cells; ``x (N, C, 8h, 8w)`` is a reduced image."""
+        return self.body(x.contiguous(memory_format=torch.channels_last))
+
+    def enter(self, images: Tensor) -> Tensor:
+        """Reduced images, padded to whole cells."""
+        x = enter(images, self.channels, self.reduce)
+        return F.pad(x, (0, -x.shape[-1] % STRIDE, 0, -x.shape[-2] % STRIDE))
+
+    @torch.no_grad()
+    def embed(self, images: Tensor) -> Tensor:
+        """``(N, D)`` soft counts and total of ``(N, 3, H, W)`` uint8 images."""
+        if self._fused is None:
+            self._fused = _fuse(self.body)
+        out = []
+        for some in images.split(64):
+            x = self.enter(some).contiguous(memory_format=torch.channels_last)
+            out.append(self._fused(x).softmax(1)[:, 1:].sum((2, 3)))
+        counts = torch.cat(out) if out else torch.zeros(0, len(self.names) - 1)
+        return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
+
+    def train(self, mode: bool = True) -> "CountNet":
+        """As in torch; what inference has fused is made anew."""
+        self._fused = None
+        return super().train(mode)
+
+
+def _conv(inner: int, outer: int, size: int, stride: int) -> list[nn.Module]:
+    convolution = nn.Conv2d(inner, outer, size, stride, size // 2, bias=False)
+    return [convolution, nn.BatchNorm2d(outer), nn.ReLU(inplace=True)]
+
+
+class _Residual(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.a, self.b = nn.Sequential(*_conv(width, width, 3, 1)), nn.Sequential(*_conv(width, width, 3, 1)[:2])
+        nn.init.zeros_(self.b[1].weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.b(self.a(x)), inplace=True)
+
+
+def _fuse(body: nn.Module) -> nn.Module:
+    """A copy for inference with every batch norm folded into the convolution before it."""
+    fused = copy.deepcopy(body).eval()
+    for parent in [m for m in fused.modules() if isinstance(m, nn.Sequential)]:
+        for i, (first, second) in enumerate(zip(list(parent), list(parent)[1:], strict=False)):
+            if isinstance(first, nn.Conv2d) and isinstance(second, nn.BatchNorm2d):
+                parent[i], parent[i + 1] = fuse_conv_bn_eval(first, second), nn.Identity()
+    return fused.to(memory_format=torch.channels_last)

@@ -1,0 +1,187 @@
+"""Training the count network on prior renders with their free labels.
+
+The loss is the cross-entropy of the cells and the squared error of the soft counts. Most of an image is empty, so the
+first part trains on crops around objects, which shows the network several times as many of them a second; the last part
+trains on whole images, without which crops leave a bias in the background. Axis letters: N images, M nodes, K crops.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from probscene.errors import ProbsceneError
+from probscene.inference.count_net import STRIDE, CountNet
+from probscene.inference.features import Draw, Examples
+from probscene.inference.resume import batch_seed, restore_training, training_state
+from probscene.sampling import seed_everything
+
+
+@dataclass(frozen=True)
+class CountSchedule:
+    """How long and how; the defaults were chosen on Multi-MNIST.
+
+    Args:
+        steps: of Adam.
+        whole: fraction of the steps, the last ones, on whole images.
+        images: images a step.
+        crops: crops a step, from those images.
+        crop: their side in pixels of the reduced image.
+        window: side of the middle part of a crop that counts, cells; the rest is context.
+        anywhere: fraction of the crops at random places.
+        learning_rate: after a warm-up of 50 steps; it falls to 0 along a cosine.
+        count_weight: of the squared error of the soft counts.
+        min_visible: objects less visible than this are not counted.
+    """
+
+    steps: int = 3000
+    whole: float = 0.25
+    images: int = 16
+    crops: int = 64
+    crop: int = 48
+    window: int = 4
+    anywhere: float = 0.2
+    learning_rate: float = 8e-3
+    count_weight: float = 0.5
+    min_visible: float = 0.25
+
+
+class CountTraining:
+    """Resumable training: images are drawn 16 steps at a time, each draw seeded by its number.
+
+    Args:
+        net: trained in place.
+        draw: labelled prior renders.
+        schedule: how long and how.
+        seed: of everything random.
+
+    Attributes:
+        done: steps taken.
+    """
+
+    STEPS_A_DRAW = 16
+
+    def __init__(self, net: CountNet, draw: Draw, schedule: CountSchedule = CountSchedule(), seed: int = 0):
+        self.net, self.draw, self.schedule, self.seed = net, draw, schedule, seed
+        self.optimiser = torch.optim.AdamW(
+            net.parameters(), lr=schedule.learning_rate, betas=(0.9, 0.99), weight_decay=1e-3
+        )
+        self.done = 0
+
+    def run(self, each: Callable[["CountTraining", float], None] | None = None) -> None:
+        """Take the steps that are left; ``each`` sees the training and the mean loss after every draw.
+
+        Raises:
+            ProbsceneError: the loss is no longer finite.
+        """
+        s = self.schedule
+        self.net.train()
+        while self.done < s.steps:
+            seed_everything(batch_seed(self.seed, self.done))
+            steps = min(self.STEPS_A_DRAW, s.steps - self.done)
+            drawn = self.draw(steps * s.images)
+            total = 0.0
+            for i in range(steps):
+                rows = slice(i * s.images, (i + 1) * s.images)
+                total += self._step(Examples(*(x[rows] for x in drawn)))
+                self.done += 1
+            if not math.isfinite(total):
+                raise ProbsceneError(
+                    f"Expected a finite loss of the count network, actual {total} at step {self.done}; try a lower "
+                    "learning rate."
+                )
+            if each is not None:
+                each(self, total / steps)
+        self.net.eval()
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        return training_state(self.net, self.optimiser, done=self.done)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        numbers = restore_training(self.net, self.optimiser, tensors)
+        self.done = int(numbers["done"])
+
+    def _step(self, batch: Examples) -> float:
+        s = self.schedule
+        factor = min(1.0, (self.done + 1) / 50) * 0.5 * (1 + math.cos(math.pi * self.done / s.steps))
+        for group in self.optimiser.param_groups:
+            group["lr"] = s.learning_rate * factor
+        image = self.net.enter(batch.image)
+        centre = batch.centre / self.net.reduce
+        label = batch.label.masked_fill(batch.visible < s.min_visible, -1)
+        margin = 0
+        if self.done < s.steps * (1 - s.whole) and min(image.shape[-2:]) > s.crop:
+            image, centre, label = self._crop(image, centre, label)
+            margin = (s.crop // STRIDE - s.window) // 2
+        target = cells(centre, label, len(self.net.names) - 1, image.shape[-2] // STRIDE, image.shape[-1] // STRIDE)
+        loss = count_loss(self.net(image), target, margin, s.count_weight)
+        self.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        self.optimiser.step()
+        return loss.item()
+
+    def _crop(self, image: Tensor, centre: Tensor, label: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Crops ``(K, C, crop, crop)`` with an object somewhere in their window, or at random places."""
+        s = self.schedule
+        N, C, H, W = image.shape
+        scene, node = (label >= 0).nonzero(as_tuple=True)
+        near = round(s.crops * (1 - s.anywhere)) if len(scene) else 0
+        pick = torch.randperm(len(scene))[:near] if near <= len(scene) else torch.randint(len(scene), (near,))
+        jitter = (torch.rand(near, 2) - 0.5) * (s.window * STRIDE)
+        which = torch.cat([scene[pick], torch.randint(N, (s.crops - near,))])
+        middle = torch.cat(
+            [centre[scene[pick], node[pick]] + jitter, torch.rand(s.crops - near, 2) * torch.tensor([W, H])]
+        )
+        corner = middle.floor().long() - s.crop // 2
+        pad = s.crop
+        corner = torch.minimum(corner.clamp(min=-pad), torch.tensor([W, H]))
+        padded = F.pad(image, (pad,) * 4)
+        span = torch.arange(s.crop)
+        rows = (corner[:, 1:] + pad + span)[:, :, None]
+        columns = (corner[:, :1] + pad + span)[:, None, :]
+        crops = padded.permute(0, 2, 3, 1)[which[:, None, None], rows, columns].permute(0, 3, 1, 2)
+        return crops, centre[which] - corner[:, None].float(), label[which]
+
+
+def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) -> Tensor:
+    """What each cell should hold: probabilities of background and classes, ``(N, 1 + classes, height, width)``.
+
+    An object spreads one unit bilinearly over the four cells around its centre; where objects crowd into a cell it holds
+    at most one between them.
+    """
+    N = len(label)
+    mass = torch.zeros(N, classes, height, width)
+    at = centre / STRIDE - 0.5
+    low = at.floor()
+    part = at - low
+    low = low.long()
+    for dx in (0, 1):
+        for dy in (0, 1):
+            x, y = low[..., 0] + dx, low[..., 1] + dy
+            share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
+            inside = (label >= 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            n, m = inside.nonzero(as_tuple=True)
+            mass.index_put_((n, label[n, m], y[n, m], x[n, m]), share[n, m], accumulate=True)
+    mass = mass / mass.sum(1, keepdim=True).clamp(min=1.0)
+    return torch.cat([1 - mass.sum(1, keepdim=True), mass], 1)
+
+
+def count_loss(logits: Tensor, target: Tensor, margin: int, count_weight: float) -> Tensor:
+    """Cross-entropy of the cells, summed over an image, and the squared error of its soft counts and their total.
+
+    Args:
+        logits, target: ``(N, 1 + classes, h, w)``.
+        margin: cells at the border that do not count.
+    """
+    h, w = logits.shape[-2:]
+    inner = (..., slice(margin, h - margin), slice(margin, w - margin))
+    log_prob, target = F.log_softmax(logits[inner], 1), target[inner]
+    entropy = -(target * log_prob).sum((1, 2, 3))
+    error = (log_prob.exp() - target)[:, 1:].sum((2, 3))
+    return (entropy + count_weight * (error.square().sum(1) + error.sum(1).square())).mean()

@@ -1,0 +1,96 @@
+"""Feature networks: what they are trained on and how images enter them.
+
+They are trained on the model's own prior renders only, whose labels come free. Axis letters: N scenes, M nodes, D
+features, C H W.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from probscene.batch import RenderBatch
+from probscene.errors import ProbsceneError
+
+
+class Examples(NamedTuple):
+    """Labelled renders, ready for training.
+
+    Attributes:
+        image: ``(N, 3, H, W)`` uint8.
+        label: ``(N, M)`` int64 class of each node, -1 where it has none or cannot be seen.
+        centre: ``(N, M, 2)`` float32 x and y of the middle of its whole silhouette, pixels.
+        visible: ``(N, M)`` visible fraction.
+    """
+
+    image: Tensor
+    label: Tensor
+    centre: Tensor
+    visible: Tensor
+
+
+class FeatureNet(Protocol):
+    """``embed((N, 3, H, W) uint8) -> (N, D)``, in batches of any size; ``names`` has one name a feature."""
+
+    names: tuple[str, ...]
+
+    def embed(self, images: Tensor) -> Tensor: ...
+
+
+Draw = Callable[[int], Examples]
+
+
+def examples(batch: RenderBatch, classes: Tensor) -> Examples:
+    """The labels of a rendered batch.
+
+    Args:
+        batch: from a renderer.
+        classes: ``(kinds + 1,)`` int64, the class of each kind of the grammar, -1 for none; the last entry is -1.
+    """
+    label = classes[batch.kind].masked_fill(batch.pixels == 0, -1)
+    box = batch.amodal_box
+    return Examples(batch.image, label, (box[..., :2] + box[..., 2:]) / 2, batch.visible)
+
+
+def class_table(kinds: tuple[str, ...], classes: tuple[str, ...]) -> Tensor:
+    """The ``classes`` argument of ``examples``: index ``-1`` (padding) falls on the last entry."""
+    return torch.tensor([classes.index(kind) if kind in classes else -1 for kind in kinds] + [-1])
+
+
+def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
+    """Images as a network reads them: ``(N, channels, H/reduce, W/reduce)`` float32 in 0..1.
+
+    Args:
+        images: ``(N, 3, H, W)`` uint8; one channel stands for all three of a grey image.
+        reduce: block average, 1, 2, 4, ...; H and W are padded with zeros to a multiple.
+    """
+    x = images[:, :channels].to(torch.int16)
+    N, C, H, W = x.shape
+    if H % reduce or W % reduce:
+        x = torch.nn.functional.pad(x, (0, -W % reduce, 0, -H % reduce))
+    if reduce > 1:
+        # Sums of at most 64 bytes fit in 16 bits; two passes over small integers beat pooling in floating point.
+        if reduce > 8:
+            raise ProbsceneError(f"Expected reduce at most 8, actual {reduce}.")
+        x = sum(x[..., i::reduce] for i in range(reduce))
+        x = sum(x[..., i::reduce, :] for i in range(reduce))
+    return x.float() * (1 / (255 * reduce * reduce))
+
+
+@torch.no_grad()
+def embed_all(net: FeatureNet, batches: Iterable[Tensor], each: Callable[[int], None] | None = None) -> Tensor:
+    """Features ``(L, D)`` of a stream of image batches; ``each`` is told how many more images are done.
+
+    Raises:
+        ProbsceneError: a feature is not finite.
+    """
+    out = []
+    for images in batches:
+        out.append(net.embed(images))
+        if each is not None:
+            each(len(images))
+    features = torch.cat(out)
+    if not torch.isfinite(features).all():
+        raise ProbsceneError("Expected finite features, actual NaN or infinity; train the feature network again.")
+    return features

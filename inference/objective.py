@@ -1,0 +1,134 @@
+"""The objective: a score-function estimate of the divergence between generated and real features, for Pyro's ``SVI``.
+
+    svi = SVI(model, guide, ClippedAdam({"lr": 1e-2}), loss=ScoreFunction(observe, KDELogRatio()))
+    svi.step(500, real=features)
+
+Structures T come from the guide, parameters from the model's program run on them, and the cost c of a scene from a
+divergence between the features of the rendered batch and those of real images [1]. The gradient is
+
+    sum_i (c_i - b_i) grad log q(T_i) / N,
+
+with the exact marginal over latent vectors in log q; parameters keep their prior, so log q(alpha | T) has no gradient.
+A derivation longer than T_max is redrawn, and a scene that took more than ``reject_threshold`` failed attempts pays
+``reject_weight`` more; the paper's supplement adds that outside the score function, where it has no gradient.
+
+Departures that an argument turns on: ``updates`` takes several steps on one rendered batch with the clipped importance
+ratio of [3]; ``baseline="leave_one_out"`` uses the mean of the other scenes' costs [4] instead of the moving average
+[1, 2].
+
+References:
+    [1] Devaranjan, Kar, Fidler, *Meta-Sim2*, ECCV 2020, section 3.3.
+    [2] Williams, *Simple statistical gradient-following algorithms*, Machine Learning 1992.
+    [3] Schulman et al., *Proximal policy optimization algorithms*, 2017.
+    [4] Kool, van Hoof, Welling, *Buy 4 REINFORCE samples, get a baseline for free!*, 2019.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from probscene.derivation import Derivation, derive_complete
+from probscene.errors import ProbsceneError
+from probscene.inference.divergence import Divergence
+from probscene.sampling import Scenes, realise
+
+BASELINES = ("moving_average", "leave_one_out", "none")
+
+
+class Batch(NamedTuple):
+    """The generated scenes that updates are taken on.
+
+    Attributes:
+        derivation: structures, N.
+        log_prob: ``(N,)`` log q(T) under the guide that drew them.
+        features: ``(N, D)``.
+        cost: ``(N,)``.
+        advantage: ``(N,)`` cost less baseline, scaled.
+        rejections: mean failed attempts a scene.
+    """
+
+    derivation: Derivation
+    log_prob: Tensor
+    features: Tensor
+    cost: Tensor
+    advantage: Tensor
+    rejections: float
+
+
+class ScoreFunction:
+    """A loss for ``pyro.infer.SVI``: ``loss(model, guide, num_scenes, real=...)``.
+
+    Args:
+        observe: features ``(N, D)`` of a batch of ``Scenes``, for example render and embed; no gradient is taken.
+        divergence: one cost a scene.
+        baseline: ``"moving_average"``, ``"leave_one_out"`` or ``"none"``.
+        decay: weight of the new value in the moving average.
+        updates: steps taken on one rendered batch.
+        clip: the importance ratio of those steps stays within ``1 +- clip``.
+        scale: of the whole cost; under Adam it changes nothing but the weight of the rejections.
+        reject_weight, reject_threshold: lambda and epsilon of section 3.3.
+
+    Attributes:
+        batch: the last ``Batch``, for logging.
+
+    Raises:
+        ProbsceneError: an unknown baseline, or numbers out of range.
+    """
+
+    def __init__(
+        self,
+        observe: Callable[[Scenes], Tensor],
+        divergence: Divergence,
+        baseline: str = "leave_one_out",
+        decay: float = 0.05,
+        updates: int = 1,
+        clip: float = 0.2,
+        scale: float = 1.0,
+        reject_weight: float = 1e-2,
+        reject_threshold: float = 1.0,
+    ):
+        if baseline not in BASELINES:
+            raise ProbsceneError(f"Expected a baseline among {', '.join(BASELINES)}, actual {baseline!r}.")
+        if updates < 1 or not 0 < decay <= 1 or clip <= 0:
+            raise ProbsceneError(
+                f"Expected updates >= 1, decay in (0, 1] and clip > 0, actual {updates}, {decay} and {clip}."
+            )
+        self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
+        self.updates, self.clip, self.scale = updates, clip, scale
+        self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
+        self.average: float | None = None
+        self.batch: Batch | None = None
+        self._used = 0
+
+    def __call__(self, model: Callable[[int], Any], guide, num_scenes: int, real: Tensor) -> Tensor:
+        """A scalar whose value is the mean cost and whose gradient is the score-function estimate."""
+        if self.batch is None or self._used == self.updates:
+            self.batch, self._used = self._draw(model, guide, num_scenes, real), 0
+        self._used += 1
+        batch = self.batch
+        ratio = torch.exp(guide.log_prob(batch.derivation) - batch.log_prob)
+        clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
+        surrogate = torch.maximum(batch.advantage * ratio, batch.advantage * clipped).mean()
+        return batch.cost.mean() + surrogate - surrogate.detach()
+
+    def _draw(self, model, guide, num_scenes: int, real: Tensor) -> Batch:
+        with torch.no_grad():
+            derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps)
+            features = self.observe(realise(model, derivation, failures=failures))
+            cost = self.divergence(features, real)
+            cost = cost + self.reject_weight * (failures > self.reject_threshold)
+            advantage = self.scale * (cost - self._baseline(cost))
+            return Batch(
+                derivation, guide.log_prob(derivation), features, cost, advantage, failures.float().mean().item()
+            )
+
+    def _baseline(self, cost: Tensor) -> Tensor | float:
+        if self.baseline == "leave_one_out":
+            return (cost.sum() - cost) / (len(cost) - 1)
+        if self.baseline == "none":
+            return 0.0
+        before = 0.0 if self.average is None else self.average
+        self.average = self.decay * cost.mean().item() + (1 - self.decay) * before
+        return self.average
