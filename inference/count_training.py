@@ -152,8 +152,8 @@ class CountTraining:
 def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) -> Tensor:
     """What each cell should hold: probabilities of background and classes, ``(N, 1 + classes, height, width)``.
 
-    An object spreads one unit bilinearly over the four cells around its centre; where objects crowd into a cell it holds
-    at most one between them.
+    An object spreads one unit bilinearly over the four cells around its centre; where objects crowd into a cell it
+    holds at most one between them.
     """
     N = len(label)
     mass = torch.zeros(N, classes, height, width)

@@ -1,8 +1,8 @@
 """Divergences between generated and real features, as one cost a scene so that credit can be assigned.
 
 A divergence is called with generated ``(N, D)`` and real ``(L, D)`` features and returns ``(N,)``: descending the mean
-of ``cost.detach() * log q(scene)`` brings the two distributions together. Costs carry no gradient: with one kernel on both
-sides, differentiating through the estimate of log q has a minimiser other than p.
+of ``cost.detach() * log q(scene)`` brings the two distributions together. Costs carry no gradient: with one kernel on
+both sides, differentiating through the estimate of log q has a minimiser other than p.
 
 References:
     [1] Devaranjan, Kar, Fidler, *Meta-Sim2*, ECCV 2020, section 3.3: the kernel density log ratio.

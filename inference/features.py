@@ -31,7 +31,7 @@ class Examples(NamedTuple):
 
 
 class FeatureNet(Protocol):
-    """``embed((N, 3, H, W) uint8) -> (N, D)``, in batches of any size; ``names`` has one name a feature."""
+    """``embed((N, 1 or 3, H, W) uint8) -> (N, D)``, in batches of any size; ``names`` has one name a feature."""
 
     names: tuple[str, ...]
 

@@ -1,8 +1,8 @@
 """The paper's feature network: which classes an image shows (Meta-Sim2, supplement).
 
 Six residual blocks of two 3x3 convolutions with batch norm and leaky ReLU, average pooling, three fully connected
-layers; binary presences under sigmoid cross-entropy. The features are the average pool and the first two fully connected
-layers. Widths are not given in the paper and are arguments here; grey images are copied to three channels as there.
+layers; binary presences under sigmoid cross-entropy. The features are the average pool and the first two fully
+connected layers. Widths are not given in the paper and are arguments here; grey images are copied to three channels.
 """
 
 from collections.abc import Callable
@@ -37,15 +37,15 @@ class PresenceNet(nn.Module):
         )
 
     def layers(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Features ``(N, D)`` and presence logits ``(N, classes)`` of uint8 images ``(N, 3, H, W)``."""
-        pool = self.blocks(images.float() / 255).mean((2, 3))
+        """Features ``(N, D)`` and presence logits ``(N, classes)`` of uint8 images ``(N, 1 or 3, H, W)``."""
+        pool = self.blocks(images.expand(-1, 3, -1, -1).float() / 255).mean((2, 3))
         first = F.leaky_relu(self.fc1(pool), 0.01)
         second = F.leaky_relu(self.fc2(first), 0.01)
         return torch.cat([pool, first, second], 1), self.out(second)
 
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
-        """``(N, D)`` features of ``(N, 3, H, W)`` uint8 images."""
+        """``(N, D)`` features of ``(N, 1 or 3, H, W)`` uint8 images."""
         parts = [self.layers(some)[0] for some in images.split(50)]
         return torch.cat(parts) if parts else torch.zeros(0, len(self.names))
 

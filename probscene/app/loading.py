@@ -46,9 +46,9 @@ def load_model(reference: str) -> SceneModel:
     return _exported(vars(module), reference)
 
 
-def renderer_for(model: SceneModel) -> SpriteRenderer:
-    """The renderer that reads the model's drawings."""
-    return SpriteRenderer(model.canvas)
+def renderer_for(model: SceneModel, threads: int | None = None) -> SpriteRenderer:
+    """The renderer that reads the model's drawings; one thread for every core where no number is given."""
+    return SpriteRenderer(model.canvas, threads)
 
 
 def _exported(names: dict, reference: str) -> SceneModel:

@@ -1,0 +1,93 @@
+"""How long and how to learn: everything that a fit depends on beside the model, the target and the seed."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from probscene.errors import ProbsceneError
+from probscene.inference.count_training import CountSchedule
+from probscene.inference.divergence import MMD, Divergence, KDELogRatio
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A fit's configuration; it is recorded with the run.
+
+    Args:
+        features: ``"count"`` for the count network, ``"presence"`` for the paper's.
+        count: the count network's schedule.
+        width, blocks: the count network's size.
+        presence_images, presence_epochs: the presence network's training set and its longest training.
+        objective: ``"kde"`` or ``"mmd"``, a shared reward.
+        variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first two also of ``MMD``.
+        pretrain_derivations, pretrain_epochs: maximum likelihood on the prior.
+        batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Learner`` and ``ScoreFunction``.
+        baseline, scale: see ``ScoreFunction``.
+        hidden, num_latents, index: see ``LSTMGuide``.
+    """
+
+    features: str = "count"
+    count: CountSchedule = field(default_factory=CountSchedule)
+    width: tuple[int, int, int] = (16, 32, 64)
+    blocks: tuple[int, int] = (1, 1)
+    presence_images: int = 5000
+    presence_epochs: int = 10
+    objective: str = "kde"
+    variance: float | None = 1.0
+    marginal_variance: float | None = 0.1
+    leave_one_out: bool = True
+    pretrain_derivations: int = 5000
+    pretrain_epochs: int = 10
+    batches: int = 60
+    num_scenes: int = 500
+    num_real: int | None = None
+    updates: int = 3
+    learning_rate: float = 1e-2
+    cosine: bool = True
+    baseline: str = "leave_one_out"
+    scale: float = 1.0
+    hidden: int = 50
+    num_latents: int = 1
+    index: bool = True
+
+    @staticmethod
+    def of(record: dict[str, Any]) -> "Preset":
+        """From ``dataclasses.asdict``, as a run's JSON keeps it."""
+        whole = {key: tuple(value) if isinstance(value, list) else value for key, value in record.items()}
+        return Preset(**{**whole, "count": CountSchedule(**record["count"])})
+
+    def divergence(self) -> Divergence:
+        """The objective's divergence."""
+        if self.objective == "mmd":
+            return MMD(self.variance, shared=True)
+        return KDELogRatio(self.variance, self.marginal_variance, self.leave_one_out)
+
+
+QUICK = Preset()
+DEFAULT = replace(QUICK, batches=120)
+# Section 4.1 and supplement: 20 epochs of 5,000 target images in batches of 500 are 200 updates.
+PAPER = Preset(
+    features="presence",
+    variance=None,
+    marginal_variance=None,
+    leave_one_out=False,
+    batches=200,
+    num_real=500,
+    updates=1,
+    learning_rate=1e-4,
+    cosine=False,
+    baseline="moving_average",
+    scale=1e-2,
+    index=False,
+)
+PRESETS = {"quick": QUICK, "default": DEFAULT, "paper": PAPER}
+
+
+def preset(name: str) -> Preset:
+    """The preset of a name.
+
+    Raises:
+        ProbsceneError: there is none.
+    """
+    if name not in PRESETS:
+        raise ProbsceneError(f"Expected a preset among {', '.join(PRESETS)}, actual {name!r}.")
+    return PRESETS[name]

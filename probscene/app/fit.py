@@ -1,0 +1,278 @@
+"""``probscene fit``: from a model and a folder of unlabelled images to a run folder.
+
+Four stages: the feature network on prior renders, features of the target images, the guide's pretraining, and the
+learning of structure. Each goes on after an interruption to the same result. Only the images are read; labels play no
+part.
+"""
+
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import probscene
+from probscene.app.files import write_text
+from probscene.app.loading import load_model, renderer_for
+from probscene.app.run import Run
+from probscene.dataset import ImageFolder
+from probscene.errors import RunError
+from probscene.inference.count_net import CountNet
+from probscene.inference.count_training import CountTraining
+from probscene.inference.features import Examples, FeatureNet, class_table, embed_all, examples
+from probscene.inference.guide import LSTMGuide
+from probscene.inference.learn import Learner
+from probscene.inference.objective import ScoreFunction
+from probscene.inference.presence_net import PresenceNet, PresenceTraining
+from probscene.inference.presets import Preset
+from probscene.inference.pretrain import pretrain
+from probscene.inference.resume import batch_seed
+from probscene.model import SceneModel
+from probscene.sampling import Scenes, sample, seed_everything
+
+Progress = Callable[[str, int, int, str], None]
+"""Called with the stage, what of it is done, of how much, and a note such as the loss."""
+
+SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
+RENDERED_AT_ONCE = 64  # images in memory
+
+
+def create(
+    model: str, target: Path, out: Path, preset: Preset, seed: int, skip_bad: bool = False, threads: int | None = None
+) -> Run:
+    """A new run folder for a fit; the model is checked first, so that a wrong one leaves no folder behind.
+
+    Args:
+        threads: of torch; all that this process may use where None. Another number rounds differently, so it is
+            recorded.
+
+    Raises:
+        ProbsceneError: see ``load_model`` and ``Run.create``.
+    """
+    load_model(model)
+    record = {
+        "version": probscene.__version__,
+        "target": str(Path(target).resolve()),
+        "skip_bad": skip_bad,
+        "seed": seed,
+        "threads": threads or len(os.sched_getaffinity(0)),
+        "preset": dataclasses.asdict(preset),
+        "guide": {"hidden": preset.hidden, "num_latents": preset.num_latents, "index": preset.index},
+    }
+    return Run.create(out, model, record)
+
+
+def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> LSTMGuide:
+    """Finish a run: take the stages that it lacks.
+
+    Args:
+        target: the run's target images, where they are open already.
+
+    Raises:
+        DataError: the target folder cannot be used.
+        RunError: it is not the one that the run was begun with.
+        ProbsceneError: something in the fit is no longer finite; the last checkpoint stays.
+    """
+    if (run.path / "guide.safetensors").is_file():
+        return run.guide()
+    preset, model, threads = Preset.of(run.record["preset"]), run.model, run.record["threads"]
+    view = View(model, threads)
+    torch.set_num_threads(threads)
+    net = _feature_net(run, preset, view, progress)
+    real = _real_features(run, net, model, progress, target)
+    torch.set_num_threads(1)  # the guide's tensors are tiny: a second thread only waits
+    guide = _learn(run, preset, model, view.observe(net), real, progress)
+    run.save("guide", guide.state_dict())
+    (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
+    return guide
+
+
+class View:
+    """A model seen through its renderer: labelled prior renders to train on, and features of scenes."""
+
+    def __init__(self, model: SceneModel, threads: int):
+        self.model, self.threads = model, threads
+        self.render = renderer_for(model, threads)
+        self.classes = class_table(model.grammar.kinds, model.classes)
+
+    def draw(self, num: int) -> Examples:
+        """``num`` labelled renders of the prior."""
+        scenes = sample(self.model, self.model.prior, num)
+        return examples(self.render(scenes.drawing), self.classes)
+
+    def observe(self, net: FeatureNet) -> Callable[[Scenes], Tensor]:
+        """Render and embed, a few images at a time."""
+
+        def features(scenes: Scenes) -> Tensor:
+            torch.set_num_threads(self.threads)
+            starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
+            parts = [net.embed(self.render(scenes.drawing[i : i + RENDERED_AT_ONCE]).image) for i in starts]
+            torch.set_num_threads(1)
+            return torch.cat(parts)
+
+        return features
+
+
+def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet:
+    """The untrained feature network of a preset."""
+    if preset.features == "presence":
+        return PresenceNet(model.classes)
+    return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks)
+
+
+def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> CountNet | PresenceNet:
+    seed_everything(batch_seed(run.record["seed"], 0))
+    net = feature_net(preset, view.model)
+    tensors = run.load("features")
+    if tensors is None:
+        _train(run, preset, view, net, progress)
+    else:
+        net.load_state_dict(tensors)
+    return net.eval()
+
+
+def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, progress: Progress) -> None:
+    seed = batch_seed(run.record["seed"], 1)
+    if isinstance(net, PresenceNet):
+        training = PresenceTraining(net, view.draw, preset.presence_images, preset.presence_epochs, seed=seed)
+        steps = preset.presence_epochs
+    else:
+        training = CountTraining(net, view.draw, preset.count, seed=seed)
+        steps = preset.count.steps
+    keep = Keeper(run, "features", training)
+
+    def each(training, loss):
+        keep({"stage": "features", "step": training.done, "loss": loss})
+        progress("features", training.done, steps, f"loss {loss:.3f}")
+
+    progress("features", training.done, steps, "")
+    training.run(each)
+    keep.finish()
+    run.save("features", net.state_dict())
+    keep.forget()
+
+
+def _real_features(
+    run: Run, net: FeatureNet, model: SceneModel, progress: Progress, target: ImageFolder | None
+) -> Tensor:
+    if target is None:
+        target = open_target(run, progress)
+    cached = run.load("real")
+    if cached is not None:
+        if bytes(cached["fingerprint"].tolist()).hex() != target.fingerprint:
+            raise RunError(
+                f"Expected the target images in {target.path} as they were when the run began, actual others; put them "
+                "back, or begin a new run."
+            )
+        return cached["features"]
+    done = 0
+
+    def each(images):
+        nonlocal done
+        done += images
+        progress("target", done, len(target), "")
+
+    features = embed_all(net, target.batches(RENDERED_AT_ONCE), each)
+    fingerprint = torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
+    run.save("real", {"features": features, "fingerprint": fingerprint})
+    return features
+
+
+def open_target(run: Run, progress: Progress) -> ImageFolder:
+    """The run's target images.
+
+    Raises:
+        DataError: see ``ImageFolder``.
+    """
+    model = run.model
+    return ImageFolder(
+        run.record["target"],
+        model.canvas,
+        model.channels,
+        run.record["skip_bad"],
+        lambda done, total: progress("reading", done, total, ""),
+    )
+
+
+def _learn(
+    run: Run, preset: Preset, model: SceneModel, observe: Callable[[Scenes], Tensor], real: Tensor, progress: Progress
+) -> LSTMGuide:
+    seed = run.record["seed"]
+    seed_everything(batch_seed(seed, 2))
+    guide = LSTMGuide(model.grammar, model.max_steps, **run.record["guide"])
+    objective = ScoreFunction(
+        observe, preset.divergence(), baseline=preset.baseline, updates=preset.updates, scale=preset.scale
+    )
+    learner = Learner(
+        model,
+        guide,
+        objective,
+        real,
+        preset.batches,
+        preset.num_scenes,
+        preset.num_real,
+        preset.learning_rate,
+        preset.cosine,
+        seed=batch_seed(seed, 3),
+    )
+    keep = Keeper(run, "guide", learner)
+    if learner.done == 0:
+        epochs = preset.pretrain_epochs
+        pretrain(
+            guide,
+            model.prior,
+            preset.pretrain_derivations,
+            epochs,
+            progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
+        )
+
+    def each(learner, diagnostics):
+        keep({"stage": "structure", **diagnostics})
+        progress("structure", learner.done, preset.batches, f"cost {diagnostics['cost']:.3f}")
+
+    learner.run(each)
+    keep.finish()
+    return guide
+
+
+class Keeper:
+    """Checkpoints of one training, at most every ``SAVE_EVERY`` seconds, with the lines of the log that belong to them.
+
+    The log is written before the checkpoint, and lines past the checkpoint are dropped when a run goes on.
+    """
+
+    def __init__(self, run: Run, name: str, training):
+        self.run, self.name, self.training = run, f"{name}-checkpoint", training
+        self.log = run.path / "log.jsonl"
+        self.lines = self.log.read_text(encoding="utf-8").splitlines() if self.log.exists() else []
+        self.saved = time.monotonic()
+        tensors = run.load(self.name)
+        if tensors is not None:
+            training.restore(tensors)
+        stage = {"features": "features", "guide": "structure"}[name]
+        self.lines = [line for line in self.lines if not self._is_past(json.loads(line), stage)]
+
+    def __call__(self, line: dict[str, float | str]) -> None:
+        self.lines.append(json.dumps(line))
+        if time.monotonic() - self.saved > SAVE_EVERY:
+            self._save()
+            self.saved = time.monotonic()
+
+    def finish(self) -> None:
+        """Write the log to its end."""
+        write_text(self.log, "".join(f"{line}\n" for line in self.lines))
+
+    def forget(self) -> None:
+        """Delete the checkpoint of a finished training."""
+        (self.run.path / f"{self.name}.safetensors").unlink(missing_ok=True)
+
+    def _save(self) -> None:
+        self.finish()
+        self.run.save(self.name, self.training.state())
+
+    def _is_past(self, line: dict, stage: str) -> bool:
+        return line["stage"] == stage and line.get("step", line.get("batch")) > self.training.done
