@@ -123,7 +123,7 @@ def _rule_probs(grammar: Grammar, name: str, distribution: Counts | Weights, C: 
     probs = _normalised(distribution.probs, None, f"counts of {name}")
     stop = torch.ones(C, 1, dtype=torch.float64)
     stop[: len(probs), 0] = hazards(probs)
-    shares = distribution.weights or (1.0,) * int(recursive.sum())
+    shares = (1.0,) * int(recursive.sum()) if distribution.weights is None else distribution.weights
     split = torch.zeros(len(rules), dtype=torch.float64)
     split[recursive > 0] = _normalised(shares, int(recursive.sum()), f"weights of {name}'s recursive productions")
     return stop * (1 - recursive) / (1 - recursive).sum() + (1 - stop) * split
