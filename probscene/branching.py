@@ -1,0 +1,137 @@
+"""A structure prior as a multi-type branching process: does it end, how long is it, what does it hold; all exact.
+
+Under a ``StructurePrior`` what a nonterminal turns into depends on its type alone: its symbol, how often its list has
+repeated and the rank of the list around it. With ``A[i, j]`` the mean number of j that one i leaves behind, a
+derivation surely ends if the spectral radius of A is below 1, and ``(I - A)^-1`` counts the expected visits. The
+lengths follow from the generating function ``L_i(s) = s sum_k p_ik prod_j L_j(s)``, coefficient by coefficient.
+Reference: Harris, The Theory of Branching Processes, 1963, chapter II.
+
+Axis letters: I types, E productions of types, R children, T steps, K rules.
+"""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from probscene.grammar import Grammar
+from probscene.structure import StructurePrior
+
+CRITICAL = 1 - 1e-6  # the table is float32: a spectral radius from here on counts as 1
+
+
+class Type(NamedTuple):
+    """What decides over an expansion; the indices are clamped where the table no longer tells them apart."""
+
+    symbol: int
+    repeat: int
+    parent_repeat: int
+
+
+class Branching:
+    """The types that can occur under a structure prior and what they turn into.
+
+    Attributes:
+        types: the I types, the start first.
+        owner: ``(E,)`` which type a production expands.
+        rule: ``(E,)`` its rule.
+        prob: ``(E,)`` its probability, above 0.
+        children: ``(E, R)`` the types it leaves behind; I pads.
+    """
+
+    def __init__(self, grammar: Grammar, prior: StructurePrior):
+        self.grammar = grammar
+        _, P, C, _ = prior.table.shape
+        table = prior.table.double().exp().numpy()
+        # A list's repeats become the rank that its elements read, so they are told apart as far as either axis goes.
+        last = max(C, P) - 1
+        below = [[v for v in row if v >= 0] for row in grammar.children.tolist()]
+        recursive = grammar.recursive.tolist()
+        index = {Type(0, 0, 0): 0}
+        todo, productions = list(index), []
+        for v, repeat, around in todo:  # grows while it is read
+            row = table[v, around, min(repeat, C - 1)]
+            own = min(repeat, P - 1) if recursive[v] else around
+            for k in np.flatnonzero(row):
+                left = []
+                for child in below[k]:
+                    kind = Type(v, min(repeat + 1, last), around) if child == v else Type(child, 0, own)
+                    if kind not in index:
+                        index[kind] = len(index)
+                        todo.append(kind)
+                    left.append(index[kind])
+                productions.append((index[v, repeat, around], k, row[k] / row.sum(), left))
+        self.types = todo
+        self.owner = np.array([p[0] for p in productions])
+        self.rule = np.array([p[1] for p in productions])
+        self.prob = np.array([p[2] for p in productions])
+        self.children = np.full((len(productions), grammar.children.shape[1]), len(todo))
+        for e, (*_, left) in enumerate(productions):
+            self.children[e, : len(left)] = left
+
+    @cached_property
+    def mean_offspring(self) -> np.ndarray:
+        """``A``, ``(I, I)``."""
+        size = len(self.types)
+        mean = np.zeros((size, size + 1))
+        for child in self.children.T:
+            np.add.at(mean, (self.owner, child), self.prob)
+        return mean[:, :size]
+
+    @cached_property
+    def cycles(self) -> list[tuple[float, list[int]]]:
+        """Sets of types that lead back to themselves, each with the spectral radius of ``A`` within it."""
+        _, label = connected_components(csr_matrix(self.mean_offspring), connection="strong")
+        members: dict[int, list[int]] = {}
+        for i, component in enumerate(label):
+            members.setdefault(component, []).append(i)
+        blocks = [(self.mean_offspring[np.ix_(group, group)], group) for group in members.values()]
+        return [(float(abs(np.linalg.eigvals(block)).max()), group) for block, group in blocks if block.any()]
+
+    @property
+    def spectral_radius(self) -> float:
+        """Of ``A``: a derivation surely ends if it is below 1; 0 where nothing leads back to itself."""
+        return max([0.0, *(radius for radius, _ in self.cycles)])
+
+    @cached_property
+    def visits(self) -> np.ndarray:
+        """``(E,)`` how often each production is expected to be used; infinite if a derivation need not end."""
+        if self.spectral_radius >= CRITICAL:
+            return np.full(len(self.prob), np.inf)
+        start = np.eye(len(self.types))[0]
+        return np.linalg.solve(np.eye(len(self.types)) - self.mean_offspring.T, start)[self.owner] * self.prob
+
+    def expected_rules(self) -> np.ndarray:
+        """``(K,)`` how often each rule is expected to be used."""
+        total = np.zeros(len(self.grammar.rules))
+        np.add.at(total, self.rule, self.visits)
+        return total
+
+    def lengths(self, upto: int, quantile: float = 1.0, limit: int = 0) -> np.ndarray:
+        """``P(length = n)`` for n = 0, 1, ..., ``upto``, and on to where they sum to ``quantile``, or to ``limit``."""
+        (E, R), size, most = self.children.shape, len(self.types), max(upto, limit)
+        length = np.zeros((size + 1, most + 1))  # the coefficients of L; padding has length 0
+        length[size, 0] = 1.0
+        product = np.zeros((R + 1, E, most + 1))  # those of the product over the first r children
+        product[0, :, 0] = 1.0
+        for n in range(1, most + 1):
+            for r, child in enumerate(self.children.T):
+                product[r + 1, :, n - 1] = np.einsum("en,en->e", product[r, :, :n], length[child, n - 1 :: -1])
+            np.add.at(length[:, n], self.owner, self.prob * product[R, :, n - 1])
+            if n >= upto and length[0].sum() >= quantile:
+                break
+        return length[0, : n + 1] if most else length[0]
+
+    def longest(self) -> float:
+        """The length of the longest derivation; infinite if there is none."""
+        if self.cycles:
+            return np.inf
+        length = np.append(np.ones(len(self.types)), 0.0)
+        while True:
+            grown = length.copy()
+            np.maximum.at(grown, self.owner, 1 + length[self.children].sum(1))
+            if (grown == length).all():
+                return float(length[0])
+            length = grown
