@@ -1,0 +1,143 @@
+"""log q(T, alpha) of a small program, against scipy."""
+
+from dataclasses import replace
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from probscene.derivation import derive
+from probscene.drawing import Sprites
+from probscene.errors import ModelError, SamplingError
+from probscene.grammar import Grammar
+from probscene.model import SceneModel
+from probscene.sampling import log_prob, realise, sample, seed_everything
+from probscene.scene import SceneGraph
+from probscene.structure import StructurePrior, counts, weights
+
+GRAMMAR = Grammar("""
+    Scene  -> table(Plates)
+    Plates -> Plate Plates | ε
+    Plate  -> plate(Mugs)
+    Mugs   -> mug Mugs | spoon | ε
+""")
+PRIOR = StructurePrior(GRAMMAR, Plates=counts(1, 2, 1), Mugs=weights(2, 1, 3))
+STEPS = 40
+
+
+def tabletop(num_scenes, structure):
+    with pyro.plate("scenes", num_scenes, dim=-2):
+        scene = SceneGraph(GRAMMAR, derive(GRAMMAR, structure, num_scenes, STEPS))
+        light = pyro.sample("light", dist.Gamma(2.0, 3.0))  # (N, 1)
+        with scene.nodes("plate"):
+            x = pyro.sample("plate.x", dist.Uniform(10.0, 90.0))
+            tint = pyro.sample("plate.tint", dist.Beta(torch.tensor([1.0, 2.0, 3.0]), 2.0).to_event(1))
+        with scene.nodes("mug", "spoon"):
+            dx = pyro.sample("mug.dx", dist.Normal(scene.of_parent(x) / 10, light))
+    mug = Sprites.disc(("mug", "spoon"), scene.of_parent(x) + dx, 50.0, radius=3.0)
+    return scene.draw(Sprites.disc("plate", x, 50.0, radius=9.0, tint=tint), mug)
+
+
+MODEL = SceneModel("tabletop", GRAMMAR, PRIOR, tabletop, (100, 100), STEPS, ("plate", "mug"))
+
+
+def alpha_log_prob(scenes, i):
+    """log q(alpha | T) of one scene by scipy, node by node."""
+    kind, parent = scenes.derivation.kind[i].tolist(), scenes.derivation.parent[i].tolist()
+    value = {name: v[i].double().numpy() for name, v in scenes.parameters.items()}
+    light = value["light"][0]
+    total = stats.gamma(2.0, scale=1 / 3).logpdf(light)
+    for m, k in enumerate(kind):
+        if k == GRAMMAR.kind("plate"):
+            total += stats.uniform(10, 80).logpdf(value["plate.x"][m])
+            total += sum(stats.beta(a, 2.0).logpdf(t) for a, t in zip((1, 2, 3), value["plate.tint"][m], strict=True))
+        if k in (GRAMMAR.kind("mug"), GRAMMAR.kind("spoon")):
+            total += stats.norm(value["plate.x"][parent[m]] / 10, light).logpdf(value["mug.dx"][m])
+    return total
+
+
+@given(st.integers(0, 2**31), st.integers(1, 9))
+def test_log_prob_of_structure_and_parameters(reference, seed, num_scenes):
+    seed_everything(seed)
+    scenes = sample(MODEL, PRIOR, num_scenes)
+    joint = log_prob(PRIOR, scenes)
+    assert joint.shape == (num_scenes,) and set(scenes.parameters) == {"light", "plate.x", "plate.tint", "mug.dx"}
+    for i in range(num_scenes):
+        alpha = alpha_log_prob(scenes, i)
+        assert scenes.log_prob[i].item() == pytest.approx(alpha, rel=1e-3, abs=1e-3)
+        rules = [k for k in scenes.derivation.rules[i].tolist() if k >= 0]
+        structure = reference.log_probability(GRAMMAR, PRIOR, rules)
+        assert joint[i].item() == pytest.approx(structure + alpha, rel=1e-3, abs=1e-3)
+
+
+@given(st.integers(0, 2**31))
+def test_the_same_parameters_make_the_same_scenes(seed):
+    seed_everything(seed)
+    scenes = sample(MODEL, PRIOR, 5)
+    again = realise(MODEL, scenes.derivation, scenes.parameters)
+    assert torch.equal(again.log_prob, scenes.log_prob)
+    for one, other in zip(scenes.drawing.layers, again.drawing.layers, strict=True):
+        for name in ("present", "x", "y", "tint"):
+            assert torch.equal(getattr(one, name), getattr(other, name))
+    fresh = realise(MODEL, scenes.derivation, {"plate.x": scenes.parameters["plate.x"]})
+    assert torch.equal(fresh.drawing.layers[0].x, scenes.drawing.layers[0].x)
+    assert not torch.equal(fresh.parameters["light"], scenes.parameters["light"])
+
+
+def test_parameters_count_where_their_nodes_are():
+    scenes = sample(MODEL, PRIOR, 30)
+    kind = scenes.derivation.kind
+    assert torch.equal(scenes.counted["plate.x"], kind == GRAMMAR.kind("plate"))
+    assert torch.equal(scenes.counted["mug.dx"], (kind == GRAMMAR.kind("mug")) | (kind == GRAMMAR.kind("spoon")))
+    assert scenes.counted["light"].shape == (30, 1) and scenes.counted["light"].all()
+    assert torch.equal(scenes.drawing.kind, kind) and (scenes.failures == 0).all()
+
+
+def test_parameters_follow_the_given_structure_not_the_prior():
+    empty = StructurePrior(GRAMMAR, Plates=counts(1))
+    full = StructurePrior(GRAMMAR, Plates=counts(0, 0, 0, 1))
+    assert (sample(MODEL, empty, 20).derivation.counts(4)[:, 1] == 0).all()
+    scenes = sample(MODEL, full, 20)  # three plates, which MODEL's own prior never has
+    assert (scenes.derivation.counts(4)[:, 1] == 3).all() and torch.isfinite(scenes.log_prob).all()
+    assert torch.isinf(log_prob(PRIOR, scenes)).all() and torch.isfinite(log_prob(full, scenes)).all()
+
+
+def test_scenes_that_are_too_long_are_redrawn_or_refused():
+    short = replace(MODEL, max_steps=6)
+    scenes = sample(short, PRIOR, 200)
+    assert scenes.derivation.lengths.max() <= 6 and scenes.failures.sum() > 0
+    with pytest.raises(SamplingError, match="max_steps = 6"):
+        sample(short, StructurePrior(GRAMMAR, Plates=counts(0, 0, 1)), 3)
+
+
+def test_programs_that_are_none():
+    def no_drawing(num_scenes, structure):
+        tabletop(num_scenes, structure)
+
+    def no_plate(num_scenes, structure):
+        pyro.sample("loose", dist.Normal(0.0, 1.0))
+        return tabletop(num_scenes, structure)
+
+    with pytest.raises(ModelError, match="'tabletop' to return a Drawing of 4 scenes .* actual NoneType"):
+        sample(replace(MODEL, program=no_drawing), PRIOR, 4)
+    with pytest.raises(ModelError, match="'loose'.*inside the scenes plate"):
+        sample(replace(MODEL, program=no_plate), PRIOR, 4)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"classes": ("plate", "cup")}, r"\['cup'\]"),
+        ({"classes": ()}, "actual none"),
+        ({"canvas": (0, 5)}, "positive canvas"),
+        ({"max_steps": 0}, "max_steps 0"),
+        ({"channels": 4}, "channels 1 or 3"),
+    ],
+)
+def test_models_that_are_none(changed, message):
+    with pytest.raises(ModelError, match=message):
+        replace(MODEL, **changed)
