@@ -1,0 +1,77 @@
+"""The one module that imports Taichi: started lazily, on the CPU, in the process that renders.
+
+Kernels live in modules of their own, take ``ti`` from here, and have arrays as their only arguments. Three facts about
+Taichi on a CPU shape them: a loop of at most 512 iterations runs on one thread, so a kernel counts to 512 for every
+worker and lets the first of each 512 work; arrays should be flat; postponed annotations break kernels.
+"""
+
+import contextlib
+import io
+import os
+import warnings
+from pathlib import Path
+
+from probscene.errors import ProbsceneError
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # otherwise the import asks a server for the latest version
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # deprecations inside Taichi must not fail a run under -W error
+    import taichi as ti
+
+__all__ = ["available_threads", "started", "start", "ti"]
+
+_forked_after_start = False
+
+
+def available_threads() -> int:
+    """The number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def started() -> bool:
+    """Whether Taichi runs in this process, by ``start`` or by the user's own ``ti.init``."""
+    return ti.lang.impl.get_runtime().prog is not None
+
+
+def start() -> None:
+    """Start Taichi unless it runs already; a program that has called ``ti.init`` itself keeps what it chose.
+
+    How many threads a kernel uses is decided at each call by its number of workers; Taichi gets one for every core.
+
+    Raises:
+        ProbsceneError: in a process forked from one in which Taichi ran; its threads are gone and a kernel would hang.
+    """
+    if _forked_after_start:
+        raise ProbsceneError(
+            "Expected to render in a process that started Taichi itself, actual a fork of one that had rendered; "
+            "start worker processes with multiprocessing's 'spawn' method."
+        )
+    if started():
+        return
+    with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints a banner
+        ti.init(
+            arch=ti.cpu,
+            cpu_max_num_threads=available_threads(),
+            fast_math=False,
+            log_level=ti.ERROR,
+            offline_cache=True,
+            offline_cache_file_path=str(_cache_folder()),
+        )
+
+
+def _cache_folder() -> Path:
+    """Where compiled kernels are kept between runs; safe with several processes."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "probscene" / "taichi"
+
+
+def _remember_fork() -> None:
+    global _forked_after_start
+    _forked_after_start = _forked_after_start or started()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_remember_fork)
