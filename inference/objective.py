@@ -26,7 +26,9 @@ References:
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import pyro
 import torch
+from pyro.poutine.runtime import am_i_wrapped
 from torch import Tensor
 
 from probscene.derivation import Derivation, derive_complete
@@ -104,6 +106,8 @@ class ScoreFunction:
 
     def __call__(self, model: Callable[[int], Any], guide, num_scenes: int, real: Tensor) -> Tensor:
         """A scalar whose value is the mean cost and whose gradient is the score-function estimate."""
+        if am_i_wrapped():  # in SVI, which learns the parameters that it sees registered
+            pyro.module("guide", guide)
         if self.batch is None or self._used == self.updates:
             self.batch, self._used = self._draw(model, guide, num_scenes, real), 0
         self._used += 1

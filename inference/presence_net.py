@@ -38,7 +38,7 @@ class PresenceNet(nn.Module):
 
     def layers(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Features ``(N, D)`` and presence logits ``(N, classes)`` of uint8 images ``(N, 1 or 3, H, W)``."""
-        pool = self.blocks(images.expand(-1, 3, -1, -1).float() / 255).mean((2, 3))
+        pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous().float() / 255).mean((2, 3))
         first = F.leaky_relu(self.fc1(pool), 0.01)
         second = F.leaky_relu(self.fc2(first), 0.01)
         return torch.cat([pool, first, second], 1), self.out(second)
@@ -57,11 +57,12 @@ class _Block(nn.Module):
         super().__init__()
         self.a, self.na = nn.Conv2d(inner, outer, 3, 2, 1, bias=False), nn.BatchNorm2d(outer)
         self.b, self.nb = nn.Conv2d(outer, outer, 3, 1, 1, bias=False), nn.BatchNorm2d(outer)
-        self.shortcut = nn.Conv2d(inner, outer, 1, 2)
+        self.shortcut = nn.Conv2d(inner, outer, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         y = F.leaky_relu(self.na(self.a(x)), 0.01)
-        return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x), 0.01)
+        # Not a stride in the convolution: with 3 channels, last in memory, torch 2.14 then writes outside its buffers.
+        return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x[..., ::2, ::2].contiguous()), 0.01)
 
 
 class PresenceTraining:

@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import gaussian_kde as scipy_kde
+
+from probscene.errors import ProbsceneError
+from probscene.inference.divergence import MMD, KDELogRatio, gaussian_kde
+from probscene.inference.guide import LSTMGuide
+
+
+@given(st.integers(1, 4), st.integers(6, 60), st.integers(2, 20), st.floats(0.05, 5.0), st.integers(0, 2**31))
+def test_kde_is_scipys(D, L, N, variance, seed):
+    rng = np.random.default_rng(seed)
+    data, points = rng.normal(50, 3, (L, D)), rng.normal(50, 3, (N, D))
+    reference = scipy_kde(data.T)
+    reference.covariance = np.eye(D) * variance  # scipy only scales the data's covariance; give it ours
+    reference.cho_cov = np.linalg.cholesky(reference.covariance)
+    reference.log_det = 2 * np.log(np.diag(reference.cho_cov * np.sqrt(2 * np.pi))).sum()
+    ours = gaussian_kde(torch.tensor(points), torch.tensor(data), variance)
+    assert np.allclose(ours.numpy(), reference.logpdf(points.T), rtol=1e-6, atol=1e-6)
+
+
+def test_leave_one_out_leaves_out_one():
+    data = torch.randn(30, 3, dtype=torch.float64)
+    ours = gaussian_kde(data, data, 0.7, leave_one_out=True)
+    for i in range(30):
+        others = torch.cat([data[:i], data[i + 1 :]])
+        assert torch.allclose(ours[i], gaussian_kde(data[i : i + 1], others, 0.7)[0])
+
+
+def test_kde_keeps_its_precision_far_from_the_origin():
+    data = torch.randn(200, 2)
+    near = gaussian_kde(data, data, 0.5)
+    assert torch.allclose(gaussian_kde(data + 1000, data + 1000, 0.5), near, atol=1e-2)
+
+
+def test_paper_form_is_the_formula():
+    generated, real = torch.randn(20, 5), torch.randn(30, 5)
+
+    def density(x, data):
+        normal = torch.distributions.MultivariateNormal(torch.zeros(5), 5.0 * torch.eye(5))  # H = d I
+        return normal.log_prob(x - data).exp().mean()
+
+    expected = torch.stack([(density(x, generated) / density(x, real)).log() for x in generated])
+    ours = KDELogRatio(variance=None, marginal_variance=None, leave_one_out=False)(generated, real)
+    assert torch.allclose(ours, expected, atol=1e-4)
+
+
+def test_marginals_add_the_log_ratio_of_each_feature():
+    generated, real = torch.randn(20, 3), torch.randn(30, 3)
+    joint = KDELogRatio(1.0, None)(generated, real)
+    single = sum(KDELogRatio(0.2, None)(generated[:, d : d + 1], real[:, d : d + 1]) for d in range(3))
+    assert torch.allclose(KDELogRatio(1.0, 0.2)(generated, real), joint + single, atol=1e-5)
+
+
+@pytest.mark.parametrize("divergence", [KDELogRatio(), MMD(shared=False)])
+def test_equal_samples_cost_nothing_on_average(divergence):
+    """With as many real as generated scenes and the self term left out, no side is favoured (exchangeability)."""
+    costs = torch.stack([divergence(torch.randn(100, 2), torch.randn(99, 2)).mean() for _ in range(60)])
+    assert costs.mean().abs() < 4 * costs.std() / 60**0.5
+
+
+def test_shared_mmd_is_the_unbiased_estimate():
+    generated, real = torch.randn(15, 2), torch.randn(12, 2) + 1
+
+    def kernel(a, b):
+        return torch.exp(-0.5 / 0.8 * (a - b).square().sum())
+
+    def mean(pairs):
+        return torch.stack([kernel(a, b) for a, b in pairs]).mean()
+
+    G, R = list(generated), list(real)
+    expected = mean([(a, b) for i, a in enumerate(G) for j, b in enumerate(G) if i != j])
+    expected = expected + mean([(a, b) for i, a in enumerate(R) for j, b in enumerate(R) if i != j])
+    expected = expected - 2 * mean([(a, b) for a in G for b in R])
+    cost = MMD(0.8)(generated, real)
+    assert cost.shape == (15,)
+    assert torch.allclose(cost, expected.expand(15), atol=1e-5)
+
+
+def test_the_witness_is_the_gradient_of_mmd(small):
+    """sum_T q(T) witness(T) grad log q(T) = grad MMD^2, exactly, on an enumerable grammar."""
+    guide = LSTMGuide(small.grammar, 4, hidden=8)
+    log_q = guide.log_prob(small.derivations)
+    squared = (small.features.unsqueeze(1) - small.features).square().sum(-1)
+    kernel = torch.exp(-0.5 * squared)
+    difference = log_q.exp() - small.target
+    exact = torch.autograd.grad(difference @ kernel @ difference, guide.parameters(), retain_graph=True)
+    witness = (2 * kernel @ difference).detach()
+    score = torch.autograd.grad((log_q.exp().detach() * witness * log_q).sum(), guide.parameters())
+    for a, b in zip(exact, score, strict=True):
+        assert torch.allclose(a, b, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("generated", "real", "says"),
+    [
+        (torch.zeros(5, 2), torch.zeros(5, 3), "Expected generated"),
+        (torch.zeros(1, 2), torch.zeros(5, 2), "at least 2 generated"),
+        (torch.zeros(5, 2), torch.zeros(0, 2), "at least 2 generated"),
+        (torch.full((5, 2), torch.nan), torch.zeros(5, 2), "finite"),
+    ],
+)
+def test_bad_features_are_named(generated, real, says):
+    for divergence in (KDELogRatio(), MMD()):
+        with pytest.raises(ProbsceneError, match=says):
+            divergence(generated, real)

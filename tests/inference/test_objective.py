@@ -1,0 +1,121 @@
+"""The score-function gradient against the exact one, on a grammar that can be enumerated."""
+
+import pyro
+import pytest
+import torch
+from pyro.infer import SVI
+from pyro.optim import Adam
+
+from probscene.errors import ProbsceneError
+from probscene.inference.divergence import KDELogRatio
+from probscene.inference.guide import LSTMGuide
+from probscene.inference.objective import ScoreFunction
+
+
+def structure_features(small):
+    return lambda scenes: scenes.derivation.counts(len(small.grammar.kinds)).float()
+
+
+class FixedCost:
+    """A cost that depends on the scene alone, so that the expected gradient is a finite sum."""
+
+    def __init__(self, small):
+        self.weights = torch.linspace(-1, 1.5, len(small.grammar.kinds)) ** 3
+
+    def __call__(self, generated, real):
+        return (generated * self.weights).sum(1) + 2.0
+
+
+def gradients(loss, guide):
+    for p in guide.parameters():
+        p.grad = None
+    loss.backward()
+    return torch.cat([torch.zeros(p.numel()) if p.grad is None else p.grad.flatten() for p in guide.parameters()])
+
+
+@pytest.mark.parametrize("latents", [1, 3])
+@pytest.mark.parametrize("baseline", ["leave_one_out", "moving_average", "none"])
+def test_gradient_is_the_exact_one(small, baseline, latents):
+    pyro.set_rng_seed(1)
+    guide = LSTMGuide(small.grammar, 4, hidden=8, num_latents=latents)
+    cost = FixedCost(small)
+    log_q = guide.log_prob(small.derivations)
+    exact = gradients((log_q.exp() * cost(small.features, None)).sum(), guide)
+    loss = ScoreFunction(structure_features(small), cost, baseline=baseline)
+    runs = torch.stack([gradients(loss(small.program, guide, 4000, real=None), guide) for _ in range(8)])
+    mean, error = runs.mean(0), runs.std(0) / 8**0.5
+    away = exact.abs() > 1e-3
+    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
+    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
+
+
+def test_kde_gradient_tends_to_the_enumerated_one(small):
+    pyro.set_rng_seed(2)
+    guide = LSTMGuide(small.grammar, 4, hidden=8)
+    log_q = guide.log_prob(small.derivations)
+    kernel = torch.exp(-0.5 * (small.features.unsqueeze(1) - small.features).square().sum(-1))
+    cost = ((kernel @ log_q.exp()) / (kernel @ small.target)).log().detach()
+    exact = gradients((log_q.exp() * cost).sum(), guide)
+    real = small.features[torch.multinomial(small.target, 4000, replacement=True)]
+    loss = ScoreFunction(structure_features(small), KDELogRatio(1.0, None))
+    runs = torch.stack([gradients(loss(small.program, guide, 2000, real=real), guide) for _ in range(6)])
+    assert torch.nn.functional.cosine_similarity(runs.mean(0), exact, 0) > 0.97
+
+
+def test_svi_learns_the_target_distribution(small):
+    pyro.set_rng_seed(0)
+    guide = LSTMGuide(small.grammar, 4, hidden=16)
+    real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
+    loss = ScoreFunction(structure_features(small), KDELogRatio(0.2, None), updates=2)
+
+    def distance():
+        return 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item()
+
+    before = distance()
+    svi = SVI(small.program, guide, Adam({"lr": 1e-2}), loss=loss)
+    for _ in range(240):
+        svi.step(300, real=real)
+    assert before > 0.3
+    assert distance() < 0.1
+
+
+def test_value_is_the_mean_cost_and_batches_are_reused(small):
+    guide = LSTMGuide(small.grammar, 4, hidden=8)
+    seen = []
+    features = structure_features(small)
+    loss = ScoreFunction(lambda scenes: seen.append(1) or features(scenes), FixedCost(small), updates=3)
+    values = [loss(small.program, guide, 50, real=None).item() for _ in range(6)]
+    assert len(seen) == 2
+    assert values[0] == values[1] == values[2] == pytest.approx(values[0])
+    assert values[3] == pytest.approx(loss.batch.cost.mean().item())
+
+
+def test_moving_average_is_the_papers(small):
+    """b <- 0.05 new + 0.95 b, from 0."""
+    guide = LSTMGuide(small.grammar, 4, hidden=8)
+    loss = ScoreFunction(structure_features(small), FixedCost(small), baseline="moving_average")
+    expected = 0.0
+    for _ in range(4):
+        loss(small.program, guide, 20, real=None)
+        expected = 0.05 * loss.batch.cost.mean().item() + 0.95 * expected
+        assert loss.average == pytest.approx(expected)
+        assert torch.allclose(loss.batch.advantage, loss.batch.cost - expected)
+
+
+def test_scenes_that_were_redrawn_pay(small, dots):
+    """With T_max cut to what half the scenes need, those that failed more than once pay lambda more."""
+    guide = LSTMGuide(dots.grammar, 4, hidden=8)
+    loss = ScoreFunction(
+        lambda scenes: scenes.failures.float().unsqueeze(1), lambda g, r: torch.zeros(len(g)), reject_weight=0.25
+    )
+    loss(lambda n: dots(n), guide, 200, real=None)
+    failures = loss.batch.features.squeeze(1)
+    assert failures.max() > 1
+    assert torch.equal(loss.batch.cost, 0.25 * (failures > 1))
+    assert loss.batch.rejections == pytest.approx(failures.mean().item())
+
+
+def test_bad_arguments_are_named(small):
+    for arguments in ({"baseline": "median"}, {"updates": 0}, {"decay": 0.0}, {"clip": -1.0}):
+        with pytest.raises(ProbsceneError, match="Expected"):
+            ScoreFunction(structure_features(small), FixedCost(small), **arguments)
