@@ -59,6 +59,15 @@ def test_grey_is_what_the_folder_reads(tmp_path_factory, pixels):
         assert (got[..., 0] == expected[0].numpy()).all()
 
 
+@given(arrays(np.uint8, (2, 1, 4, 5)))
+def test_grey_stays_as_it_is(pixels):
+    image = torch.from_numpy(pixels)
+    assert (grey(image.expand(2, 3, 4, 5)) == image).all()
+    off = image.repeat(1, 3, 1, 1)
+    off[0, 0, 0, 0] += 1
+    assert (grey(off)[1] == image[1]).all()
+
+
 def test_every_kind_of_file(tmp_path, noise, smooth):
     folder, canvas = tmp_path / "images", (40, 30)
     few = Image.fromarray(noise).quantize(9)
