@@ -8,6 +8,7 @@ worker and lets the first of each 512 work; arrays should be flat; postponed ann
 import contextlib
 import io
 import os
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -58,14 +59,19 @@ def start() -> None:
             cpu_max_num_threads=available_threads(),
             fast_math=False,
             log_level=ti.ERROR,
-            offline_cache=True,
-            offline_cache_file_path=str(_cache_folder()),
+            **_cache(),
         )
 
 
-def _cache_folder() -> Path:
-    """Where compiled kernels are kept between runs; safe with several processes."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "probscene" / "taichi"
+def _cache() -> dict[str, object]:
+    """Where compiled kernels are kept between runs, safe with several processes; nowhere if nothing can be written."""
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "probscene" / "taichi"
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    if os.access(folder, os.W_OK | os.X_OK):
+        return {"offline_cache": True, "offline_cache_file_path": str(folder)}
+    # Taichi crashes at exit if it cannot write to its folder, even where it keeps no cache.
+    return {"offline_cache": False, "offline_cache_file_path": tempfile.gettempdir()}
 
 
 def _remember_fork() -> None:

@@ -55,7 +55,7 @@ def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int]) -> Instan
                     f"Expected {name} of layer {i} as (scenes, nodes) = {shape}, actual {tuple(value.shape)}; "
                     "make layers with probscene.drawing.resolve."
                 )
-    present = _stack(drawing, "present").reshape(shape[0], -1, shape[1])
+    present = _stack(drawing, "present")
     scene, layer, node = np.nonzero(present)
     values = {name: _stack(drawing, name)[present] for name in ("sprite", *_REAL)}
     _check(values)

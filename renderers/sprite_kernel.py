@@ -192,8 +192,8 @@ def none_zero(word):
 def see_node(t, node, scene, height, width, instance: ti.template(), quads: ti.template(), result: ti.template()):
     """Extent and pixels of the visible mask, by runs of four ids within the silhouette's extent."""
     label, labels = ti.cast(node + 1, ti.i16), (ti.cast(node, i64) + 1) * i64(LANES)
-    x0, x1 = ti.max(ti.cast(result[t + WHOLE], ti.i32), 0), ti.min(ti.cast(result[t + WHOLE + 2], ti.i32), width)
-    y0, y1 = ti.max(ti.cast(result[t + WHOLE + 1], ti.i32), 0), ti.min(ti.cast(result[t + WHOLE + 3], ti.i32), height)
+    x0, x1 = ti.cast(ti.max(result[t + WHOLE], 0), ti.i32), ti.cast(ti.min(result[t + WHOLE + 2], width), ti.i32)
+    y0, y1 = ti.cast(ti.max(result[t + WHOLE + 1], 0), ti.i32), ti.cast(ti.min(result[t + WHOLE + 3], height), ti.i32)
     left, top, right, bottom, pixels = width, height, 0, 0, 0
     for y in range(y0, y1):
         line = (scene * height + y) * width
@@ -247,7 +247,7 @@ def paint(
     ``first (scenes + 1)`` says where the instances of each scene begin; ``words`` and ``quads`` are ``image`` and
     ``instance`` seen as 32-bit and 64-bit words; ``queue`` and ``result`` hold zeros.
     """
-    for j in range(workers * 512):
+    for j in range(workers * ti.i32(512)):
         if j % 512 == 0:
             scene = ti.atomic_add(queue[0], 1)
             while scene < scenes:

@@ -91,7 +91,7 @@ class SpriteRenderer:
         colour = np.rint(np.clip(np.asarray(drawing.background, np.float64), 0, 1) * 255).astype(np.uint8)
         if colour.any():
             empty = np.tile(colour, height * width)
-            image[: scenes * empty.size].reshape(scenes, -1)[:] = empty
+            image[: scenes * empty.size].reshape(scenes, empty.size)[:] = empty
         return image
 
 
