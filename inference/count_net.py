@@ -17,6 +17,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from probscene.inference.features import enter
 
 STRIDE = 8  # pixels of the reduced image a cell
+BORDER = STRIDE // 2  # clear pixels around a reduced image, so that objects at its edge have cells on either side
 
 
 class CountNet(nn.Module):
@@ -62,9 +63,10 @@ class CountNet(nn.Module):
         return self.body(x.contiguous(memory_format=torch.channels_last))
 
     def enter(self, images: Tensor) -> Tensor:
-        """Reduced images, padded to whole cells."""
+        """Reduced images with a clear border, padded to whole cells."""
         x = enter(images, self.channels, self.reduce)
-        return F.pad(x, (0, -x.shape[-1] % STRIDE, 0, -x.shape[-2] % STRIDE))
+        right, below = ((-n - 2 * BORDER) % STRIDE + BORDER for n in (x.shape[-1], x.shape[-2]))
+        return F.pad(x, (BORDER, right, BORDER, below))
 
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:

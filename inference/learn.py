@@ -98,10 +98,10 @@ class Learner:
         """All that ``restore`` needs, as named tensors."""
         average = self.objective.average
         average = math.nan if average is None else average
-        return training_state(self.guide, self.optimiser, average=average, done=self.done)
+        return training_state(self.guide, {"adam": self.optimiser}, average=average, done=self.done)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
-        numbers = restore_training(self.guide, self.optimiser, tensors)
+        numbers = restore_training(self.guide, {"adam": self.optimiser}, tensors)
         self.objective.average = None if math.isnan(numbers["average"]) else numbers["average"]
         self.done = int(numbers["done"])

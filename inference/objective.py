@@ -44,7 +44,6 @@ class Batch(NamedTuple):
 
     Attributes:
         derivation: structures, N.
-        log_prob: ``(N,)`` log q(T) under the guide that drew them.
         features: ``(N, D)``.
         cost: ``(N,)``.
         advantage: ``(N,)`` cost less baseline, scaled.
@@ -52,7 +51,6 @@ class Batch(NamedTuple):
     """
 
     derivation: Derivation
-    log_prob: Tensor
     features: Tensor
     cost: Tensor
     advantage: Tensor
@@ -103,6 +101,7 @@ class ScoreFunction:
         self.average: float | None = None
         self.batch: Batch | None = None
         self._used = 0
+        self._drawn_with: Tensor | None = None  # log q(T) under the guide that drew the batch
 
     def __call__(self, model: Callable[[int], Any], guide, num_scenes: int, real: Tensor) -> Tensor:
         """A scalar whose value is the mean cost and whose gradient is the score-function estimate."""
@@ -110,9 +109,12 @@ class ScoreFunction:
             pyro.module("guide", guide)
         if self.batch is None or self._used == self.updates:
             self.batch, self._used = self._draw(model, guide, num_scenes, real), 0
-        self._used += 1
         batch = self.batch
-        ratio = torch.exp(guide.log_prob(batch.derivation) - batch.log_prob)
+        log_prob = guide.log_prob(batch.derivation)
+        if self._used == 0:
+            self._drawn_with = log_prob.detach()
+        self._used += 1
+        ratio = torch.exp(log_prob - self._drawn_with)
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         surrogate = torch.maximum(batch.advantage * ratio, batch.advantage * clipped).mean()
         return batch.cost.mean() + surrogate - surrogate.detach()
@@ -124,9 +126,7 @@ class ScoreFunction:
             cost = self.divergence(features, real)
             cost = cost + self.reject_weight * (failures > self.reject_threshold)
             advantage = self.scale * (cost - self._baseline(cost))
-            return Batch(
-                derivation, guide.log_prob(derivation), features, cost, advantage, failures.float().mean().item()
-            )
+            return Batch(derivation, features, cost, advantage, failures.float().mean().item())
 
     def _baseline(self, cost: Tensor) -> Tensor | float:
         if self.baseline == "leave_one_out":

@@ -122,11 +122,11 @@ class PresenceTraining:
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
-        return training_state(self.net, self.optimiser, done=self.done, reached=self.reached)
+        return training_state(self.net, {"adam": self.optimiser}, done=self.done, reached=self.reached)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
-        numbers = restore_training(self.net, self.optimiser, tensors)
+        numbers = restore_training(self.net, {"adam": self.optimiser}, tensors)
         self.done, self.reached = int(numbers["done"]), numbers["reached"]
 
 

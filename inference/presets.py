@@ -21,6 +21,7 @@ class Preset:
         variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first two also of ``MMD``.
         pretrain_derivations, pretrain_epochs: maximum likelihood on the prior.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Learner`` and ``ScoreFunction``.
+        candidates: drawings of each structure, of which the clearest is looked at.
         baseline, scale: see ``ScoreFunction``.
         hidden, num_latents, index: see ``LSTMGuide``.
     """
@@ -40,6 +41,7 @@ class Preset:
     batches: int = 60
     num_scenes: int = 500
     num_real: int | None = None
+    candidates: int = 4
     updates: int = 3
     learning_rate: float = 1e-2
     cosine: bool = True
@@ -72,6 +74,7 @@ PAPER = Preset(
     leave_one_out=False,
     batches=200,
     num_real=500,
+    candidates=1,
     updates=1,
     learning_rate=1e-4,
     cosine=False,

@@ -20,6 +20,7 @@ from probscene.app.files import write_text
 from probscene.app.loading import load_model, renderer_for
 from probscene.app.run import Run
 from probscene.dataset import ImageFolder
+from probscene.drawing import Drawing
 from probscene.errors import RunError
 from probscene.inference.count_net import CountNet
 from probscene.inference.count_training import CountTraining
@@ -32,7 +33,7 @@ from probscene.inference.presets import Preset
 from probscene.inference.pretrain import pretrain
 from probscene.inference.resume import batch_seed
 from probscene.model import SceneModel
-from probscene.sampling import Scenes, sample, seed_everything
+from probscene.sampling import Scenes, realise, sample, seed_everything
 
 Progress = Callable[[str, int, int, str], None]
 """Called with the stage, what of it is done, of how much, and a note such as the loss."""
@@ -85,7 +86,7 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> LSTM
     net = _feature_net(run, preset, view, progress)
     real = _real_features(run, net, model, progress, target)
     torch.set_num_threads(1)  # the guide's tensors are tiny: a second thread only waits
-    guide = _learn(run, preset, model, view.observe(net), real, progress)
+    guide = _learn(run, preset, model, view.observe(net, preset.candidates), real, progress)
     run.save("guide", guide.state_dict())
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
     return guide
@@ -104,17 +105,36 @@ class View:
         scenes = sample(self.model, self.model.prior, num)
         return examples(self.render(scenes.drawing), self.classes)
 
-    def observe(self, net: FeatureNet) -> Callable[[Scenes], Tensor]:
-        """Render and embed, a few images at a time."""
+    def observe(self, net: FeatureNet, candidates: int = 1) -> Callable[[Scenes], Tensor]:
+        """Render and embed, a few images at a time.
+
+        Args:
+            candidates: parameters are drawn so many times for each structure, and the drawing in which the least
+                visible object shows most is kept: what covers an object says nothing about its structure.
+        """
 
         def features(scenes: Scenes) -> Tensor:
             torch.set_num_threads(self.threads)
+            drawings = [scenes.drawing]
+            drawings += [realise(self.model, scenes.derivation).drawing for _ in range(candidates - 1)]
             starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
-            parts = [net.embed(self.render(scenes.drawing[i : i + RENDERED_AT_ONCE]).image) for i in starts]
+            parts = [net.embed(self._clearest([d[i : i + RENDERED_AT_ONCE] for d in drawings])) for i in starts]
             torch.set_num_threads(1)
             return torch.cat(parts)
 
         return features
+
+    def _clearest(self, drawings: list[Drawing]) -> Tensor:
+        """Images ``(N, 3, H, W)``, each from the drawing that covers least of its least visible object."""
+        rendered = [self.render(drawing) for drawing in drawings]
+        if len(rendered) == 1:
+            return rendered[0].image
+        least = torch.stack([batch.visible.where(batch.kind >= 0, 1.0).amin(1) for batch in rendered])
+        best = least.argmax(0)
+        image = rendered[0].image
+        for number, batch in enumerate(rendered):
+            image[best == number] = batch.image[best == number]
+        return image
 
 
 def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet:

@@ -65,7 +65,7 @@ def test_embedding_is_the_map_summed_and_indifferent_to_place(dots):
     assert torch.allclose(one, other, atol=1e-3)
 
 
-SHORT = CountSchedule(steps=260, images=16, crops=24, crop=32, window=2)
+SHORT = CountSchedule(steps=260, whole=0.5, images=16, crops=24, crop=32, window=2)
 
 
 def test_it_learns_to_count(dots, draw_dots):
