@@ -21,7 +21,7 @@ from torch import Tensor
 
 from probscene.app.files import make_folder, write_json, write_whole
 from probscene.app.loading import BUILT_IN, load_model
-from probscene.errors import ModelError, RunError
+from probscene.errors import DataError, ModelError, RunError
 from probscene.inference.guide import LSTMGuide
 from probscene.model import SceneModel
 
@@ -49,20 +49,34 @@ class Run:
             MachineError: it cannot be written.
         """
         path = Path(path)
-        if (path / "run.json").exists():
-            raise RunError(f"Expected a new folder for the run, actual {path} holds one; add --resume or name another.")
-        if path.is_dir() and any(path.iterdir()):
-            raise RunError(f"Expected a new or empty folder for the run, actual {path} holds other files.")
+        Run.check_free(path)
         make_folder(path)
         reference = model
         digest = None
         if model not in BUILT_IN:
             reference = str(Path(model).resolve())
             digest = _sha256(Path(model))
-            write_whole(path / "model.py", lambda temporary: shutil.copyfile(model, temporary))
         run = Run(path, {**record, "format": FORMAT, "model": reference, "model_sha256": digest})
-        write_json(path / "run.json", run.record)
+        write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
+        if digest is not None:
+            write_whole(path / "model.py", lambda temporary: shutil.copyfile(model, temporary))
         return run
+
+    @staticmethod
+    def check_free(path: Path) -> None:
+        """See that a folder can become a run's; nothing is written.
+
+        Raises:
+            RunError: it holds a run or other files already.
+            DataError: a file is in the way.
+        """
+        path = Path(path)
+        if (path / "run.json").exists():
+            raise RunError(f"Expected a new folder for the run, actual {path} holds one; add --resume or name another.")
+        if path.exists() and not path.is_dir():
+            raise DataError(f"Expected a folder for the run, actual {path} is a file; name another.")
+        if path.is_dir() and any(not entry.name.startswith(".") for entry in path.iterdir()):
+            raise RunError(f"Expected a new or empty folder for the run, actual {path} holds other files.")
 
     @staticmethod
     def open(path: Path) -> "Run":
@@ -140,10 +154,9 @@ class Run:
 
     def save(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write ``name.safetensors``, whole or not at all."""
-        whole = {key: value.detach().contiguous() for key, value in tensors.items()}
-        write_whole(
-            self.path / f"{name}.safetensors", lambda temporary: safetensors.torch.save_file(whole, str(temporary))
-        )
+        # As bytes: safetensors' own writing says neither OSError nor why where the disk is full.
+        whole = safetensors.torch.save({key: value.detach().contiguous() for key, value in tensors.items()})
+        write_whole(self.path / f"{name}.safetensors", lambda temporary: temporary.write_bytes(whole))
 
 
 def is_run(path: str) -> bool:
