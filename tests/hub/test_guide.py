@@ -82,7 +82,7 @@ def derived(guide, seed, num_scenes=6):
     return trace, trace.nodes["_RETURN"]["value"]
 
 
-@given(guides(st.from_type(Grammar)), st.integers(0, 2**31))
+@given(guides(LISTS) | guides(st.from_type(Grammar)), st.integers(0, 2**31))
 def test_log_prob_is_the_mean_over_the_latent_vectors_of_a_plain_lstm(reference, guide, seed):
     _, derivation = derived(guide, seed)
     found = guide.log_prob(derivation).tolist()
