@@ -1,0 +1,171 @@
+"""How close a fit comes to the truth on Multi-MNIST, from target images that another program drew.
+
+    python benchmarks/learn_multi_mnist.py --mnist FOLDER --out FOLDER [--presets quick default paper quick-mmd oracle]
+
+The images are drawn here with numpy and OpenCV from the digits of t10k (the original IDX files), which the model does
+not have; the fit sees the folder alone. Printed is the total variation of the number of digits and of their classes
+between 20,000 learnt structures and the distributions that the target was drawn from. Runs of one preset and seed share their
+feature network, which depends on nothing else; its time is counted once for each.
+"""
+
+import argparse
+import gzip
+import json
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from probscene.app.files import write_json
+from probscene.app.fit import create, fit
+from probscene.app.run import Run
+from probscene.derivation import derive_complete
+from probscene.drawing import Drawing
+from probscene.inference.guide import LSTMGuide
+from probscene.inference.learn import Learner
+from probscene.inference.objective import ScoreFunction
+from probscene.inference.presets import DEFAULT, PAPER, QUICK
+from probscene.inference.pretrain import pretrain
+from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL
+from probscene.sampling import seed_everything
+from probscene.structure import StructurePrior, counts, weights
+
+PRESETS = {
+    "quick": QUICK,
+    "quick-mmd": replace(QUICK, objective="mmd"),
+    "default": DEFAULT,
+    "default-mmd": replace(DEFAULT, objective="mmd"),
+    "paper": PAPER,
+    "oracle": QUICK,
+}
+ORACLE_BATCHES = 100
+
+
+def distributions(target: int) -> tuple[np.ndarray, np.ndarray]:
+    """Truth: P(number of digits) ``(11,)`` and P(class) ``(10,)``."""
+    rng = np.random.default_rng([7, target])
+    return rng.dirichlet(np.ones(11)), rng.dirichlet(np.ones(10))
+
+
+def draw_target(mnist: Path, target: int, folder: Path, images: int) -> None:
+    """Upright digits in an evenly spaced row, pasted by numpy."""
+    if folder.is_dir():
+        return
+    pixels = np.frombuffer(gzip.decompress((mnist / "t10k-images-idx3-ubyte.gz").read_bytes()), np.uint8, offset=16)
+    labels = np.frombuffer(gzip.decompress((mnist / "t10k-labels-idx1-ubyte.gz").read_bytes()), np.uint8, offset=8)
+    glyphs = [pixels.reshape(-1, 28, 28)[labels == c] for c in range(10)]
+    number, share = distributions(target)
+    rng = np.random.default_rng([8, target])
+    aside = folder.with_suffix(".part")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    for i in range(images):
+        n = rng.choice(11, p=number)
+        canvas = np.zeros((256, 256), np.uint8)
+        for k, digit in enumerate(rng.choice(10, p=share, size=n)):
+            x = round(256 * (k + 1) / (n + 1)) - 14
+            window = canvas[114:142, x : x + 28]
+            np.maximum(window, rng.choice(glyphs[digit]), out=window)
+        cv2.imwrite(str(aside / f"{i:06d}.png"), canvas)
+    aside.rename(folder)
+
+
+def distances(policy, target: int) -> tuple[float, float]:
+    """Total variation of number and of classes between 20,000 structures and the truth."""
+    seed_everything(99)
+    derivation, _ = derive_complete(GRAMMAR, policy, 20_000, MODEL.max_steps)
+    seen = derivation.counts(len(GRAMMAR.kinds))[:, [GRAMMAR.kind(name) for name in CLASSES]].numpy()
+    number, share = distributions(target)
+    lengths = np.bincount(seen.sum(1), minlength=32) / len(seen)
+    number = np.pad(number, (0, len(lengths) - len(number)))
+    return float(np.abs(lengths - number).sum() / 2), float(np.abs(seen.sum(0) / seen.sum() - share).sum() / 2)
+
+
+def fit_images(name: str, target: int, seed: int, args) -> tuple[LSTMGuide, dict[str, float]]:
+    """A fit from images, resumed if it was begun."""
+    out = args.out / f"{name}-{target}"
+    shared = args.out / f"features-{'paper' if name == 'paper' else name.split('-')[0]}.safetensors"
+    if (out / "run.json").exists():
+        run = Run.open(out)
+    else:
+        run = create("multi_mnist", args.out / f"target-{target}", out, PRESETS[name], seed)
+    took, last = {}, [None, time.monotonic()]
+
+    def progress(stage, done, total, note):
+        if stage != last[0]:
+            last[:] = [stage, time.monotonic()]
+        took[stage] = time.monotonic() - last[1]
+        if stage in ("features", "structure") and done == total:
+            print(f"  {name} target {target}: {stage} {took[stage]:.0f} s, {note}", flush=True)
+
+    if shared.exists() and not (out / "features.safetensors").exists():
+        shutil.copyfile(shared, out / "features.safetensors")
+    guide = fit(run, progress)
+    if not shared.exists():
+        shutil.copyfile(out / "features.safetensors", shared)
+    return guide, took
+
+
+def fit_counts(target: int, seed: int, images: int) -> tuple[LSTMGuide, dict[str, float]]:
+    """The same objective on true counts: what is left is the error of optimisation."""
+    start = time.monotonic()
+    kinds = [GRAMMAR.kind(name) for name in CLASSES]
+
+    def observe(scenes):
+        seen = scenes.derivation.counts(len(GRAMMAR.kinds))[:, kinds].float()
+        return torch.cat([seen, seen.sum(1, keepdim=True)], 1)
+
+    def structures(num_scenes):
+        drawn = MODEL.program(num_scenes, MODEL.prior)
+        return Drawing(drawn.kind, drawn.kinds, ())
+
+    seed_everything(seed)
+    number, share = distributions(target)
+    truth = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
+    real, _ = derive_complete(GRAMMAR, truth, images, MODEL.max_steps)
+    seen = real.counts(len(GRAMMAR.kinds))[:, kinds].float()
+    guide = LSTMGuide(GRAMMAR, MODEL.max_steps)
+    pretrain(guide, MODEL.prior)
+    loss = ScoreFunction(observe, QUICK.divergence(), updates=QUICK.updates)
+    features = torch.cat([seen, seen.sum(1, keepdim=True)], 1)
+    Learner(structures, guide, loss, features, ORACLE_BATCHES, seed=seed).run()
+    return guide, {"structure": time.monotonic() - start}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--mnist", type=Path, required=True, help="folder of the original IDX files")
+    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
+    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
+    parser.add_argument("--targets", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--images", type=int, default=5000)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    rows = []
+    for name in args.presets:
+        for target in args.targets:
+            draw_target(args.mnist, target, args.out / f"target-{target}", args.images)
+            before = distances(MODEL.prior, target)
+            if name == "oracle":
+                guide, took = fit_counts(target, args.seed, args.images)
+            else:
+                guide, took = fit_images(name, target, args.seed, args)
+            after = distances(guide, target)
+            rows.append({"preset": name, "target": target, "prior": before, "learnt": after, "seconds": took})
+            print(json.dumps(rows[-1]), flush=True)
+            write_json(args.out / "results.json", rows)
+    print(f"\n{'preset':12} {'number: prior':>14} {'learnt':>8} {'classes: prior':>15} {'learnt':>8}   each target")
+    for name in args.presets:
+        mine = [row for row in rows if row["preset"] == name]
+        prior, learnt = (np.array([row[key] for row in mine]) for key in ("prior", "learnt"))
+        each = "  ".join(f"{n:.3f}/{c:.3f}" for n, c in learnt)
+        n, c = learnt.mean(0)
+        print(f"{name:12} {prior[:, 0].mean():14.3f} {n:8.3f} {prior[:, 1].mean():15.3f} {c:8.3f}   {each}")
+
+
+if __name__ == "__main__":
+    main()
