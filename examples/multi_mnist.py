@@ -75,7 +75,8 @@ def main():
 
     target = MODEL.target(args.seed)
     observe = true_counts if args.oracle else seen_counts(args.steps)
-    real = torch.cat([observe(sample(target, target.prior, 500)) for _ in range(-(-args.num_real // 500))])
+    chunks = [min(500, args.num_real - done) for done in range(0, args.num_real, 500)]
+    real = torch.cat([observe(sample(target, target.prior, size)) for size in chunks])
 
     guide = LSTMGuide(GRAMMAR, MODEL.max_steps)
     pretrain(guide, MODEL.prior)

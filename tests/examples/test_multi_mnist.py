@@ -1,0 +1,22 @@
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "multi_mnist.py"
+FEW = ["--batches", "2", "--num-scenes", "40", "--num-real", "100"]
+
+
+@pytest.mark.parametrize("arguments", [["--oracle"], ["--steps", "16"]], ids=["oracle", "pixels"])
+def test_runs_and_prints_how_far_it_came(arguments, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(EXAMPLE.parents[1]), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, EXAMPLE, *arguments, *FEW], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    distances = re.findall(r"total variation, (\w+): number of digits ([\d.]+), classes ([\d.]+)", done.stdout)
+    assert [name for name, *_ in distances] == ["prior", "learnt"]
+    assert all(0 <= float(value) <= 1 for _, *pair in distances for value in pair)
