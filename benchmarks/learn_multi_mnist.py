@@ -4,8 +4,8 @@
 
 The images are drawn here with numpy and OpenCV from the digits of t10k (the original IDX files), which the model does
 not have; the fit sees the folder alone. Printed is the total variation of the number of digits and of their classes
-between 20,000 learnt structures and the distributions that the target was drawn from. Runs of one preset and seed share their
-feature network, which depends on nothing else; its time is counted once for each.
+between 20,000 learnt structures and the distributions that the target was drawn from. Runs of one preset and seed share
+their feature network, which depends on nothing else.
 """
 
 import argparse

@@ -44,6 +44,12 @@ def default_digits(held_out: bool) -> Digits:
     return idx(folder, held_out) if folder else shipped(held_out)
 
 
+def default_assets() -> str:
+    """Which digits ``default_digits`` are."""
+    folder = os.environ.get("PROBSCENE_MNIST")
+    return f"IDX digits in {os.path.abspath(folder)} (PROBSCENE_MNIST)" if folder else "digits of the install"
+
+
 def scattered(num_scenes: int, structure: Policy, digits: Source) -> Drawing:
     """The prior's program: place and rotation are uniform."""
     with pyro.plate("scenes", num_scenes, dim=-2):
@@ -84,8 +90,8 @@ def target(seed: int, digits: Source = default_digits) -> SceneModel:
     return SceneModel("multi_mnist_target", GRAMMAR, prior, program, (CANVAS, CANVAS), MAX_STEPS, CLASSES, channels=1)
 
 
-def multi_mnist(digits: Source = default_digits) -> SceneModel:
-    """The model with digits of any source; see ``probscene.models.digits``."""
+def multi_mnist(digits: Source = default_digits, assets: str = "") -> SceneModel:
+    """The model with digits of any source, see ``probscene.models.digits``; ``assets`` names it in words."""
     return SceneModel(
         name="multi_mnist",
         grammar=GRAMMAR,
@@ -95,8 +101,9 @@ def multi_mnist(digits: Source = default_digits) -> SceneModel:
         max_steps=MAX_STEPS,
         classes=CLASSES,
         channels=1,
+        assets=assets,
         target=partial(target, digits=digits),
     )
 
 
-MODEL = multi_mnist()
+MODEL = multi_mnist(assets=default_assets())

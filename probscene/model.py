@@ -23,6 +23,7 @@ class SceneModel:
         max_steps: T_max; a longer derivation is redrawn.
         classes: the kinds that are labelled and counted, in the order of the categories.
         channels: 1 if colour carries nothing (images are then read as grey), else 3.
+        assets: what it draws with beside its own code, in words; a run is bound to it.
         target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
 
     Raises:
@@ -37,6 +38,7 @@ class SceneModel:
     max_steps: int
     classes: tuple[str, ...]
     channels: int = 3
+    assets: str = ""
     target: Callable[[int], "SceneModel"] | None = None
 
     def __post_init__(self):

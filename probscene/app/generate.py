@@ -143,7 +143,8 @@ class Job:
         done(None)
         work(chunks, done)
         found = (annotation for record in parts.records() for annotation in record["annotations"])
-        lines = (json.dumps(line, ensure_ascii=False) + "\n" for record in parts.records() for line in record["provenance"])
+        provenance = (line for record in parts.records() for line in record["provenance"])
+        lines = (json.dumps(line, ensure_ascii=False) + "\n" for line in provenance)
         labels = {LABELS: lambda path: coco.write(path, self.model, parts.num, parts.settings, found)}
         parts.finish({**(labels if self.labelled else {}), LINES: lambda path: _write_lines(path, lines)})
         return Dataset(parts.out, made)

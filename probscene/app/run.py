@@ -50,13 +50,14 @@ class Run:
         """
         path = Path(path)
         Run.check_free(path)
+        assets = load_model(model).assets
         make_folder(path)
         reference = model
         digest = None
         if model not in BUILT_IN:
             reference = str(Path(model).resolve())
             digest = _sha256(Path(model))
-        run = Run(path, {**record, "format": FORMAT, "model": reference, "model_sha256": digest})
+        run = Run(path, {**record, "format": FORMAT, "model": reference, "model_sha256": digest, "assets": assets})
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
         if digest is not None:
             write_whole(path / "model.py", lambda temporary: shutil.copyfile(model, temporary))
@@ -106,7 +107,7 @@ class Run:
         """The scene model, loaded once.
 
         Raises:
-            RunError: the model's file is gone or has changed since the fit.
+            RunError: the model's file is gone or has changed since the fit, or it draws with other assets.
         """
         if self._model is None:
             reference, digest = self.record["model"], self.record["model_sha256"]
@@ -115,7 +116,13 @@ class Run:
                     f"Expected the model file {reference} as it was when {self.path} was fitted, actual a missing or "
                     f"changed file. A copy is in {self.path / 'model.py'}: put it back, or fit again."
                 )
-            self._model = load_model(reference)
+            model = load_model(reference)
+            if model.assets != self.record["assets"]:
+                raise RunError(
+                    f"Expected model {model.name} to draw with {self.record['assets'] or 'no assets'}, as when the run "
+                    f"{self.path} was begun, actual {model.assets or 'no assets'}; put them back, or fit again."
+                )
+            self._model = model
         return self._model
 
     def guide(self) -> LSTMGuide:
