@@ -1,0 +1,123 @@
+"""Charts for a page: matplotlib's SVG, inline, in the colours of the page's style sheet, for light and dark alike.
+
+A colour here is a stand-in that becomes ``var(--name)``.
+"""
+
+import io
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from probscene.app.evaluate import Evaluation
+from probscene.inference.metrics import Histogram
+
+INK, FAINT = "#010203", "#010204"
+SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
+VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
+STYLE = {
+    "svg.fonttype": "none",  # text stays text, in the page's font
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": INK,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.5,
+    "axes.grid.axis": "y",
+    "axes.axisbelow": True,
+}
+
+
+def numbers(evaluation: Evaluation) -> str:
+    """The share of images by number of objects."""
+    each = {name: source.number() for name, source in evaluation.sources.items()}
+    bins = max(len(found.share) for found in each.values())
+    return _bars(each, [str(k) for k in range(bins)], "objects in an image", "share of images", "number")
+
+
+def classes(evaluation: Evaluation) -> str:
+    """The share of objects by class."""
+    each = {name: source.classes() for name, source in evaluation.sources.items()}
+    return _bars(each, list(evaluation.classes), "class", "share of objects", "class")
+
+
+def curves(log: list[dict]) -> list[str]:
+    """Learning curves, one chart each: the feature network's loss, and what each batch of structures was like."""
+    features = [line for line in log if line["stage"] == "features"]
+    structure = [line for line in log if line["stage"] == "structure"]
+    charts = []
+    if features:
+        charts.append(_curve("Feature network: loss", "step", _column(features, "step"), _column(features, "loss")))
+    if structure:
+        batch = _column(structure, "batch")
+        titles = {
+            "cost": "Structure: mean cost, and its spread",
+            "rejections": "Structure: rejected derivations a scene",
+            "length": "Structure: rules a derivation",
+        }
+        for key, title in titles.items():
+            spread = _column(structure, "cost_sd") if key == "cost" else None
+            charts.append(_curve(title, "batch", batch, _column(structure, key), spread))
+    return charts
+
+
+def _bars(each: dict[str, Histogram], ticks: list[str], x: str, y: str, salt: str) -> str:
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt, "axes.grid": True}):
+        figure, axes = _figure(9.6, 2.9)
+        width = 0.82 / len(each)
+        for i, (name, found) in enumerate(each.items()):
+            size = len(found.share)
+            at = np.arange(size) + (i - (len(each) - 1) / 2) * width
+            axes.bar(at, found.share, width * 0.92, color=SOURCES[name])
+            error = np.clip([found.share - found.low, found.high - found.share], 0, None)
+            axes.errorbar(at, found.share, error, fmt="none", ecolor=INK, elinewidth=0.8)
+        axes.set_xticks(range(len(ticks)), ticks)
+        axes.set_xlim(-0.6, len(ticks) - 0.4)
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel(x)
+        axes.set_ylabel(y)
+        axes.tick_params(length=0)
+        return _svg(figure)
+
+
+def _curve(title: str, x: str, at: np.ndarray, value: np.ndarray, spread: np.ndarray | None = None) -> str:
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": title, "axes.grid": True}):
+        figure, axes = _figure(3.8, 2.1)
+        if spread is not None:
+            axes.fill_between(at, value - spread, value + spread, color=SOURCES["learnt"], alpha=0.15, linewidth=0)
+        axes.plot(at, value, color=SOURCES["learnt"], linewidth=1.6)
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        if value.min() >= 0 and spread is None:
+            axes.set_ylim(0, max(1e-6, 1.05 * value.max()))
+        axes.set_title(title)
+        axes.set_xlabel(x)
+        axes.tick_params(length=0)
+        return _svg(figure)
+
+
+def _figure(width: float, height: float) -> tuple[Figure, Axes]:
+    figure = Figure((width, height), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _svg(figure: Figure) -> str:
+    out = io.StringIO()
+    figure.savefig(out, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = out.getvalue()
+    text = text[text.index("<svg") :]
+    for stand_in, variable in VARIABLES.items():
+        text = text.replace(stand_in, variable)
+    return text
+
+
+def _column(lines: list[dict], key: str) -> np.ndarray:
+    return np.array([line[key] for line in lines], float)

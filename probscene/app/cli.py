@@ -1,0 +1,276 @@
+"""``probscene``: the command line. Commands import what they need when they run, so that ``--help`` is quick.
+
+Exit codes: 0; 2 where the input is at fault; 1 where the machine is, where the work was interrupted, and for a bug.
+"""
+
+import os
+import shlex
+import sys
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer.core import TyperGroup
+
+import probscene
+from probscene.errors import ModelError, ProbsceneError
+
+if TYPE_CHECKING:
+    from probscene.inference.presets import Preset
+
+
+@dataclass
+class Call:
+    """What was asked for, for the message when it ends early."""
+
+    words: list[str]
+    debug: bool = field(default_factory=lambda: bool(os.environ.get("PROBSCENE_DEBUG")))
+
+
+class Commands(TyperGroup):
+    """Turns an error of any command into one line on stderr and an exit code."""
+
+    def parse_args(self, ctx, args):
+        ctx.obj = Call(list(args))
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx):
+        try:
+            return super().invoke(ctx)
+        except (Exception, KeyboardInterrupt) as error:
+            its_own = type(error).__module__.startswith(("typer.", "click."))  # wrong usage, --help, an exit code
+            if its_own or isinstance(error, BrokenPipeError) or ctx.obj.debug:
+                raise
+            code, text = explained(error, ctx.obj.words)
+            print(text, file=sys.stderr)
+        raise typer.Exit(code)
+
+
+def explained(error: BaseException, words: list[str]) -> tuple[int, str]:
+    """The exit code and the one line that an error comes to; ``words`` are what was typed after ``probscene``."""
+    again = shlex.join(["probscene", *words])
+    if isinstance(error, KeyboardInterrupt):
+        return 1, f"Interrupted; go on with: {again}"
+    if isinstance(error, OSError):
+        from probscene.app.files import machine_error
+
+        error = machine_error(error, Path(error.filename or "the output"))
+    if isinstance(error, ProbsceneError):
+        return error.exit_code, f"probscene: {' '.join(str(error).split())}"
+    if isinstance(error, MemoryError):
+        return 1, "probscene: The machine is out of memory; close other programs and run the command again."
+    last = (str(error).strip().splitlines() or ["no message"])[-1]
+    debug = shlex.join(["probscene", "--debug", *words])
+    return 1, f"probscene: A bug in probscene: {type(error).__name__}: {last}. Please report what this prints: {debug}"
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, made by 'probscene fit'.")]
+Model = Annotated[str, typer.Argument(metavar="MODEL", help="A built-in model (multi_mnist) or a path to a .py file.")]
+Seed = Annotated[int, typer.Option(help="The same seed gives the same result.")]
+PresetName = StrEnum("PresetName", ["quick", "default", "paper"])
+Objective = StrEnum("Objective", ["kde", "mmd"])
+
+
+@app.callback()
+def _everywhere(
+    ctx: typer.Context, debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False
+) -> None:
+    """Learn which scene structures occur in unlabelled images, then generate a labelled dataset that has them."""
+    ctx.obj.debug |= debug
+
+
+@app.command()
+def check(model: Model) -> None:
+    """Say whether a model's grammar is sound, how long its derivations are, and what to mend."""
+    from probscene.app.loading import load_model
+    from probscene.checks import check
+
+    report = check(load_model(model))
+    print(report)
+    if report.faults:
+        raise ModelError(f"Expected a model without faults, actual {model} with {len(report.faults)}; mend them first.")
+
+
+@app.command()
+def preview(
+    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a finished run.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write, a PNG.")],
+    num: Annotated[int, typer.Option(help="How many scenes.")] = 16,
+    seed: Seed = 0,
+    boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes and class names.")] = False,
+) -> None:
+    """Draw a grid of scenes: of a model's prior, or of what a run has learnt."""
+    from probscene.app.preview import preview
+
+    preview(model_or_run, out, num, _seed(seed), boxes)
+    print(f"{num} scenes in {out}")
+
+
+@app.command()
+def fit(
+    ctx: typer.Context,
+    out: Annotated[Path, typer.Option(metavar="RUN", help="The run folder to write.")],
+    model: Annotated[str | None, typer.Argument(metavar="MODEL", help="A built-in model or a .py file.")] = None,
+    target: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of PNG or JPEG images.")] = None,
+    preset: Annotated[PresetName | None, typer.Option(help="How long to learn; 'default' if not given.")] = None,
+    objective: Annotated[Objective | None, typer.Option(help="The divergence, instead of the preset's.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="The same seed gives the same result; 0 if not given.")] = None,
+    skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = None,
+    threads: Annotated[int | None, typer.Option(help="All cores if not given.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
+) -> None:
+    """Learn which structures occur in a folder of unlabelled images."""
+    from probscene.app import session
+    from probscene.app.display import Display
+
+    if seed is not None:
+        _seed(seed)
+    if threads is not None and threads < 1:
+        raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
+    chosen = _preset(preset, objective, settings or [])
+    with Display() as show:
+        if resume:
+            given = chosen if preset or objective or settings else None
+            run, images = session.resume(out, show, model, target, given, seed=seed, skip_bad=skip_bad, threads=threads)
+        elif model is None or target is None:
+            raise ProbsceneError(
+                "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
+            )
+        else:
+            run, images = session.begin(model, target, out, chosen, seed or 0, bool(skip_bad), threads, show)
+            ctx.obj.words.append("--resume")
+        if not session.is_finished(run):
+            session.carry_out(run, images, show)
+    print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")
+
+
+@app.command()
+def generate(
+    run: RunFolder,
+    num: Annotated[int, typer.Option(metavar="N", help="How many images.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    format: Annotated[str, typer.Option(help="coco, or images for no annotations.")] = "coco",
+    seed: Seed = 0,
+    workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,
+) -> None:
+    """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
+    from probscene.app.display import Display
+    from probscene.app.generate import generate
+    from probscene.app.run import Run
+
+    with Display() as show:
+        dataset = generate(Run.open(run), num, out, seed, workers, format, show.stage("generating"))
+    print(f"{num} images in {dataset.path}, {dataset.made} of them made now")
+
+
+@app.command()
+def evaluate(
+    run: RunFolder,
+    target: Annotated[Path, typer.Option(metavar="DIR", help="The images to judge by.")],
+    labels: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="counts.csv: image,CLASS,CLASS,...; one row an image.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
+    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+) -> None:
+    """Compare prior and learnt structures with the truth, or with what the feature network sees."""
+    from rich.console import Console
+
+    from probscene.app import session, tables
+    from probscene.app.display import Display
+    from probscene.app.evaluate import evaluate
+    from probscene.app.files import make_folder, write_json
+    from probscene.app.labels import read_counts
+    from probscene.app.run import Run
+
+    opened = Run.open(run)
+    opened.guide()
+    if json is not None:
+        make_folder(json.parent)
+    with Display() as show:
+        images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
+        truth = None if labels is None else read_counts(labels, opened.model.classes, images)
+        found = evaluate(opened, images, truth, show, num)
+    tables.show(found, Console(highlight=False))
+    if json is not None:
+        write_json(json, found.record())
+
+
+@app.command()
+def report(
+    run: RunFolder,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="report.html in the run folder if not given.")
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="counts.csv of the run's target, for the truth.")
+    ] = None,
+    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+) -> None:
+    """Write one self-contained HTML page about a run."""
+    from probscene.app.display import Display
+    from probscene.app.report import report
+    from probscene.app.run import Run
+
+    with Display() as show:
+        path = report(Run.open(run), show, out, labels, num)
+    print(f"The report is {path}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")] = Path("demo"), seed: Seed = 0
+) -> None:
+    """The whole path on handwritten digits that come with the install; about five minutes on two cores."""
+    from probscene.app.demo import demo
+
+    demo(out, _seed(seed))
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    print(f"probscene {probscene.__version__}")
+
+
+def _seed(seed: int) -> int:
+    if seed < 0:
+        raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
+    return seed
+
+
+def _preset(name: str | None, objective: str | None, settings: list[str]) -> "Preset":
+    from probscene.app.overrides import override
+    from probscene.inference.presets import preset
+
+    chosen = preset(str(name or PresetName.default))
+    return override(chosen if objective is None else replace(chosen, objective=str(objective)), settings)
+
+
+def main() -> None:
+    """The console script."""
+    sys.stdout.reconfigure(errors="replace")  # a grammar's ε on a terminal that has none
+    try:
+        app(prog_name="probscene")
+    except KeyboardInterrupt:  # before or after a command's work
+        code, text = explained(KeyboardInterrupt(), sys.argv[1:])
+        print(text, file=sys.stderr)
+        sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""``probscene demo``: the whole path on a target that the model itself draws.
+
+    target/images    the target; fitting sees nothing else
+    truth.csv        what is in it, for judging only
+    run              the fit, with report.html
+    dataset          labelled images of what was learnt
+    evaluation.json  how near that is to the truth
+    grid.png         prior, learnt and target side by side
+
+Each step is left out where it is finished, so the same command goes on after an interruption.
+"""
+
+import json
+from pathlib import Path
+
+from rich.console import Console
+
+from probscene.app import report, session, tables
+from probscene.app.display import Display
+from probscene.app.evaluate import evaluate
+from probscene.app.files import make_folder, write_json
+from probscene.app.generate import generate, generate_scenes
+from probscene.app.labels import counts_of_dataset, read_counts, write_counts
+from probscene.app.loading import load_model
+from probscene.app.preview import pixels, scenes, side_by_side, write_picture
+from probscene.app.run import Run
+from probscene.dataset import ImageFolder
+from probscene.errors import ModelError
+from probscene.inference.presets import QUICK, Preset
+from probscene.model import SceneModel
+
+SAMPLES = 16  # images a grid
+
+
+def demo(
+    out: Path,
+    seed: int = 0,
+    model: str = "multi_mnist",
+    preset: Preset = QUICK,
+    images: int = 3000,
+    num: int = 500,
+    threads: int | None = None,
+) -> None:
+    """Draw a target, fit, generate, evaluate, report; prints how near it came and where to look.
+
+    Args:
+        seed: of the target's distribution as well as of the fit.
+        images: of the target.
+        num: of the dataset.
+        threads: of the fit; all cores where None.
+
+    Raises:
+        ProbsceneError: a model without a target, or a folder that holds something else.
+    """
+    loaded = load_model(model)
+    if loaded.target is None:
+        raise ModelError(f"Expected a model with a target to learn from, actual {model!r}, which has none.")
+    out = make_folder(out)
+    with Display() as show:
+        target = _draw(loaded.target(seed), images, out, seed, show)
+        run, opened = _fit(model, target, out / "run", preset, seed, threads, show)
+        generate(run, num, out / "dataset", seed, progress=show.stage("generating"))
+        if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
+            _judge(run, opened or session.open_images(target, loaded, False, show), out, show)
+    console = Console(highlight=False)
+    measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))["distances"]
+    for table in tables.distances({"truth": measured["truth"]}):
+        console.print(table)
+    spent = sum(session.timing(run).values())
+    print(f"\nFitting took {spent:.0f} s and saw only {target}. Where to look:")
+    for name, what in (
+        ("grid.png", "scenes of the prior, of what was learnt, and of the target"),
+        ("run/report.html", "the report: histograms, learning curves, configuration"),
+        ("dataset", f"{num} labelled images: images/, annotations.json (COCO), provenance.jsonl"),
+        ("truth.csv", "what the target holds, for judging only"),
+    ):
+        print(f"  {out / name!s:<24} {what}")
+
+
+def _draw(truth: SceneModel, images: int, out: Path, seed: int, show: Display) -> Path:
+    """The folder of the target's images, with its counts beside it."""
+    folder = out / "target"
+    generate_scenes(truth, truth.prior, images, folder, seed, "images", show.stage("drawing"))
+    if not (out / "truth.csv").exists():
+        write_counts(out / "truth.csv", *counts_of_dataset(truth, folder), truth.classes)
+    return folder / "images"
+
+
+def _fit(
+    model: str, target: Path, out: Path, preset: Preset, seed: int, threads: int | None, show: Display
+) -> tuple[Run, ImageFolder | None]:
+    if (out / "run.json").exists():
+        run, opened = session.resume(out, show, model, target, preset, seed=seed, threads=threads)
+    else:
+        run, opened = session.begin(model, target, out, preset, seed, False, threads, show)
+    if not session.is_finished(run):
+        session.carry_out(run, opened, show)
+    return run, opened
+
+
+def _judge(run: Run, target: ImageFolder, out: Path, show: Display) -> None:
+    model = run.model
+    found = evaluate(run, target, read_counts(out / "truth.csv", model.classes, target), show)
+    write_json(out / "evaluation.json", found.record())
+    report.write(run, found, target)
+    pictures = {
+        "Prior": pixels(scenes(model, model.prior, SAMPLES, 0).image),
+        "Learnt": pixels(scenes(model, run.guide(), SAMPLES, 0).image),
+        "Target": [pixels(target.load(i)[None])[0] for i in range(min(SAMPLES, len(target)))],
+    }
+    write_picture(out / "grid.png", side_by_side(pictures))

@@ -1,0 +1,63 @@
+"""A target folder, and a run that the command line has fitted to it in a few seconds."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+from probscene.app.cli import app
+from probscene.app.generate import generate_scenes
+from probscene.app.labels import counts_of_dataset, write_counts
+from probscene.app.loading import load_model
+
+DISCS = Path(__file__).with_name("discs.py")
+SHORT = {
+    "count.steps": 48,
+    "count.images": 4,
+    "count.crops": 4,
+    "width": "4,8,8",
+    "pretrain_derivations": 100,
+    "pretrain_epochs": 2,
+    "batches": 4,
+    "num_scenes": 30,
+}
+SETTINGS = ["--preset", "quick", "--threads", "1", *(w for k, v in SHORT.items() for w in ("--set", f"{k}={v}"))]
+
+
+def probscene(*words) -> SimpleNamespace:
+    """Call the command line in this process: ``code``, ``out`` and ``err``."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    return SimpleNamespace(code=result.exit_code, out=result.stdout, err=result.stderr)
+
+
+@pytest.fixture(scope="session")
+def call() -> Callable[..., SimpleNamespace]:
+    return probscene
+
+
+@pytest.fixture(scope="session")
+def discs() -> SimpleNamespace:
+    """``file``: a model; ``settings``: words that make a fit of it short."""
+    return SimpleNamespace(file=DISCS, settings=SETTINGS)
+
+
+@pytest.fixture(scope="session")
+def target(tmp_path_factory) -> SimpleNamespace:
+    """40 images that the model's target drew: ``images`` is their folder, ``labels`` their counts."""
+    folder = tmp_path_factory.mktemp("target")
+    truth = load_model(str(DISCS)).target(0)
+    generate_scenes(truth, truth.prior, 40, folder / "drawn", format="images")
+    names, counts = counts_of_dataset(truth, folder / "drawn")
+    write_counts(folder / "counts.csv", names, counts, truth.classes)
+    return SimpleNamespace(images=folder / "drawn" / "images", labels=folder / "counts.csv", counts=counts)
+
+
+@pytest.fixture(scope="session")
+def fitted(tmp_path_factory, target) -> Path:
+    """A finished run."""
+    out = tmp_path_factory.mktemp("fitted") / "run"
+    done = probscene("fit", DISCS, "--target", target.images, "--out", out, *SETTINGS)
+    assert done.code == 0, done.err
+    return out

@@ -1,0 +1,433 @@
+"""The command line: what it does, and that whatever goes wrong says so in one line and leaves nothing half-written."""
+
+import errno
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import probscene
+from probscene.app import cli, fit
+from probscene.app.overrides import override
+from probscene.app.run import Run
+from probscene.errors import ProbsceneError
+from probscene.inference.presets import PRESETS, QUICK
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def copied(target, folder: Path, number: int = 10) -> Path:
+    """A folder with some of the target's images."""
+    folder.mkdir()
+    for file in sorted(target.images.iterdir())[:number]:
+        (folder / file.name).write_bytes(file.read_bytes())
+    return folder
+
+
+def check_fault(result, code: int, *parts: str) -> None:
+    """One line on stderr after what progress says, and nothing that only a programmer reads."""
+    assert result.code == code, result.err
+    (line,) = [line for line in result.err.splitlines() if line.startswith("probscene: ")]
+    assert result.err.endswith(line + "\n") and "Traceback" not in result.err
+    for part in parts:
+        assert part in line
+
+
+def test_help_is_quick_because_it_imports_nothing_heavy():
+    program = (
+        "import sys\nfrom probscene.app.cli import main\nsys.argv = ['probscene', 'fit', '--help']\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "heavy = {'torch', 'pyro', 'taichi', 'numpy', 'cv2', 'scipy', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "--skip-bad" in run.stdout
+
+
+def test_version_and_help(call):
+    assert call("version").out == f"probscene {probscene.__version__}\n"
+    commands = ("check", "preview", "fit", "generate", "evaluate", "report", "demo", "version")
+    assert all(f"\n  {command} " in call("--help").out for command in commands)
+
+
+def test_presets_are_those_of_the_library():
+    assert [str(name) for name in cli.PresetName] == list(PRESETS)
+    assert {override(QUICK, [f"objective={name}"]).objective for name in cli.Objective} == set(cli.Objective)
+
+
+def test_check_says_what_a_person_should_know(call, discs):
+    result = call("check", discs.file)
+    assert result.code == 0 and "Every derivation ends" in result.out
+
+
+def test_preview_of_a_prior_and_of_a_run(call, discs, fitted, tmp_path):
+    for what in (discs.file, fitted):
+        out = tmp_path / "new" / f"{what.stem}.png"
+        assert call("preview", what, "--out", out, "--num", 5, "--boxes").code == 0
+        first = out.read_bytes()
+        with Image.open(out) as picture:
+            assert picture.size == (3 * 66 + 2, 2 * 66 + 2)
+        call("preview", what, "--out", out, "--num", 5, "--boxes")
+        assert out.read_bytes() == first
+        call("preview", what, "--out", out, "--num", 5, "--boxes", "--seed", 1)
+        assert out.read_bytes() != first
+
+
+def test_a_fit_leaves_a_run_that_says_how_it_was_made(fitted, discs, target, call):
+    record = json.loads((fitted / "run.json").read_text())
+    assert record["preset"]["count"]["steps"] == 48 and record["preset"]["width"] == [4, 8, 8]
+    assert record["seed"] == 0 and record["target"] == str(target.images) and record["model"] == str(discs.file)
+    log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
+    assert [line.get("step", line.get("batch")) for line in log] == [16, 32, 48, 1, 2, 3, 4]
+    assert set(json.loads((fitted / "timing.json").read_text())) >= {"reading", "features", "target", "structure"}
+    again = call("fit", "--resume", "--out", fitted)
+    assert again.code == 0 and again.err == ""
+
+
+def test_generate_and_its_refusal_of_another_seed(call, fitted, tmp_path):
+    first = call("generate", fitted, "--num", 3, "--out", tmp_path / "d")
+    assert first.code == 0 and "3 images" in first.out
+    assert len(list((tmp_path / "d" / "images").iterdir())) == 3
+    check_fault(call("generate", fitted, "--num", 3, "--out", tmp_path / "d", "--seed", 1), 2, "seed 0", "seed 1")
+
+
+# What is wrong with the images.
+
+
+def spoil_empty(folder):
+    for file in folder.iterdir():
+        file.unlink()
+
+
+def spoil_no_images(folder):
+    spoil_empty(folder)
+    (folder / "notes.txt").write_text("none")
+
+
+def spoil_corrupt(folder):
+    (folder / "000003.png").write_bytes(b"not a picture")
+
+
+def spoil_truncated(folder):
+    file = folder / "000003.png"
+    file.write_bytes(file.read_bytes()[:-20])
+
+
+def spoil_file(folder):
+    spoil_empty(folder)
+    folder.rmdir()
+    folder.write_text("a file")
+
+
+def spoil_gone(folder):
+    spoil_empty(folder)
+    folder.rmdir()
+
+
+IMAGES = {
+    spoil_empty: "an empty folder",
+    spoil_no_images: "notes.txt",
+    spoil_corrupt: "000003.png",
+    spoil_truncated: "000003.png is truncated",
+    spoil_file: "which is a file",
+    spoil_gone: "which is not there",
+}
+
+
+@pytest.mark.parametrize("spoil", IMAGES, ids=lambda spoil: spoil.__name__[6:])
+def test_bad_images(spoil, call, discs, target, fitted, tmp_path):
+    folder = copied(target, tmp_path / "images")
+    spoil(folder)
+    check_fault(call("fit", discs.file, "--target", folder, "--out", tmp_path / "run"), 2, IMAGES[spoil])
+    assert not (tmp_path / "run").exists()
+    check_fault(call("evaluate", fitted, "--target", folder, "--json", tmp_path / "e.json"), 2, IMAGES[spoil])
+    assert not (tmp_path / "e.json").exists()
+
+
+def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, discs, target, tmp_path):
+    folder = copied(target, tmp_path / "images")
+    spoil_corrupt(folder)
+    Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(folder / "small.png")
+    words = ["fit", discs.file, "--target", folder, "--out", tmp_path / "run", *discs.settings, "--set", "batches=1"]
+    result = call(*words, "--skip-bad", "--set", "count.steps=16")
+    assert result.code == 0, result.err
+    assert result.err.count("000003.png") == 1 and result.err.count("resized to 64x64") == 1
+    assert len(Run.open(tmp_path / "run").load("real")["features"]) == 10
+
+
+# What is wrong with the model.
+
+GOOD = (Path(__file__).with_name("discs.py")).read_text(encoding="utf-8")
+MODELS = {
+    "syntax": ("def f(:\n", "does not import: SyntaxError"),
+    "import": ("import nothing_of_this_name\n", "ModuleNotFoundError"),
+    "raises": ("1 / 0\n", "ZeroDivisionError"),
+    "none": ("x = 1\n", "actual none"),
+    "two": (GOOD + "\nOTHER = target(1)\nMODEL2 = MODEL\ndel MODEL\n", "to export one SceneModel"),
+    "undefined": (GOOD.replace("red | blue\n", "red | Blue\n"), "Undefined nonterminal: Blue"),
+    "unreachable": (GOOD.replace("| blue\n", "| blue\n    Lost -> lost\n", 1), "Unreachable nonterminal: Lost"),
+    "duplicate": (GOOD.replace("red | blue\n", "red | blue | red\n"), "Duplicate production"),
+    "never ends": (GOOD.replace("Disc Discs | ε", "Disc Discs"), "can never end"),
+    "need not end": (GOOD.replace("Discs=counts(*discs)", "Discs=weights(1, 0)"), "need not terminate"),
+    "too long": (GOOD.replace("(64, 64), 12,", "(64, 64), 1,"), "max_steps = 1 is too short"),
+}
+
+
+@pytest.mark.parametrize("fault", MODELS)
+def test_bad_models(fault, call, target, tmp_path):
+    text, part = MODELS[fault]
+    (tmp_path / "m.py").write_text(text, encoding="utf-8")
+    check_fault(call("fit", tmp_path / "m.py", "--target", target.images, "--out", tmp_path / "run"), 2, part)
+    assert not (tmp_path / "run").exists()
+    checked = call("check", tmp_path / "m.py")
+    check_fault(checked, 2)
+    assert part in checked.out + checked.err
+
+
+def test_a_model_that_is_not_there(call, tmp_path):
+    check_fault(call("check", "nothing"), 2, "multi_mnist", "'nothing'")
+    check_fault(call("preview", tmp_path / "m.py", "--out", tmp_path / "g.png"), 2, "which is not there")
+    assert not (tmp_path / "g.png").exists()
+
+
+# What is wrong with the run.
+
+
+def test_runs_that_cannot_be_read(call, fitted, target, tmp_path):
+    def commands(run):
+        yield "preview", run, "--out", tmp_path / "out"
+        yield "generate", run, "--num", 1, "--out", tmp_path / "out"
+        yield "evaluate", run, "--target", target.images, "--json", tmp_path / "out"
+        yield "report", run, "--out", tmp_path / "out"
+        yield "fit", "--resume", "--out", run
+
+    record = json.loads((fitted / "run.json").read_text())
+    runs = {
+        "other": (json.dumps(record | {"format": 0, "version": "0.0.1"}), "another version of probscene (0.0.1)"),
+        "damaged": ("{", "actual something else"),
+    }
+    for name, (text, part) in runs.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").write_text(text)
+        for words in commands(tmp_path / name):
+            check_fault(call(*words), 2, part)
+    unfinished = tmp_path / "unfinished"
+    unfinished.mkdir()
+    (unfinished / "run.json").write_text(json.dumps(record))
+    for words in list(commands(unfinished))[:-1]:
+        check_fault(call(*words), 2, "--resume")
+    for words in list(commands(tmp_path / "gone"))[1:]:
+        check_fault(call(*words), 2, "run.json")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_fit_takes_no_folder_that_holds_something(call, discs, fitted, target, tmp_path):
+    words = ["fit", discs.file, "--target", target.images, "--out"]
+    check_fault(call(*words, fitted), 2, "--resume")
+    (tmp_path / "kept.txt").write_text("mine")
+    check_fault(call(*words, tmp_path), 2, "other files")
+    check_fault(call(*words, tmp_path / "kept.txt"), 2, "is a file")
+    check_fault(call(*words, tmp_path / "kept.txt" / "run"), 2, "a file in the way")
+    assert [file.name for file in tmp_path.iterdir()] == ["kept.txt"]
+
+
+def test_resume_takes_the_settings_of_the_run_or_none(call, discs, fitted, target, tmp_path):
+    words = ["fit", "--resume", "--out", fitted]
+    same = [discs.file, "--target", target.images, *discs.settings, "--seed", 0]
+    assert call(*words, *same).code == 0
+    for other, *parts in (
+        (["multi_mnist"], "Expected the model"),
+        (["--target", tmp_path], "Expected the target"),
+        (["--seed", 1], "(0), actual 1"),
+        (["--threads", 7], "threads"),
+        (["--skip-bad"], "skip_bad"),
+        ([*discs.settings, "--set", "batches=5"], "batches", "(4), actual 5"),
+        ([*discs.settings, "--objective", "mmd"], "(kde), actual mmd"),
+    ):
+        check_fault(call(*words, *other), 2, *parts)
+
+
+def test_numbers_out_of_range(call, discs, fitted, target, tmp_path):
+    out = tmp_path / "out"
+    for number in (0, -1):
+        check_fault(call("generate", fitted, "--num", number, "--out", out), 2, "positive number of images")
+        check_fault(call("generate", fitted, "--num", 1, "--workers", number, "--out", out), 2, "workers")
+        check_fault(call("preview", discs.file, "--num", number, "--out", out), 2, "positive number of images")
+        check_fault(
+            call("evaluate", fitted, "--target", target.images, "--num", number), 2, "positive number of scenes"
+        )
+        fitting = ["fit", discs.file, "--target", target.images, "--out", out]
+        check_fault(call(*fitting, "--threads", number), 2, "threads")
+    check_fault(call(*fitting, "--seed", -1), 2, "seed of 0 or more")
+    check_fault(call("generate", fitted, "--num", 1, "--out", out, "--format", "voc"), 2, "'voc'")
+    check_fault(call("fit", "--out", out), 2, "Expected MODEL and --target")
+    assert not out.exists()
+
+
+def test_what_typer_refuses_exits_with_2(call, discs, tmp_path):
+    for words in (["fit", discs.file], ["nothing"], ["generate", "r", "--num", "many", "--out", "d"],
+                  ["fit", discs.file, "--target", "t", "--out", "r", "--preset", "slow"]):  # fmt: skip
+        result = call(*words)
+        assert result.code == 2 and "Usage" in result.err and "Traceback" not in result.err
+
+
+@pytest.mark.parametrize(
+    "setting, part",
+    [("batches", "key=value"), ("batches=x", "batches=<int>"), ("speed=1", "among features,"), ("width=1,2", "width="),
+     ("count=3", "count.steps"), ("count.speed=1", "of count among steps"), ("batches.x=1", "batches=..."),
+     ("cosine=5", "cosine=<bool>"), ("count.steps=1.5", "count.steps=<int>"), ("num_scenes=1", "at least 2"),
+     ("batches=0", "at least 1"), ("learning_rate=0", "above 0"), ("count.whole=-1", "at least 0"),
+     ("variance=nan", "above 0"), ("objective=kl", "kde, mmd"), ("num_scenes=none", "num_scenes=<int>")],
+)  # fmt: skip
+def test_wrong_settings(setting, part, call, discs, target, tmp_path):
+    words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--set", setting]
+    check_fault(call(*words), 2, part)
+    assert not (tmp_path / "run").exists()
+
+
+def test_settings_change_what_they_name_and_nothing_else():
+    settings = ["batches=2", "count.steps=32", "width=8,16,32", "variance=none", "cosine=false", "learning_rate=1e-3"]
+    changed = override(QUICK, settings)
+    assert (changed.batches, changed.count.steps, changed.width) == (2, 32, (8, 16, 32))
+    assert (changed.variance, changed.cosine, changed.learning_rate) == (None, False, 1e-3)
+    back = override(changed, ["batches=60", "count.steps=3000", "width=16,32,64", "variance=1", "cosine=true",
+                              "learning_rate=0.01"])  # fmt: skip
+    assert back == QUICK
+    with pytest.raises(ProbsceneError):
+        override(QUICK, ["=1"])
+
+
+# What is wrong with the machine.
+
+
+def test_a_full_disk(call, discs, fitted, target, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before = {file: file.read_bytes() for file in fitted.iterdir()}
+    monkeypatch.setattr(os, "fsync", full)
+    out = tmp_path / "out"
+    for words in (
+        ("preview", discs.file, "--out", out),
+        ("evaluate", fitted, "--target", target.images, "--num", 100, "--json", out),
+        ("report", fitted, "--num", 100),
+        ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings),
+    ):
+        check_fault(call(*words), 1, "The disk is full")
+        assert not out.exists()
+    assert list((tmp_path / "run").iterdir()) == []
+    assert {file: file.read_bytes() for file in fitted.iterdir()} == before
+
+
+def test_an_output_that_cannot_be_written(call, discs, fitted, target, tmp_path):
+    nowhere = Path("/proc/nowhere")
+    check_fault(call("fit", discs.file, "--target", target.images, "--out", nowhere, *discs.settings), 1, str(nowhere))
+    check_fault(call("generate", fitted, "--num", 1, "--out", nowhere), 1, str(nowhere))
+    check_fault(call("preview", discs.file, "--out", nowhere / "g.png"), 1, str(nowhere))
+    check_fault(call("preview", discs.file, "--out", tmp_path), 2, "name a file in it")
+
+
+def test_a_bug_is_one_line_and_a_traceback_on_demand(call, discs, tmp_path, monkeypatch):
+    monkeypatch.delenv("PROBSCENE_DEBUG", raising=False)
+    monkeypatch.setattr("probscene.app.preview.grid", lambda images: 1 / 0)
+    words = ["preview", discs.file, "--out", tmp_path / "g.png"]
+    check_fault(call(*words), 1, "A bug in probscene: ZeroDivisionError: division by zero", "--debug preview")
+    for debugging in (["--debug", *words], words):
+        result = call(*debugging)
+        assert result.code == 1 and "probscene: " not in result.err
+        monkeypatch.setenv("PROBSCENE_DEBUG", "1")
+
+
+# Interruptions.
+
+CHILD = """
+import os, signal, sys
+from probscene.app import cli, files, fit
+
+kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
+fit.SAVE_EVERY = 0.0
+line, replace = [{}], os.replace
+
+def at_once():
+    if line[0].get("stage") == stage and line[0].get("step", line[0].get("batch")) >= number:
+        os.kill(os.getpid(), kind)
+
+keep = fit.Keeper.__call__
+def keeping(self, said):
+    line[0] = said
+    keep(self, said)
+    if kind == signal.SIGINT:
+        at_once()
+
+def replacing(source, path):  # the worst moment: the log is ahead, the checkpoint written and not yet in its place
+    if str(path).endswith("checkpoint.safetensors"):
+        at_once()
+    replace(source, path)
+
+fit.Keeper.__call__, os.replace = keeping, replacing
+del sys.argv[1:4]
+cli.main()
+"""
+
+
+def child(kind: str, stage: str, number: int, words) -> subprocess.CompletedProcess:
+    """The command line in a process of its own that gets a signal in the middle of a stage."""
+    command = [sys.executable, "-c", CHILD, kind, stage, str(number), *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+def test_killed_twice_it_goes_on_to_the_same_guide(call, discs, target, fitted, tmp_path):
+    out = tmp_path / "run"
+    first = child("SIGKILL", "features", 32, ["fit", discs.file, "--target", target.images, "--out", out,
+                                              *discs.settings])  # fmt: skip
+    assert first.returncode == -signal.SIGKILL, first.stderr
+    assert (out / "features-checkpoint.safetensors").exists() and not (out / "features.safetensors").exists()
+    second = child("SIGKILL", "structure", 3, ["fit", "--resume", "--out", out])
+    assert second.returncode == -signal.SIGKILL, second.stderr
+    assert (out / "guide-checkpoint.safetensors").exists() and not (out / "guide.safetensors").exists()
+    assert call("fit", "--resume", "--out", out).code == 0
+    for name in ("features.safetensors", "guide.safetensors", "log.jsonl"):
+        assert (out / name).read_bytes() == (fitted / name).read_bytes(), name
+
+
+def test_interrupted_it_says_how_to_go_on_and_does(call, discs, target, fitted, tmp_path):
+    out = tmp_path / "a run"
+    words = ["fit", discs.file, "--target", target.images, "--out", out, *discs.settings]
+    interrupted = child("SIGINT", "structure", 2, words)
+    assert interrupted.returncode == 1 and "Traceback" not in interrupted.stderr
+    last = interrupted.stderr.splitlines()[-1]
+    assert last == f"Interrupted; go on with: {shlex.join(['probscene', *map(str, words), '--resume'])}"
+    assert call(*shlex.split(last.partition("probscene ")[2])).code == 0
+    assert (out / "guide.safetensors").read_bytes() == (fitted / "guide.safetensors").read_bytes()
+
+
+def test_interrupted_before_the_run_exists_the_same_command_is_named(call, discs, target, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("probscene.app.session.ImageFolder", interrupt)
+    words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run"]
+    result = call(*words)
+    assert result.code == 1 and not (tmp_path / "run").exists()
+    assert result.err == f"Interrupted; go on with: {shlex.join(['probscene', *map(str, words)])}\n"
+
+
+def test_another_target_is_refused_on_resuming(call, discs, target, tmp_path, monkeypatch):
+    folder, out = copied(target, tmp_path / "images"), tmp_path / "run"
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit, "_learn", interrupt)
+        call("fit", discs.file, "--target", folder, "--out", out, *discs.settings)
+    (folder / "000000.png").unlink()
+    check_fault(call("fit", "--resume", "--out", out), 2, "as they were when the run began")

@@ -1,0 +1,69 @@
+"""The demo: everything is there, nothing is done twice, and an interruption loses nothing."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from probscene.app import demo as module
+from probscene.app import session
+from probscene.app.demo import demo
+from probscene.app.overrides import override
+from probscene.app.run import Run
+from probscene.errors import DataError, ModelError
+from probscene.inference.presets import QUICK
+
+SHORT = override(
+    QUICK, ["count.steps=16", "count.images=4", "count.crops=4", "width=4,8,8", "batches=2", "num_scenes=20",
+            "pretrain_derivations=50", "pretrain_epochs=1"]
+)  # fmt: skip
+
+
+def contents(folder: Path) -> dict[Path, tuple[bytes, int]]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+
+
+def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "demo"
+
+    def go():
+        demo(out, 0, str(discs.file), SHORT, images=20, num=5, threads=1)
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    for where, name in ((session.fit, "_learn"), (module, "generate"), (module, "evaluate")):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(where, name, interrupt)
+            go()
+    go()
+    assert {path.name for path in out.iterdir()} == {
+        "target", "truth.csv", "run", "dataset", "evaluation.json", "grid.png"
+    }  # fmt: skip
+    assert {path.suffix for path in (out / "target" / "images").iterdir()} == {".png"}
+    assert len(list((out / "target" / "images").iterdir())) == 20
+    assert len(json.loads((out / "dataset" / "annotations.json").read_text())["images"]) == 5
+    assert Run.open(out / "run").record["target"] == str((out / "target" / "images").resolve())
+    assert (out / "run" / "report.html").stat().st_size > 10000
+    with Image.open(out / "grid.png") as grid:
+        assert grid.width > 3 * 4 * 64 and grid.height > 4 * 64
+    said = capsys.readouterr().out
+    truth = json.loads((out / "evaluation.json").read_text())["distances"]["truth"]
+    assert f"{truth['learnt']['number']:.3f}" in said and str(out / "grid.png") in said
+    before = contents(out)
+    go()
+    assert contents(out) == before
+    assert capsys.readouterr().out == said[said.index("Distance to the truth") :]
+
+
+def test_a_folder_of_another_seed_and_a_model_without_a_target(discs, tmp_path):
+    module.generate_scenes(module.load_model(str(discs.file)).target(0), module.load_model(str(discs.file)).prior, 20,
+                           tmp_path / "demo" / "target", 0, "images")  # fmt: skip
+    with pytest.raises(DataError, match="seed 0.*seed 1"):
+        demo(tmp_path / "demo", 1, str(discs.file), SHORT, images=20, num=5, threads=1)
+    plates = Path(__file__).with_name("plates.py")
+    with pytest.raises(ModelError, match="has none"):
+        demo(tmp_path / "other", 0, str(plates), SHORT)
+    assert not (tmp_path / "other").exists()
