@@ -1,10 +1,56 @@
+"""The run folder keeps what it has, whatever happens while it is written."""
+
 import importlib
+import resource
+import shutil
+from pathlib import Path
 
 import pytest
+import torch
 
 from probscene.app.run import Run
-from probscene.errors import RunError
+from probscene.errors import DataError, MachineError, RunError
 from probscene.models import multi_mnist
+
+DISCS = Path(__file__).with_name("discs.py")
+
+
+def test_tensors_that_do_not_fit_on_the_disk_leave_the_old_ones(tmp_path):
+    run = Run(tmp_path, {})
+    run.save("x", {"a": torch.zeros(10)})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10000, limits[1]))
+    try:
+        with pytest.raises(MachineError, match="x.safetensors"):
+            run.save("x", {"a": torch.zeros(10000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert len(run.load("x")["a"]) == 10 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_free_folder_is_new_or_empty_but_for_hidden_files(tmp_path):
+    Run.check_free(tmp_path / "new")
+    Run.check_free(tmp_path)
+    (tmp_path / ".run.json.x1").touch()  # what a kill while writing leaves
+    Run.check_free(tmp_path)
+    (tmp_path / "model.py").touch()  # may be the user's own
+    with pytest.raises(RunError, match="other files"):
+        Run.check_free(tmp_path)
+    with pytest.raises(DataError, match="is a file"):
+        Run.check_free(tmp_path / "model.py")
+
+
+def test_a_run_whose_making_was_interrupted_can_be_resumed(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copyfile", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            Run.create(tmp_path / "run", str(DISCS), {"seed": 3})
+    run = Run.open(tmp_path / "run")
+    assert run.record["seed"] == 3 and run.model.name == "discs"
+    assert [file.name for file in run.path.iterdir()] == ["run.json"]
 
 
 def test_a_run_is_bound_to_the_digits_it_was_begun_with(tmp_path, monkeypatch):
