@@ -264,6 +264,8 @@ def _preset(name: str | None, objective: str | None, settings: list[str]) -> "Pr
 def main() -> None:
     """The console script."""
     sys.stdout.reconfigure(errors="replace")  # a grammar's ε on a terminal that has none
+    # Torch's threads wait for one another spinning, which on a machine that has other work takes six times as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         app(prog_name="probscene")
     except KeyboardInterrupt:  # before or after a command's work
