@@ -14,14 +14,12 @@ from rich.progress import (
     ProgressColumn,
     Task,
     TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.table import Column
 from rich.text import Text
 
 STAGES = {
-    "reading": ("Reading the target", "images"),
+    "reading": ("Target's images", "images"),
     "features": ("Feature network", "steps"),
     "target": ("Target's features", "images"),
     "pretraining": ("Pretraining", "epochs"),
@@ -64,12 +62,11 @@ class Display(AbstractContextManager):
         self._stage: _Stage | None = None
         self._last = time.monotonic()
         self._bars = Progress(
-            TextColumn("{task.description}", table_column=_whole()),
-            BarColumn(bar_width=12),
-            MofNCompleteColumn(table_column=_whole()),
-            _Rate(table_column=_whole()),
-            TimeElapsedColumn(table_column=_whole()),
-            _Left(table_column=_whole()),
+            TextColumn("{task.description}", table_column=_wide(17)),
+            BarColumn(bar_width=8, table_column=_wide(8)),
+            MofNCompleteColumn(table_column=_wide(9)),
+            _Rate(table_column=_wide(13)),
+            _Time(table_column=_wide(15)),
             TextColumn("{task.fields[note]}", style="dim", table_column=Column(no_wrap=True, overflow="ellipsis")),
             console=self.console,
         )
@@ -128,8 +125,13 @@ def _short(rate: float) -> str:
     return f"{rate:,.0f}" if rate >= 100 else f"{rate:.2g}"
 
 
-def _whole() -> Column:
-    return Column(no_wrap=True)
+def _wide(least: int) -> Column:
+    return Column(min_width=least, no_wrap=True)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
 
 
 class _Rate(ProgressColumn):
@@ -138,8 +140,11 @@ class _Rate(ProgressColumn):
         return Text(f"{_short(speed)} {task.fields['unit']}/s" if speed else "", style="cyan")
 
 
-class _Left(TimeRemainingColumn):
+class _Time(ProgressColumn):
+    """The time that a stage has taken, and what is left of it."""
+
+    max_refresh = 0.5
+
     def render(self, task: Task) -> Text:
-        if task.finished or not task.speed:
-            return Text("")
-        return Text.assemble(super().render(task), " left")
+        left = None if task.finished else task.time_remaining
+        return Text(_clock(task.elapsed or 0.0) + (f", {_clock(left)} left" if left is not None else ""), style="green")
