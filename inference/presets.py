@@ -65,7 +65,7 @@ class Preset:
 
 
 QUICK = Preset()
-DEFAULT = replace(QUICK, batches=120)
+DEFAULT = replace(QUICK, count=CountSchedule(steps=12000), batches=120)
 # Section 4.1 and supplement: 20 epochs of 5,000 target images in batches of 500 are 200 updates.
 PAPER = Preset(
     features="presence",

@@ -26,6 +26,7 @@ from probscene.inference.guide import LSTMGuide
 from probscene.model import SceneModel
 
 FORMAT = 1  # of the run folder; another number is not read
+KEYS = {"model", "model_sha256", "assets"}  # that create adds to every run.json
 
 
 class Run:
@@ -93,6 +94,8 @@ class Run:
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
             written = record["format"]
+            if written == FORMAT and not KEYS <= record.keys():
+                raise KeyError(*(KEYS - record.keys()))
         except (ValueError, KeyError, TypeError) as error:
             raise RunError(f"Expected JSON of a run in {file}, actual something else; fit again.") from error
         if written != FORMAT:
