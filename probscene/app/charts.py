@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from probscene.app.evaluate import Evaluation
 from probscene.inference.metrics import Histogram
@@ -17,6 +17,7 @@ from probscene.inference.metrics import Histogram
 INK, FAINT = "#010203", "#010204"
 SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
 VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
+SMALL = 1e-3  # a share that would be no pixel high
 STYLE = {
     "svg.fonttype": "none",  # text stays text, in the page's font
     "font.family": "sans-serif",
@@ -40,7 +41,8 @@ STYLE = {
 def numbers(evaluation: Evaluation) -> str:
     """The share of images by number of objects."""
     each = {name: source.number() for name, source in evaluation.sources.items()}
-    bins = max(len(found.share) for found in each.values())
+    bins = 1 + max(int(np.flatnonzero(found.share >= SMALL).max(initial=0)) for found in each.values())
+    each = {name: Histogram(*(x[:bins] for x in found)) for name, found in each.items()}
     return _bars(each, [str(k) for k in range(bins)], "objects in an image", "share of images", "number")
 
 
@@ -56,7 +58,8 @@ def curves(log: list[dict]) -> list[str]:
     structure = [line for line in log if line["stage"] == "structure"]
     charts = []
     if features:
-        charts.append(_curve("Feature network: loss", "step", _column(features, "step"), _column(features, "loss")))
+        loss = _column(features, "loss")
+        charts.append(_curve("Feature network: loss", "step", _column(features, "step"), loss, log=loss.min() > 0))
     if structure:
         batch = _column(structure, "batch")
         titles = {
@@ -89,14 +92,21 @@ def _bars(each: dict[str, Histogram], ticks: list[str], x: str, y: str, salt: st
         return _svg(figure)
 
 
-def _curve(title: str, x: str, at: np.ndarray, value: np.ndarray, spread: np.ndarray | None = None) -> str:
+def _curve(
+    title: str, x: str, at: np.ndarray, value: np.ndarray, spread: np.ndarray | None = None, log: bool = False
+) -> str:
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": title, "axes.grid": True}):
         figure, axes = _figure(3.8, 2.1)
         if spread is not None:
             axes.fill_between(at, value - spread, value + spread, color=SOURCES["learnt"], alpha=0.15, linewidth=0)
         axes.plot(at, value, color=SOURCES["learnt"], linewidth=1.6)
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        if value.min() >= 0 and spread is None:
+        if log:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_locator(NullLocator())
+        elif value.min() >= 0 and spread is None:
             axes.set_ylim(0, max(1e-6, 1.05 * value.max()))
         axes.set_title(title)
         axes.set_xlabel(x)

@@ -101,9 +101,8 @@ def _headline(evaluation: Evaluation) -> str:
             rows.append(f'<div class="card">{what}, {to}<b>{prior} → {learnt}</b></div>')
     if not rows:
         return "<p>There are neither labels nor an estimate to compare with.</p>"
-    return (
-        f'<div class="row">{"".join(rows)}</div><p class="soft">Total variation, from the prior to what was learnt.</p>'
-    )
+    note = "Total variation: first the prior's, then that of what was learnt."
+    return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>'
 
 
 def _samples(run: Run, images: ImageFolder | None, absent: str) -> str:

@@ -20,6 +20,7 @@ from probscene.inference.presets import Preset
 from probscene.model import SceneModel
 
 TIMING = "timing.json"
+STAGES = ("reading", "features", "target", "pretraining", "structure")
 
 
 def checked_model(reference: str) -> SceneModel:
@@ -99,8 +100,8 @@ def carry_out(run: Run, target: ImageFolder | None, show: Display) -> None:
     try:
         fit.fit(run, show, target)
     finally:
-        spent = {stage: before.get(stage, 0.0) + seconds for stage, seconds in show.seconds.items()}
-        write_json(run.path / TIMING, before | spent)
+        spent = {stage: before.get(stage, 0.0) + show.seconds.get(stage, 0.0) for stage in STAGES}
+        write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
 
 
 def is_finished(run: Run) -> bool:

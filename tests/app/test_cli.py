@@ -300,8 +300,11 @@ def test_settings_change_what_they_name_and_nothing_else():
     changed = override(QUICK, settings)
     assert (changed.batches, changed.count.steps, changed.width) == (2, 32, (8, 16, 32))
     assert (changed.variance, changed.cosine, changed.learning_rate) == (None, False, 1e-3)
-    back = override(changed, ["batches=60", "count.steps=3000", "width=16,32,64", "variance=1", "cosine=true",
-                              "learning_rate=0.01"])  # fmt: skip
+    back = override(
+        changed,
+        [f"batches={QUICK.batches}", f"count.steps={QUICK.count.steps}", f"width={QUICK.width}", "cosine=true",
+         f"variance={QUICK.variance}", f"learning_rate={QUICK.learning_rate}"],
+    )  # fmt: skip
     assert back == QUICK
     with pytest.raises(ProbsceneError):
         override(QUICK, ["=1"])
