@@ -97,11 +97,14 @@ class PresenceTraining:
     def run(self, each: Callable[["PresenceTraining", float], None] | None = None) -> None:
         """Take the epochs that are left; ``each`` sees the training and the mean loss after every one."""
         seed_everything(batch_seed(self.seed, 0))
-        # Drawn in parts and kept as bytes: 5,000 images of 256 x 256 are 1 GB.
-        parts = [self.draw(min(250, self.images - i)) for i in range(0, self.images, 250)]
-        image = torch.cat([part.image for part in parts])
         classes = self.net.out.out_features
-        present = torch.cat([_present(part, classes) for part in parts])
+        image, present = None, torch.zeros(self.images, classes)
+        for start in range(0, self.images, 250):  # kept as bytes: 5,000 images of 256 x 256 are 1 GB
+            part = self.draw(min(250, self.images - start))
+            if image is None:
+                image = torch.empty(self.images, *part.image.shape[1:], dtype=torch.uint8)
+            image[start : start + 250] = part.image
+            present[start : start + 250] = _present(part, classes)
         self.net.train()
         while self.done < self.steps and self.reached < self.accuracy:
             seed_everything(batch_seed(self.seed, 1, self.done))
