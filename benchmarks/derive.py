@@ -24,7 +24,7 @@ import pyro
 import pyro.distributions as dist
 import torch
 
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MAX_STEPS, PRIOR
 from probscene.scene import SceneGraph
 

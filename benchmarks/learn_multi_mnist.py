@@ -23,7 +23,7 @@ import torch
 from probscene.app.files import write_json
 from probscene.app.fit import create, fit
 from probscene.app.run import Run
-from probscene.derivation import derive_complete
+from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guide import LSTMGuide
 from probscene.inference.learn import Learner

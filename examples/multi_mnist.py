@@ -15,7 +15,7 @@ import torch
 from pyro.infer import SVI
 from pyro.optim import LambdaLR
 
-from probscene.derivation import derive_complete
+from probscene.derive import derive_complete
 from probscene.inference.count_net import CountNet
 from probscene.inference.count_training import CountSchedule, CountTraining
 from probscene.inference.divergence import KDELogRatio

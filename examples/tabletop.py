@@ -16,7 +16,7 @@ import pyro
 import pyro.distributions as dist
 import torch
 
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.drawing import Atlas, Drawing, Sprites, disc
 from probscene.grammar import Grammar
 from probscene.model import SceneModel

@@ -14,9 +14,10 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from probscene.derivation import Derivation, derive
+from probscene.derivation import Derivation, Frontier
+from probscene.derive import derive
 from probscene.grammar import Grammar
-from probscene.policy import Frontier, Policy, rule_log_probs
+from probscene.policy import Policy, rule_log_probs
 
 
 class LSTMGuide(nn.Module, Policy):

@@ -31,7 +31,8 @@ import torch
 from pyro.poutine.runtime import am_i_wrapped
 from torch import Tensor
 
-from probscene.derivation import Derivation, derive_complete
+from probscene.derivation import Derivation
+from probscene.derive import derive_complete
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import Divergence
 from probscene.sampling import Scenes, realise

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from probscene.derivation import Derivation, derive_complete
+from probscene.derivation import Derivation
+from probscene.derive import derive_complete
 from probscene.policy import Policy
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pyro
 import pyro.distributions as dist
 
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.drawing import Drawing, Sprites
 from probscene.grammar import Grammar
 from probscene.model import SceneModel

@@ -10,7 +10,7 @@ import pyro
 import torch
 
 from probscene.branching import CRITICAL, Branching
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.enumeration import shortest_lengths
 from probscene.errors import GrammarError
 from probscene.grammar import Grammar

@@ -1,21 +1,34 @@
-"""``derive``, the one Pyro program behind prior, PCFG and guide: leftmost derivations of many scenes at once.
+"""Leftmost derivations of many scenes at once, and the scene graphs that they spell.
 
 A tensor holds a last-in-first-out stack of nonterminals for every scene (Meta-Sim2, section 3.2); each step pops one,
-samples a rule at the site ``rule_t`` from the masked Categorical and pushes what the rule produces. There is no Python
-loop over scenes. Axis letters: N scenes, T steps, M nodes, K rules, R nonterminals and J objects of one rule.
+takes a rule for it and pushes what the rule produces. There is no Python loop over scenes. Axis letters: N scenes, T
+steps, M nodes, K rules, R nonterminals and J objects of one rule.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import pyro
-import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from probscene.errors import GrammarError, SamplingError
+from probscene.errors import GrammarError
 from probscene.grammar import Grammar
-from probscene.policy import Frontier, Policy, masked
+
+
+class Frontier(NamedTuple):
+    """What is about to be expanded, one nonterminal a scene.
+
+    Attributes:
+        symbol: ``(N,)`` int64 nonterminal; V where the scene is finished.
+        repeat: ``(N,)`` how often this list has repeated: a child with its parent's nonterminal counts one more, any
+            other child starts at 0.
+        parent_repeat: ``(N,)`` the ``repeat`` of the nearest list around it.
+    """
+
+    symbol: Tensor
+    repeat: Tensor
+    parent_repeat: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +78,7 @@ class Derivation:
                 )
             return rule
 
-        return _expand(grammar, choose, len(given), given.shape[1])
+        return expand(grammar, choose, len(given), given.shape[1])
 
     def __len__(self) -> int:
         return self.rules.shape[0]
@@ -96,62 +109,7 @@ class Derivation:
         return padded[:, :num_kinds]
 
 
-def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) -> Derivation:
-    """Sample derivations: a Pyro program with sites ``rule_0``, ``rule_1``, ... of shape ``(N, 1)``.
-
-    Call it inside ``pyro.plate("scenes", num_scenes, dim=-2)``. It stops when every scene is complete, at the latest
-    after ``max_steps``; what is not complete by then says so in ``Derivation.complete``, for the caller to redraw.
-
-    Args:
-        policy: the structure prior, a PCFG, or a guide.
-    """
-    memory = policy.start(num_scenes)
-
-    def choose(t, frontier, previous):
-        nonlocal memory
-        logits, memory = policy.step(memory, frontier, previous)
-        active = frontier.symbol < len(grammar.nonterminals)
-        rule = dist.Categorical(logits=masked(grammar, logits, frontier.symbol).unsqueeze(-2), validate_args=False)
-        value = pyro.sample(f"rule_{t}", rule.mask(active.unsqueeze(-1))).squeeze(-1)
-        return value.where(active, -1)
-
-    return _expand(grammar, choose, num_scenes, max_steps)
-
-
-def derive_complete(
-    grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int, attempts: int = 100
-) -> tuple[Derivation, Tensor]:
-    """Derivations that are all complete: what is longer than ``max_steps`` is redrawn (section 3.3). No Pyro sites.
-
-    Returns:
-        The derivations, and the failed attempts of each scene ``(N,)`` int64.
-
-    Raises:
-        SamplingError: some scene failed ``attempts`` times.
-    """
-    rules = torch.full((num_scenes, max_steps), -1)
-    failures = torch.zeros(num_scenes, dtype=torch.int64)
-    todo = torch.arange(num_scenes)
-    with torch.no_grad(), pyro.poutine.block():
-        for _ in range(attempts):
-            if not len(todo):
-                break
-            drawn = derive(grammar, policy, len(todo), max_steps)
-            done = todo[drawn.complete]
-            rules[done] = -1
-            rules[done, : drawn.rules.shape[1]] = drawn.rules[drawn.complete]
-            todo = todo[~drawn.complete]
-            failures[todo] += 1
-    if len(todo):
-        raise SamplingError(
-            f"Expected every scene to end within max_steps = {max_steps}, actual {len(todo)} of {num_scenes} scenes "
-            f"still open after {attempts} attempts; raise max_steps or make the lists shorter."
-        )
-    longest = int((rules >= 0).sum(1).max()) if num_scenes else 0
-    return Derivation.of(grammar, rules[:, : max(1, longest)]), failures
-
-
-def _expand(grammar: Grammar, choose: Callable[..., Tensor], N: int, max_steps: int) -> Derivation:
+def expand(grammar: Grammar, choose: Callable[..., Tensor], N: int, max_steps: int) -> Derivation:
     """Run the stack machine; ``choose(t, frontier, previous_rule)`` gives the rules ``(N,)``, -1 where finished."""
     V, R = len(grammar.nonterminals), grammar.children.shape[1]
     finished = torch.tensor([V, 0, 0, -1])

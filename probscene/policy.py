@@ -3,32 +3,15 @@
 Axis letters: N scenes, T steps, K rules, V nonterminals.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from probscene.derivation import Derivation, Frontier
 from probscene.grammar import Grammar
 
-if TYPE_CHECKING:
-    from probscene.derivation import Derivation
-
 MASKED = -1e9  # finite, so that a masked logit has no gradient that is NaN
-
-
-class Frontier(NamedTuple):
-    """What is about to be expanded, one nonterminal a scene.
-
-    Attributes:
-        symbol: ``(N,)`` int64 nonterminal; V where the scene is finished.
-        repeat: ``(N,)`` how often this list has repeated: a child with its parent's nonterminal counts one more, any
-            other child starts at 0.
-        parent_repeat: ``(N,)`` the ``repeat`` of the nearest list around it.
-    """
-
-    symbol: Tensor
-    repeat: Tensor
-    parent_repeat: Tensor
 
 
 class Policy:
@@ -47,7 +30,7 @@ class Policy:
         """Logits ``(N, K)`` and the next memory; ``previous_rule (N,)`` is -1 before the first step."""
         raise TypeError(f"Expected a policy with a 'step' method, actual {type(self).__name__}.")
 
-    def logits(self, derivation: "Derivation") -> Tensor:
+    def logits(self, derivation: Derivation) -> Tensor:
         """Logits ``(N, T, K)`` at every step of given derivations, unmasked."""
         memory = self.start(len(derivation))
         out = []
@@ -57,7 +40,7 @@ class Policy:
             out.append(step)
         return torch.stack(out, 1)
 
-    def log_prob(self, derivation: "Derivation") -> Tensor:
+    def log_prob(self, derivation: Derivation) -> Tensor:
         """``log q(T)``, ``(N,)``: the sum over steps of the masked log-probability of each rule (section 3.2; a product
         of probabilities, where the paper prints a sum)."""
         return rule_log_probs(self.grammar, self.logits(derivation), derivation).sum(1)
@@ -68,7 +51,7 @@ def masked(grammar: Grammar, logits: Tensor, symbol: Tensor) -> Tensor:
     return torch.where(grammar.legal[symbol], logits, MASKED)
 
 
-def rule_log_probs(grammar: Grammar, logits: Tensor, derivation: "Derivation") -> Tensor:
+def rule_log_probs(grammar: Grammar, logits: Tensor, derivation: Derivation) -> Tensor:
     """Log-probability ``(N, T)`` of each chosen rule; 0 on padding."""
     logp = torch.log_softmax(masked(grammar, logits, derivation.frontier.symbol), -1)
     rules = derivation.rules

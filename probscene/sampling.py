@@ -12,7 +12,8 @@ from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
-from probscene.derivation import Derivation, derive_complete
+from probscene.derivation import Derivation
+from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.errors import ModelError
 from probscene.model import SceneModel

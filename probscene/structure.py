@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from probscene.derivation import Frontier
 from probscene.errors import GrammarError
 from probscene.grammar import Grammar
-from probscene.policy import Frontier, Policy
+from probscene.policy import Policy
 
 
 @dataclass(frozen=True)

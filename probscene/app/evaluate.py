@@ -21,7 +21,7 @@ from probscene.app.labels import Counts, class_counts
 from probscene.app.provenance import chunk_randomness
 from probscene.app.run import Run
 from probscene.dataset import ImageFolder
-from probscene.derivation import derive_complete
+from probscene.derive import derive_complete
 from probscene.errors import ProbsceneError, RunError
 from probscene.inference.features import embed_all
 from probscene.inference.metrics import (

@@ -3,7 +3,7 @@
 import pyro
 import pyro.distributions as dist
 
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.model import SceneModel

@@ -4,7 +4,7 @@ import pyro
 import pyro.distributions as dist
 import torch
 
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.model import SceneModel

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyro import poutine
 
-from probscene.derivation import Derivation, derive, derive_complete
+from probscene.derivation import Derivation
+from probscene.derive import derive, derive_complete
 from probscene.errors import GrammarError, SamplingError
 from probscene.grammar import Grammar
 from probscene.policy import Policy, rule_log_probs

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.errors import ModelError, SamplingError
 from probscene.grammar import Grammar

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyro import poutine
 
-from probscene.derivation import Derivation, derive
+from probscene.derivation import Derivation
+from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.errors import GrammarError, ModelError
 from probscene.grammar import Grammar

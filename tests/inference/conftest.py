@@ -5,7 +5,7 @@ import pyro.distributions as dist
 import pytest
 import torch
 
-from probscene.derivation import derive
+from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar

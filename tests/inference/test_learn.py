@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from probscene.derivation import derive_complete
+from probscene.derive import derive_complete
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guide import LSTMGuide
