@@ -42,7 +42,7 @@ class CountSchedule:
         min_visible: objects less visible than this are not counted.
     """
 
-    steps: int = 2800
+    steps: int = 3600
     whole: float = 0.25
     images: int = 16
     crops: int = 64
