@@ -13,7 +13,6 @@ import gzip
 import json
 import shutil
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -36,9 +35,9 @@ from probscene.structure import StructurePrior, counts, weights
 
 PRESETS = {
     "quick": QUICK,
-    "quick-mmd": replace(QUICK, objective="mmd"),
+    "quick-mmd": QUICK.toward("mmd"),
     "default": DEFAULT,
-    "default-mmd": replace(DEFAULT, objective="mmd"),
+    "default-mmd": DEFAULT.toward("mmd"),
     "paper": PAPER,
     "oracle": QUICK,
 }

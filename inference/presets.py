@@ -7,6 +7,8 @@ from probscene.errors import ProbsceneError
 from probscene.inference.count_training import CountSchedule
 from probscene.inference.divergence import MMD, Divergence, KDELogRatio
 
+OBJECTIVES = ("kde", "mmd")
+
 
 @dataclass(frozen=True)
 class Preset:
@@ -56,6 +58,20 @@ class Preset:
         """From ``dataclasses.asdict``, as a run's JSON keeps it."""
         whole = {key: tuple(value) if isinstance(value, list) else value for key, value in record.items()}
         return Preset(**{**whole, "count": CountSchedule(**record["count"])})
+
+    def toward(self, objective: str) -> "Preset":
+        """This preset with another objective. MMD is one score for all scenes: the others' mean as a baseline would
+        cancel it, and its noise makes lists run away at the density ratio's learning rate.
+
+        Raises:
+            ProbsceneError: an unknown objective.
+        """
+        if objective not in OBJECTIVES:
+            raise ProbsceneError(f"Expected an objective among {', '.join(OBJECTIVES)}, actual {objective!r}.")
+        if objective == self.objective or objective == "kde":
+            return replace(self, objective=objective)
+        rate = min(self.learning_rate, 2e-3)
+        return replace(self, objective=objective, baseline="moving_average", learning_rate=rate)
 
     def divergence(self) -> Divergence:
         """The objective's divergence."""

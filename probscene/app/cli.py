@@ -6,7 +6,7 @@ Exit codes: 0; 2 where the input is at fault; 1 where the machine is, where the 
 import os
 import shlex
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -258,7 +258,7 @@ def _preset(name: str | None, objective: str | None, settings: list[str]) -> "Pr
     from probscene.inference.presets import preset
 
     chosen = preset(str(name or PresetName.default))
-    return override(chosen if objective is None else replace(chosen, objective=str(objective)), settings)
+    return override(chosen if objective is None else chosen.toward(str(objective)), settings)
 
 
 def main() -> None:

@@ -1,0 +1,43 @@
+import dataclasses
+import json
+
+import pytest
+import torch
+
+from probscene.errors import ProbsceneError
+from probscene.inference.divergence import MMD, KDELogRatio
+from probscene.inference.guide import LSTMGuide
+from probscene.inference.objective import ScoreFunction
+from probscene.inference.presets import PRESETS, QUICK, Preset, preset
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_record_in_json_is_read_back(name):
+    record = json.loads(json.dumps(dataclasses.asdict(preset(name))))
+    assert Preset.of(record) == preset(name)
+
+
+def test_the_paper_preset_is_the_papers():
+    paper = preset("paper")
+    assert paper.divergence() == KDELogRatio(variance=None, marginal_variance=None, leave_one_out=False)
+    assert (paper.hidden, paper.num_latents, paper.index) == (50, 1, False)
+    assert (paper.num_scenes, paper.num_real, paper.learning_rate, paper.cosine) == (500, 500, 1e-4, False)
+    assert (paper.baseline, paper.scale, paper.updates) == ("moving_average", 1e-2, 1)
+
+
+def test_a_shared_reward_keeps_a_gradient(small):
+    """Under the others' mean as a baseline every advantage would be zero."""
+    mmd = QUICK.toward("mmd")
+    assert isinstance(mmd.divergence(), MMD)
+    loss = ScoreFunction(
+        lambda scenes: scenes.derivation.counts(len(small.grammar.kinds)).float(), mmd.divergence(), mmd.baseline
+    )
+    loss(small.program, LSTMGuide(small.grammar, 4, hidden=8), 50, real=small.features[:1] + torch.randn(30, 1))
+    assert loss.batch.advantage.abs().min() > 0
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(ProbsceneError, match="quick"):
+        preset("fast")
+    with pytest.raises(ProbsceneError, match="kde"):
+        QUICK.toward("gan")
