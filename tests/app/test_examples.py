@@ -1,0 +1,48 @@
+"""A new domain in one file goes the whole path; so do the other objective and the paper's preset."""
+
+from pathlib import Path
+
+import pytest
+
+from probscene.app.generate import generate_scenes
+from probscene.app.loading import load_model
+from probscene.app.run import Run
+
+TABLETOP = Path(__file__).resolve().parents[2] / "examples" / "tabletop.py"
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """24 pictures of tables that are laid otherwise than the prior's."""
+    folder = tmp_path_factory.mktemp("photos")
+    truth = load_model(str(TABLETOP)).target(0)
+    generate_scenes(truth, truth.prior, 24, folder, format="images")
+    return folder / "images"
+
+
+def test_tabletop_is_fitted_and_generated(call, discs, photos, tmp_path):
+    run, dataset = tmp_path / "run", tmp_path / "dataset"
+    done = call("fit", TABLETOP, "--target", photos, "--out", run, *discs.settings)
+    assert done.code == 0, done.err
+    done = call("generate", run, "--num", 5, "--out", dataset)
+    assert done.code == 0, done.err
+    assert len(list((dataset / "images").glob("*.png"))) == 5
+    assert (dataset / "annotations.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--preset", "paper", "--set", "presence_images=40", "--set", "presence_epochs=1", "--set", "num_real=10"],
+        ["--preset", "quick", "--objective", "mmd", "--set", "count.steps=16", "--set", "width=4,8,8"],
+        ["--preset", "quick", "--set", "num_latents=3", "--set", "count.steps=16", "--set", "width=4,8,8"],
+    ],
+    ids=["paper", "mmd", "latents"],
+)
+def test_other_presets_and_objectives_run(words, call, photos, tmp_path):
+    few = [w for s in ("pretrain_derivations=100", "batches=2", "num_scenes=20") for w in ("--set", s)]
+    done = call("fit", TABLETOP, "--target", photos, "--out", tmp_path / "run", "--threads", 1, *words, *few)
+    assert done.code == 0, done.err
+    run = Run.open(tmp_path / "run")
+    assert len(run.guide().latents) == run.record["preset"]["num_latents"]
+    assert run.record["preset"]["objective"] == ("mmd" if "mmd" in words else "kde")
