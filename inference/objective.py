@@ -134,6 +134,7 @@ class ScoreFunction:
             return (cost.sum() - cost) / (len(cost) - 1)
         if self.baseline == "none":
             return 0.0
-        before = 0.0 if self.average is None else self.average
-        self.average = self.decay * cost.mean().item() + (1 - self.decay) * before
+        new = cost.mean().item()
+        # The paper leaves the first value open. From 0, every scene of the first batches would seem bad, or good.
+        self.average = new if self.average is None else self.decay * new + (1 - self.decay) * self.average
         return self.average

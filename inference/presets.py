@@ -70,7 +70,7 @@ class Preset:
             raise ProbsceneError(f"Expected an objective among {', '.join(OBJECTIVES)}, actual {objective!r}.")
         if objective == self.objective or objective == "kde":
             return replace(self, objective=objective)
-        rate = min(self.learning_rate, 2e-3)
+        rate = min(self.learning_rate, 1e-3)
         return replace(self, objective=objective, baseline="moving_average", learning_rate=rate)
 
     def divergence(self) -> Divergence:

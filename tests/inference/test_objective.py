@@ -91,13 +91,14 @@ def test_value_is_the_mean_cost_and_batches_are_reused(small):
 
 
 def test_moving_average_is_the_papers(small):
-    """b <- 0.05 new + 0.95 b, from 0."""
+    """b <- 0.05 new + 0.95 b, from the first batch's mean."""
     guide = LSTMGuide(small.grammar, 4, hidden=8)
     loss = ScoreFunction(structure_features(small), FixedCost(small), baseline="moving_average")
-    expected = 0.0
+    expected = None
     for _ in range(4):
         loss(small.program, guide, 20, real=None)
-        expected = 0.05 * loss.batch.cost.mean().item() + 0.95 * expected
+        new = loss.batch.cost.mean().item()
+        expected = new if expected is None else 0.05 * new + 0.95 * expected
         assert loss.average == pytest.approx(expected)
         assert torch.allclose(loss.batch.advantage, loss.batch.cost - expected)
 
