@@ -60,8 +60,10 @@ class Preset:
         return Preset(**{**whole, "count": CountSchedule(**record["count"])})
 
     def toward(self, objective: str) -> "Preset":
-        """This preset with another objective. MMD is one score for all scenes: the others' mean as a baseline would
-        cancel it, and its noise makes lists run away at the density ratio's learning rate.
+        """This preset with another objective.
+
+        MMD is one score for all scenes: the others' mean as a baseline would cancel it, and several clipped steps away
+        from everything that was drawn move the guide to what was not, derivations that do not end.
 
         Raises:
             ProbsceneError: an unknown objective.
@@ -71,7 +73,7 @@ class Preset:
         if objective == self.objective or objective == "kde":
             return replace(self, objective=objective)
         rate = min(self.learning_rate, 1e-3)
-        return replace(self, objective=objective, baseline="moving_average", learning_rate=rate)
+        return replace(self, objective=objective, baseline="moving_average", updates=1, learning_rate=rate)
 
     def divergence(self) -> Divergence:
         """The objective's divergence."""
