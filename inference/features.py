@@ -18,7 +18,7 @@ class Examples(NamedTuple):
     """Labelled renders, ready for training.
 
     Attributes:
-        image: ``(N, 3, H, W)`` uint8.
+        image: ``(N, 1 or 3, H, W)`` uint8, grey where the model's colour carries nothing.
         label: ``(N, M)`` int64 class of each node, -1 where it has none or cannot be seen.
         centre: ``(N, M, 2)`` float32 x and y of the middle of its whole silhouette, pixels.
         visible: ``(N, M)`` visible fraction.
@@ -62,7 +62,7 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
     """Images as a network reads them: ``(N, channels, H/reduce, W/reduce)`` float32 in 0..1.
 
     Args:
-        images: ``(N, 3, H, W)`` uint8; one channel stands for all three of a grey image.
+        images: ``(N, 1 or 3, H, W)`` uint8.
         reduce: block average, 1, 2, 4, ...; H and W are padded with zeros to a multiple.
     """
     x = images[:, :channels].to(torch.int16)

@@ -19,7 +19,7 @@ import probscene
 from probscene.app.files import write_text
 from probscene.app.loading import load_model, renderer_for
 from probscene.app.run import Run
-from probscene.dataset import ImageFolder
+from probscene.dataset import ImageFolder, grey
 from probscene.drawing import Drawing
 from probscene.errors import RunError
 from probscene.inference.count_net import CountNet
@@ -103,7 +103,8 @@ class View:
     def draw(self, num: int) -> Examples:
         """``num`` labelled renders of the prior."""
         scenes = sample(self.model, self.model.prior, num)
-        return examples(self.render(scenes.drawing), self.classes)
+        drawn = examples(self.render(scenes.drawing), self.classes)
+        return drawn._replace(image=self._as_read(drawn.image))
 
     def observe(self, net: FeatureNet, candidates: int = 1) -> Callable[[Scenes], Tensor]:
         """Render and embed, a few images at a time.
@@ -118,11 +119,16 @@ class View:
             drawings = [scenes.drawing]
             drawings += [realise(self.model, scenes.derivation).drawing for _ in range(candidates - 1)]
             starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
-            parts = [net.embed(self._clearest([d[i : i + RENDERED_AT_ONCE] for d in drawings])) for i in starts]
+            images = (self._clearest([d[i : i + RENDERED_AT_ONCE] for d in drawings]) for i in starts)
+            parts = [net.embed(self._as_read(some)) for some in images]
             torch.set_num_threads(1)
             return torch.cat(parts)
 
         return features
+
+    def _as_read(self, images: Tensor) -> Tensor:
+        """Renders ``(N, 3, H, W)`` as ``ImageFolder`` would read them from files, ``(N, channels, H, W)``."""
+        return grey(images) if self.model.channels == 1 else images
 
     def _clearest(self, drawings: list[Drawing]) -> Tensor:
         """Images ``(N, 3, H, W)``, each from the drawing that covers least of its least visible object."""
