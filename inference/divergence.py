@@ -48,7 +48,8 @@ class KDELogRatio:
 
     With ``marginal_variance`` the log ratios of every single feature's own density are added, one-dimensional estimates
     that stay sharp where the joint one has to be smooth: a sum of reverse KLs, zero where the distributions agree. On
-    Multi-MNIST it learns in half the batches to less than half the distance (not in the paper).
+    Multi-MNIST, true counts as features and two targets, 60 batches came to 0.4 of the distance that 100 came to
+    without them (not in the paper).
 
     Args:
         variance: of the joint kernel, in squared feature units; None is the paper's ``H = d I``, the feature dimension.
