@@ -64,19 +64,21 @@ _DISC, _BOX = Atlas((disc(),)), Atlas((box(),))
 
 @dataclass(frozen=True, eq=False)
 class Sprites:
-    """One sprite for every node of the named kinds.
+    """One sprite for every node of the named kinds, or decoration that belongs to no node.
 
     All tensors broadcast to ``(N, M)``; entries at nodes of other kinds are ignored.
 
     Args:
-        kinds: the kinds of node that this layer draws, a name or several.
+        kinds: the kinds of node that this layer draws, a name or several; ``()`` for decoration, which has no label.
+            Then M is the last axis of ``present``, how much there may be of it in a scene.
         atlas: where the sprites are.
         sprite: index into the atlas.
         x, y: centre of the sprite, pixels.
         angle: radians, anticlockwise as seen on the screen.
         scale: canvas pixels per sprite pixel; ``scale_y`` differs from it where given.
         tint: RGB in 0..1 that multiplies the sprite's colour, ``(3,)`` or ``(N, M, 3)``.
-        labelled: whether nodes get an instance id; decoration that only covers others says False.
+        labelled: whether nodes get an instance id; what only covers others says False.
+        present: ``(N, M)`` bool, which of them are drawn; all if None.
     """
 
     kinds: str | tuple[str, ...]
@@ -89,6 +91,7 @@ class Sprites:
     scale_y: Tensor | float | None = None
     tint: Tensor | tuple[float, float, float] = (1.0, 1.0, 1.0)
     labelled: bool = True
+    present: Tensor | None = None
 
     @staticmethod
     def disc(kinds, x, y, radius, tint=(1.0, 1.0, 1.0), labelled: bool = True) -> "Sprites":
@@ -105,8 +108,8 @@ class Sprites:
 class Layer:
     """``Sprites`` resolved on a batch of scenes: every tensor has its full shape.
 
-    ``present (N, M)`` bool; ``sprite (N, M)`` int64; ``x, y, angle, scale_x, scale_y (N, M)`` float32; ``tint
-    (N, M, 3)``.
+    M is the scene's nodes, or the layer's own number of sprites where it is not ``labelled``. ``present (N, M)`` bool;
+    ``sprite (N, M)`` int64; ``x, y, angle, scale_x, scale_y (N, M)`` float32; ``tint (N, M, 3)``.
     """
 
     atlas: Atlas

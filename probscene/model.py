@@ -9,6 +9,33 @@ from probscene.grammar import Grammar
 from probscene.policy import Policy
 
 
+@dataclass(frozen=True)
+class Groups:
+    """By what a model's objects are counted, and in which order: cars by road, say, from the top of the image.
+
+    Totals can agree where the counts of every group are wrong, so context that a guide is to learn has to be counted.
+
+    Args:
+        kind: the parent that makes a group, such as ``"road"``.
+        along: the axis of the canvas along which groups follow one another, ``"x"`` or ``"y"``: from the left or from
+            the top, by the middle of their boxes, in the order in which they are derived.
+        most: groups that are counted each for itself; objects of later ones are counted with the last.
+
+    Raises:
+        ModelError: another axis, or fewer than one group.
+    """
+
+    kind: str
+    along: str = "y"
+    most: int = 4
+
+    def __post_init__(self):
+        if self.along not in ("x", "y") or self.most < 1:
+            raise ModelError(
+                f"Expected Groups along 'x' or 'y', at least 1 group, actual along {self.along!r}, most {self.most}."
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class SceneModel:
     """A generative model of one domain.
@@ -24,10 +51,14 @@ class SceneModel:
         classes: the kinds that are labelled and counted, in the order of the categories.
         channels: 1 if colour carries nothing (images are then read as grey), else 3.
         assets: what it draws with beside its own code, in words; a run is bound to it.
+        groups: by what objects are counted; over the whole image where None.
+        pretraining: the policy whose derivations a guide is pretrained on, the prior where None. A guide learns only
+            from what it draws: give it now and then longer lists than the prior has, where the target may have them.
         target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
 
     Raises:
-        ModelError: a class that the grammar has no object of, a canvas or ``max_steps`` that is not positive.
+        ModelError: a class that the grammar has no object of, groups of no class or of the only one, a canvas or
+            ``max_steps`` that is not positive.
     """
 
     name: str
@@ -39,6 +70,8 @@ class SceneModel:
     classes: tuple[str, ...]
     channels: int = 3
     assets: str = ""
+    groups: Groups | None = None
+    pretraining: Policy | None = None
     target: Callable[[int], "SceneModel"] | None = None
 
     def __post_init__(self):
@@ -47,6 +80,11 @@ class SceneModel:
             raise ModelError(
                 f"Expected the classes of model {self.name!r} among the grammar's objects {list(self.grammar.kinds)}, "
                 f"actual {unknown or 'none'}."
+            )
+        if self.groups is not None and (self.groups.kind not in self.classes or len(self.classes) < 2):
+            raise ModelError(
+                f"Expected the groups of model {self.name!r} by one of several classes {list(self.classes)}, actual "
+                f"{self.groups.kind!r}."
             )
         if min(self.canvas) < 1 or self.max_steps < 1:
             raise ModelError(

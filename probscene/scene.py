@@ -4,13 +4,15 @@ Axis letters: N scenes, M nodes.
 """
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pyro
 import torch
 from torch import Tensor
 
 from probscene.derivation import Derivation
-from probscene.drawing import Drawing, Sprites, resolve
+from probscene.drawing import Drawing, Layer, Sprites, resolve
+from probscene.errors import ModelError
 from probscene.grammar import Grammar
 
 
@@ -63,6 +65,10 @@ class SceneGraph:
         mask = self.mask(*kinds)
         return (self.parent.unsqueeze(-1) == self.parent.unsqueeze(-2)) & mask.unsqueeze(-2)
 
+    def _of_nodes(self, layer: Sprites, kinds: tuple[str, ...]) -> Layer:
+        mask = self.mask(*kinds)
+        return resolve(layer, mask if layer.present is None else mask & layer.present)
+
     def draw(self, *layers: Sprites, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drawing:
         """What to render: layers from the back to the front.
 
@@ -72,5 +78,16 @@ class SceneGraph:
         resolved = []
         for layer in layers:
             kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds
-            resolved.append(resolve(layer, self.mask(*kinds)))
+            resolved.append(_decoration(layer, len(self.kind)) if kinds == () else self._of_nodes(layer, kinds))
         return Drawing(self.kind, self.grammar.kinds, tuple(resolved), background)
+
+
+def _decoration(layer: Sprites, num_scenes: int) -> Layer:
+    present = layer.present
+    if present is None or present.ndim != 2 or present.shape[0] != num_scenes or present.dtype != torch.bool:
+        actual = "none" if present is None else f"{present.dtype} {tuple(present.shape)}"
+        raise ModelError(
+            f"Expected Sprites of no kind with present, bool ({num_scenes} scenes, how many), actual {actual}; say "
+            "which of the decoration is drawn."
+        )
+    return resolve(replace(layer, labelled=False), present)

@@ -50,14 +50,16 @@ def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int]) -> Instan
         raise ModelError(f"Expected at most {MAX_NODES} nodes a scene, actual {shape[1]}; draw fewer things.")
     for i, layer in enumerate(drawing.layers):
         for name, value in vars(layer).items():
-            if isinstance(value, torch.Tensor) and tuple(value.shape[:2]) != shape:
+            expected = shape if layer.labelled else tuple(layer.present.shape)
+            if isinstance(value, torch.Tensor) and tuple(value.shape[:2]) != expected:
                 raise ModelError(
-                    f"Expected {name} of layer {i} as (scenes, nodes) = {shape}, actual {tuple(value.shape)}; "
+                    f"Expected {name} of layer {i} as (scenes, nodes) = {expected}, actual {tuple(value.shape)}; "
                     "make layers with probscene.drawing.resolve."
                 )
-    present = _stack(drawing, "present")
-    scene, layer, node = np.nonzero(present)
-    values = {name: _stack(drawing, name)[present] for name in ("sprite", *_REAL)}
+    present = _joined(drawing, "present")
+    scene, column = np.nonzero(present)
+    layer, node = _columns(drawing)[:, column]
+    values = {name: _joined(drawing, name)[present] for name in ("sprite", *_REAL)}
     _check(values)
     labelled = np.array([layer.labelled for layer in drawing.layers], bool)[layer]
     rows = max(1, len(scene))  # Taichi takes no empty array
@@ -68,10 +70,17 @@ def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int]) -> Instan
     return Instances(scene, node, labelled, whole.ravel(), real.ravel())
 
 
-def _stack(drawing: Drawing, name: str) -> np.ndarray:
-    """One attribute of all layers, ``(N, L, M, ...)``."""
+def _joined(drawing: Drawing, name: str) -> np.ndarray:
+    """One attribute of all layers side by side, ``(N, columns, ...)``."""
     layers = [getattr(layer, name).detach().cpu().numpy() for layer in drawing.layers]
-    return np.stack(layers, 1) if layers else np.zeros((len(drawing), 0, drawing.kind.shape[1]), bool)
+    return np.concatenate(layers, 1) if layers else np.zeros((len(drawing), 0), bool)
+
+
+def _columns(drawing: Drawing) -> np.ndarray:
+    """``(2, columns)`` the layer, and the place in it, of every column of ``_joined``."""
+    widths = [layer.present.shape[1] for layer in drawing.layers]
+    places = [np.stack([np.full(width, i), np.arange(width)]) for i, width in enumerate(widths)]
+    return np.concatenate(places, 1) if places else np.zeros((2, 0), np.int64)
 
 
 def _check(values: dict[str, np.ndarray]) -> None:

@@ -11,7 +11,7 @@ from probscene.errors import ModelError, ProbsceneError
 from probscene.model import SceneModel
 from probscene.renderers.sprites import SpriteRenderer
 
-BUILT_IN = {"multi_mnist": "probscene.models.multi_mnist"}
+BUILT_IN = {"multi_mnist": "probscene.models.multi_mnist", "aerial2d": "probscene.models.aerial2d"}
 
 
 def load_model(reference: str) -> SceneModel:
