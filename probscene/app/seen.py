@@ -1,0 +1,107 @@
+"""Scenes and photographs as a feature network sees them: what judges a fit by its images.
+
+Scene number i of a policy and a seed is image number i that ``generate`` would write, whatever the number of scenes.
+Axis letters: N scenes, L images, D features, C H W.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from probscene.app.fit import RENDERED_AT_ONCE, feature_net
+from probscene.app.loading import renderer_for
+from probscene.app.provenance import CHUNK, as_written, chunk_randomness
+from probscene.app.run import Run
+from probscene.dataset import ImageFolder
+from probscene.errors import ProbsceneError, RunError
+from probscene.inference.features import FeatureNet, embed_all
+from probscene.inference.presets import Preset
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import sample
+
+Each = Callable[[int], None]
+"""Told how many more images are done."""
+CHOICES = "run, efficientnet or inception=FILE"
+
+
+def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Iterator[Tensor]:
+    """Renders of ``num`` scenes with structures from ``policy``, in batches ``(n, channels, H, W)`` uint8 as a reader
+    of their files would have them."""
+    render = renderer_for(model)
+    for chunk, first in enumerate(range(0, num, CHUNK)):
+        with threads(1), chunk_randomness(seed, chunk):  # a chunk is drawn whole: the number changes no scene
+            scenes = sample(model, policy, CHUNK)
+        yield as_written(model, render(scenes.drawing[: num - first]).image)
+
+
+def features_of(run: Run, policy: Policy, num: int, net: FeatureNet, seed: int = 0, each: Each | None = None) -> Tensor:
+    """Features ``(num, D)`` of rendered scenes with structures from ``policy``; the same for the same seed.
+
+    Args:
+        policy: ``run.model.prior``, ``run.guide()`` or any other over the model's grammar.
+        net: such as ``network`` gives.
+
+    Raises:
+        ProbsceneError: a feature is not finite.
+    """
+    with threads(run.record["threads"]):
+        return embed_all(net, images_of(run.model, policy, num, seed), each)
+
+
+def features_in(run: Run, images: ImageFolder, net: FeatureNet, each: Each | None = None) -> Tensor:
+    """Features ``(L, D)`` of real images.
+
+    Raises:
+        ProbsceneError: a feature is not finite.
+    """
+    with threads(run.record["threads"]):
+        return embed_all(net, images.batches(RENDERED_AT_ONCE), each)
+
+
+def own_net(run: Run) -> FeatureNet:
+    """The feature network that the run has trained.
+
+    Raises:
+        RunError: it is not trained yet.
+    """
+    tensors = run.load("features")
+    if tensors is None:
+        raise RunError(f"Expected the feature network in {run.path}, actual none; go on with --resume.")
+    net = feature_net(Preset.of(run.record["preset"]), run.model)
+    net.load_state_dict(tensors)
+    return net.eval()
+
+
+def network(choice: str, run: Run) -> tuple[str, FeatureNet]:
+    """A feature network and its name, from ``run``, ``efficientnet`` or ``inception=FILE``.
+
+    Raises:
+        ProbsceneError: another word.
+        DataError: see ``Inception``.
+        RunError: see ``own_net``.
+    """
+    from probscene.inference.pretrained import EfficientNetLite, Inception  # torchvision takes seconds to import
+
+    name, _, file = choice.partition("=")
+    if choice == "run":
+        return "run", own_net(run)
+    if choice == "efficientnet":
+        return "efficientnet-lite0", EfficientNetLite()
+    if name == "inception" and file:
+        return "inception-v3", Inception(Path(file))
+    raise ProbsceneError(f"Expected features among {CHOICES}, actual {choice!r}.")
+
+
+@contextmanager
+def threads(number: int) -> Iterator[None]:
+    """So many of torch's threads inside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
