@@ -8,19 +8,20 @@ tables of logits: without them an LSTM of 50 units has to learn to count, which 
 ``q(T) = 1/|Z| sum_z q(T|z)`` (section 3.3).
 """
 
-import math
-
-import pyro
 import torch
 from torch import Tensor, nn
 
 from probscene.derivation import Derivation, Frontier
-from probscene.derive import derive
+from probscene.errors import ProbsceneError
 from probscene.grammar import Grammar
-from probscene.policy import Policy, rule_log_probs
+from probscene.inference.grammar_vae import GrammarVAE
+from probscene.inference.latent import Guide, LatentGuide
+from probscene.inference.pcfg import PCFG
+
+GUIDES = ("lstm", "pcfg", "grammar-vae")
 
 
-class LSTMGuide(nn.Module, Policy):
+class LSTMGuide(LatentGuide):
     """Also a Pyro program: ``guide(num_scenes)`` derives scenes inside the plate ``"scenes"``.
 
     Args:
@@ -43,8 +44,8 @@ class LSTMGuide(nn.Module, Policy):
         index: bool = True,
         max_index: int = 32,
     ):
-        super().__init__()
-        self.grammar, self.max_steps, self.hidden, self.max_index = grammar, max_steps, hidden, max_index
+        super().__init__(grammar, max_steps)
+        self.hidden, self.max_index = hidden, max_index
         K = len(grammar.rules)
         self.embed = nn.Embedding(K + 1, hidden)  # a linear layer on the one-hot of the previous rule, or of the start
         self.cell = nn.LSTM(hidden, hidden, batch_first=True)
@@ -58,21 +59,9 @@ class LSTMGuide(nn.Module, Policy):
             for table in (*self.embed_index, *self.index_logits):
                 nn.init.zeros_(table.weight)
 
-    def forward(self, num_scenes: int) -> Derivation:
-        """The Pyro program of the guide: sites ``z`` (where ``|Z| > 1``) and ``rule_t``."""
-        pyro.module("guide", self)
-        with pyro.plate("scenes", num_scenes, dim=-2):
-            return derive(self.grammar, self, num_scenes, self.max_steps)
-
     def start(self, num_scenes: int) -> tuple[Tensor, Tensor]:
         """First hidden and cell state, ``(N, hidden)`` each."""
-        Z = len(self.latents)
-        if Z == 1:
-            z = torch.zeros(num_scenes, dtype=torch.int64)
-        else:
-            uniform = pyro.distributions.Categorical(logits=torch.zeros(num_scenes, 1, Z))
-            z = pyro.sample("z", uniform).squeeze(-1)
-        return self._state(self.latents[z])
+        return self._state(self.latents[self.draw_latents(num_scenes)])
 
     def step(self, memory, frontier: Frontier, previous_rule: Tensor):
         """One step of the cell."""
@@ -87,14 +76,6 @@ class LSTMGuide(nn.Module, Policy):
         h, c = (s.expand(len(derivation), -1).unsqueeze(0).contiguous() for s in (h, c))
         states, _ = self.cell(self._input(derivation.frontier, derivation.previous_rules), (h, c))
         return self._output(states, derivation.frontier)
-
-    def log_prob(self, derivation: Derivation) -> Tensor:
-        """``log q(T)``, ``(N,)``, marginal over the latent vectors."""
-        each = [
-            rule_log_probs(self.grammar, self.logits(derivation, z), derivation).sum(1)
-            for z in range(len(self.latents))
-        ]
-        return torch.logsumexp(torch.stack(each), 0) - math.log(len(each))
 
     def _state(self, latents: Tensor) -> tuple[Tensor, Tensor]:
         h, c = torch.tanh(self.first_state(latents)).chunk(2, -1)
@@ -111,3 +92,19 @@ class LSTMGuide(nn.Module, Policy):
     def _indexed(self, tables: nn.ModuleList, frontier: Frontier) -> Tensor:
         repeat, around = (i.clamp(max=self.max_index) for i in (frontier.repeat, frontier.parent_repeat))
         return tables[0](repeat) + tables[1](around)
+
+
+def make_guide(kind: str, grammar: Grammar, max_steps: int, **settings) -> Guide:
+    """An untrained guide.
+
+    Args:
+        kind: ``"lstm"``, ``"pcfg"`` (one weight a rule) or ``"grammar-vae"`` (logits from z alone).
+        settings: arguments of ``LSTMGuide``, ``PCFG`` or ``GrammarVAE``.
+
+    Raises:
+        ProbsceneError: another kind.
+    """
+    if kind not in GUIDES:
+        raise ProbsceneError(f"Expected a guide among {', '.join(GUIDES)}, actual {kind!r}.")
+    made = {"lstm": LSTMGuide, "pcfg": PCFG, "grammar-vae": GrammarVAE}[kind]
+    return made(grammar, max_steps, **settings)

@@ -6,6 +6,7 @@ from typing import Any
 from probscene.errors import ProbsceneError
 from probscene.inference.count_training import CountSchedule
 from probscene.inference.divergence import MMD, Divergence, KDELogRatio
+from probscene.inference.guide import GUIDES
 
 OBJECTIVES = ("kde", "mmd")
 
@@ -19,13 +20,14 @@ class Preset:
         count: the count network's schedule.
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
+        guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``.
         objective: ``"kde"`` or ``"mmd"``, a shared reward.
         variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first two also of ``MMD``.
-        pretrain_derivations, pretrain_epochs: maximum likelihood on the prior.
+        pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Learner`` and ``ScoreFunction``.
         candidates: drawings of each structure, of which the clearest is looked at.
         baseline, scale: see ``ScoreFunction``.
-        hidden, num_latents, index: see ``LSTMGuide``.
+        hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
     """
 
     features: str = "count"
@@ -34,12 +36,14 @@ class Preset:
     blocks: tuple[int, int] = (1, 1)
     presence_images: int = 5000
     presence_epochs: int = 10
+    guide: str = "lstm"
     objective: str = "kde"
     variance: float | None = 1.0
     marginal_variance: float | None = 0.1
     leave_one_out: bool = True
     pretrain_derivations: int = 5000
     pretrain_epochs: int = 10
+    pretrain_rate: float = 1e-3
     batches: int = 60
     num_scenes: int = 500
     num_real: int | None = None
@@ -74,6 +78,26 @@ class Preset:
             return replace(self, objective=objective)
         rate = min(self.learning_rate, 1e-3)
         return replace(self, objective=objective, baseline="moving_average", updates=1, learning_rate=rate)
+
+    def guided(self, kind: str) -> "Preset":
+        """This preset with another guide. A PCFG's weights, one a rule, are many small steps of Adam away from any
+        prior; the Grammar VAE's context is in its latent vectors alone, of which it takes many.
+
+        Raises:
+            ProbsceneError: an unknown guide.
+        """
+        if kind not in GUIDES:
+            raise ProbsceneError(f"Expected a guide among {', '.join(GUIDES)}, actual {kind!r}.")
+        if kind == "pcfg":
+            return replace(self, guide=kind, pretrain_rate=3e-2)
+        if kind == "grammar-vae":
+            return replace(self, guide=kind, pretrain_rate=5e-3, hidden=100, num_latents=32)
+        return replace(self, guide=kind)
+
+    def guide_settings(self) -> dict[str, Any]:
+        """The arguments of ``make_guide`` that a run keeps."""
+        of_kind = {"lstm": ("hidden", "num_latents", "index"), "pcfg": (), "grammar-vae": ("hidden", "num_latents")}
+        return {"kind": self.guide} | {name: getattr(self, name) for name in of_kind[self.guide]}
 
     def divergence(self) -> Divergence:
         """The objective's divergence."""

@@ -80,6 +80,7 @@ Model = Annotated[str, typer.Argument(metavar="MODEL", help="A built-in model (m
 Seed = Annotated[int, typer.Option(help="The same seed gives the same result.")]
 PresetName = StrEnum("PresetName", ["quick", "default", "paper"])
 Objective = StrEnum("Objective", ["kde", "mmd"])
+GuideName = StrEnum("GuideName", {"lstm": "lstm", "pcfg": "pcfg", "grammar_vae": "grammar-vae"})
 
 
 @app.callback()
@@ -125,6 +126,7 @@ def fit(
     target: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of PNG or JPEG images.")] = None,
     preset: Annotated[PresetName | None, typer.Option(help="How long to learn; 'default' if not given.")] = None,
     objective: Annotated[Objective | None, typer.Option(help="The divergence, instead of the preset's.")] = None,
+    guide: Annotated[GuideName | None, typer.Option(help="What learns the rules; 'lstm' if not given.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
     ] = None,
@@ -141,10 +143,10 @@ def fit(
         _seed(seed)
     if threads is not None and threads < 1:
         raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
-    chosen = _preset(preset, objective, settings or [])
+    chosen = _preset(preset, objective, guide, settings or [])
     with Display() as show:
         if resume:
-            given = chosen if preset or objective or settings else None
+            given = chosen if preset or objective or guide or settings else None
             run, images = session.resume(out, show, model, target, given, seed=seed, skip_bad=skip_bad, threads=threads)
         elif model is None or target is None:
             raise ProbsceneError(
@@ -163,7 +165,10 @@ def generate(
     run: RunFolder,
     num: Annotated[int, typer.Option(metavar="N", help="How many images.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
-    format: Annotated[str, typer.Option(help="coco, or images for no annotations.")] = "coco",
+    format: Annotated[
+        list[str] | None,
+        typer.Option(help="coco (if not given), yolo, kitti, webdataset, or images for no labels; several may be given."),
+    ] = None,
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,
 ) -> None:
@@ -173,7 +178,7 @@ def generate(
     from probscene.app.run import Run
 
     with Display() as show:
-        dataset = generate(Run.open(run), num, out, seed, workers, format, show.stage("generating"))
+        dataset = generate(Run.open(run), num, out, seed, workers, format or "coco", show.stage("generating"))
     print(f"{num} images in {dataset.path}, {dataset.made} of them made now")
 
 
@@ -253,12 +258,16 @@ def _seed(seed: int) -> int:
     return seed
 
 
-def _preset(name: str | None, objective: str | None, settings: list[str]) -> "Preset":
+def _preset(name: str | None, objective: str | None, guide: str | None, settings: list[str]) -> "Preset":
     from probscene.app.overrides import override
     from probscene.inference.presets import preset
 
     chosen = preset(str(name or PresetName.default))
-    return override(chosen if objective is None else chosen.toward(str(objective)), settings)
+    if objective is not None:
+        chosen = chosen.toward(str(objective))
+    if guide is not None:
+        chosen = chosen.guided(str(guide))
+    return override(chosen, settings)
 
 
 def main() -> None:

@@ -25,7 +25,7 @@ from probscene.errors import RunError
 from probscene.inference.count_net import CountNet
 from probscene.inference.count_training import CountTraining
 from probscene.inference.features import Examples, FeatureNet, class_table, embed_all, examples
-from probscene.inference.guide import LSTMGuide
+from probscene.inference.latent import Guide
 from probscene.inference.learn import Learner
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.presence_net import PresenceNet, PresenceTraining
@@ -62,12 +62,12 @@ def create(
         "seed": seed,
         "threads": threads or len(os.sched_getaffinity(0)),
         "preset": dataclasses.asdict(preset),
-        "guide": {"hidden": preset.hidden, "num_latents": preset.num_latents, "index": preset.index},
+        "guide": preset.guide_settings(),
     }
     return Run.create(out, model, record)
 
 
-def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> LSTMGuide:
+def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guide:
     """Finish a run: take the stages that it lacks.
 
     Args:
@@ -226,10 +226,10 @@ def open_target(run: Run, progress: Progress) -> ImageFolder:
 
 def _learn(
     run: Run, preset: Preset, model: SceneModel, observe: Callable[[Scenes], Tensor], real: Tensor, progress: Progress
-) -> LSTMGuide:
+) -> Guide:
     seed = run.record["seed"]
     seed_everything(batch_seed(seed, 2))
-    guide = LSTMGuide(model.grammar, model.max_steps, **run.record["guide"])
+    guide = run.new_guide()
     objective = ScoreFunction(
         observe, preset.divergence(), baseline=preset.baseline, updates=preset.updates, scale=preset.scale
     )
@@ -253,6 +253,7 @@ def _learn(
             model.prior,
             preset.pretrain_derivations,
             epochs,
+            learning_rate=preset.pretrain_rate,
             progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
         )
 

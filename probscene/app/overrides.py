@@ -6,12 +6,18 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from probscene.errors import ProbsceneError
+from probscene.inference.guide import GUIDES
 from probscene.inference.objective import BASELINES
-from probscene.inference.presets import Preset
+from probscene.inference.presets import OBJECTIVES, Preset
 
-CHOICES = {"features": ("count", "presence"), "objective": ("kde", "mmd"), "baseline": BASELINES}
+CHOICES = {
+    "features": ("count", "presence"),
+    "objective": OBJECTIVES,
+    "baseline": BASELINES,
+    "guide": tuple(GUIDES),
+}
 LEAST = {"num_scenes": 2}
-ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale")
+ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate")
 
 
 def override(preset: Preset, settings: list[str]) -> Preset:

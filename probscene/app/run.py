@@ -22,7 +22,8 @@ from torch import Tensor
 from probscene.app.files import make_folder, write_json, write_whole
 from probscene.app.loading import BUILT_IN, load_model
 from probscene.errors import DataError, ModelError, RunError
-from probscene.inference.guide import LSTMGuide
+from probscene.inference.guide import make_guide
+from probscene.inference.latent import Guide
 from probscene.model import SceneModel
 
 FORMAT = 1  # of the run folder; another number is not read
@@ -128,7 +129,12 @@ class Run:
             self._model = model
         return self._model
 
-    def guide(self) -> LSTMGuide:
+    def new_guide(self) -> Guide:
+        """An untrained guide of the kind and size that the run was begun with; one that names no kind has an LSTM."""
+        settings = {"kind": "lstm", **self.record["guide"]}
+        return make_guide(grammar=self.model.grammar, max_steps=self.model.max_steps, **settings)
+
+    def guide(self) -> Guide:
         """The learnt guide.
 
         Raises:
@@ -137,7 +143,7 @@ class Run:
         tensors = self.load("guide")
         if tensors is None:
             raise RunError(f"Expected a finished fit in {self.path}, actual an unfinished one; go on with --resume.")
-        guide = LSTMGuide(self.model.grammar, self.model.max_steps, **self.record["guide"])
+        guide = self.new_guide()
         try:
             guide.load_state_dict(tensors)
         except RuntimeError as error:

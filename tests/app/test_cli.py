@@ -18,7 +18,8 @@ from probscene.app import cli, fit
 from probscene.app.overrides import override
 from probscene.app.run import Run
 from probscene.errors import ProbsceneError
-from probscene.inference.presets import PRESETS, QUICK
+from probscene.inference.guide import GUIDES
+from probscene.inference.presets import OBJECTIVES, PRESETS, QUICK
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -60,7 +61,10 @@ def test_version_and_help(call):
 
 def test_presets_are_those_of_the_library():
     assert [str(name) for name in cli.PresetName] == list(PRESETS)
+    assert [str(name) for name in cli.Objective] == list(OBJECTIVES)
+    assert [str(name) for name in cli.GuideName] == list(GUIDES)
     assert {override(QUICK, [f"objective={name}"]).objective for name in cli.Objective} == set(cli.Objective)
+    assert {override(QUICK, [f"guide={name}"]).guide for name in cli.GuideName} == set(cli.GuideName)
 
 
 def test_check_says_what_a_person_should_know(call, discs):
@@ -253,6 +257,7 @@ def test_resume_takes_the_settings_of_the_run_or_none(call, discs, fitted, targe
         (["--skip-bad"], "skip_bad"),
         ([*discs.settings, "--set", "batches=5"], "batches", "(4), actual 5"),
         ([*discs.settings, "--objective", "mmd"], "(kde), actual mmd"),
+        ([*discs.settings, "--guide", "pcfg"], "the guide", "(lstm), actual pcfg"),
     ):
         check_fault(call(*words, *other), 2, *parts)
 
@@ -287,7 +292,8 @@ def test_what_typer_refuses_exits_with_2(call, discs, tmp_path):
      ("count=3", "count.steps"), ("count.speed=1", "of count among steps"), ("batches.x=1", "batches=..."),
      ("cosine=5", "cosine=<bool>"), ("count.steps=1.5", "count.steps=<int>"), ("num_scenes=1", "at least 2"),
      ("batches=0", "at least 1"), ("learning_rate=0", "above 0"), ("count.whole=-1", "at least 0"),
-     ("variance=nan", "above 0"), ("objective=kl", "kde, mmd"), ("num_scenes=none", "num_scenes=<int>")],
+     ("variance=nan", "above 0"), ("objective=kl", "kde, mmd"), ("guide=hmm", "lstm, pcfg"),
+     ("num_scenes=none", "num_scenes=<int>")],
 )  # fmt: skip
 def test_wrong_settings(setting, part, call, discs, target, tmp_path):
     words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--set", setting]

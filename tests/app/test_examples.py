@@ -36,13 +36,17 @@ def test_tabletop_is_fitted_and_generated(call, discs, photos, tmp_path):
         ["--preset", "paper", "--set", "presence_images=40", "--set", "presence_epochs=1", "--set", "num_real=10"],
         ["--preset", "quick", "--objective", "mmd", "--set", "count.steps=16", "--set", "width=4,8,8"],
         ["--preset", "quick", "--set", "num_latents=3", "--set", "count.steps=16", "--set", "width=4,8,8"],
+        ["--preset", "quick", "--guide", "pcfg", "--set", "count.steps=16", "--set", "width=4,8,8"],
+        ["--preset", "quick", "--guide", "grammar-vae", "--set", "count.steps=16", "--set", "width=4,8,8"],
     ],
-    ids=["paper", "mmd", "latents"],
+    ids=["paper", "mmd", "latents", "pcfg", "grammar-vae"],
 )
 def test_other_presets_and_objectives_run(words, call, photos, tmp_path):
     few = [w for s in ("pretrain_derivations=100", "batches=2", "num_scenes=20") for w in ("--set", s)]
     done = call("fit", TABLETOP, "--target", photos, "--out", tmp_path / "run", "--threads", 1, *words, *few)
     assert done.code == 0, done.err
     run = Run.open(tmp_path / "run")
-    assert len(run.guide().latents) == run.record["preset"]["num_latents"]
+    guide = "lstm" if "--guide" not in words else words[words.index("--guide") + 1]
+    assert run.record["guide"]["kind"] == run.record["preset"]["guide"] == guide
+    assert len(getattr(run.guide(), "latents", [0])) == run.record["preset"]["num_latents"]
     assert run.record["preset"]["objective"] == ("mmd" if "mmd" in words else "kde")

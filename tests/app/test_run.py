@@ -10,6 +10,8 @@ import torch
 
 from probscene.app.run import Run
 from probscene.errors import DataError, MachineError, RunError
+from probscene.inference.guide import GUIDES, make_guide
+from probscene.inference.presets import QUICK
 from probscene.models import multi_mnist
 
 DISCS = Path(__file__).with_name("discs.py")
@@ -64,3 +66,20 @@ def test_a_run_is_bound_to_the_digits_it_was_begun_with(tmp_path, monkeypatch):
         _ = Run.open(run.path).model
     monkeypatch.delenv("PROBSCENE_MNIST")
     importlib.reload(multi_mnist)
+
+
+@pytest.mark.parametrize("kind", [*GUIDES, None])
+def test_the_guide_is_rebuilt_from_the_record(tmp_path, kind):
+    """A record that names no kind is of a version that had LSTMs alone."""
+    settings = QUICK.guided(kind or "lstm").guide_settings()
+    if kind is None:
+        del settings["kind"]
+    run = Run.create(tmp_path / "run", str(DISCS), {"guide": settings})
+    made = make_guide(**{"kind": "lstm", **settings}, grammar=run.model.grammar, max_steps=run.model.max_steps)
+    run.save("guide", made.state_dict())
+    again = Run.open(run.path).guide()
+    assert type(again) is type(made)
+    assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), made.state_dict().values(), strict=True))
+    other = Run(run.path, run.record | {"guide": {"kind": "pcfg" if kind != "pcfg" else "lstm"}})
+    with pytest.raises(RunError, match="Expected a guide for model discs"):
+        other.guide()
