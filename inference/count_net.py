@@ -2,8 +2,11 @@
 
 Fully convolutional, so it is indifferent to place. Every cell of a coarse map holds a distribution over background and
 classes; an object spreads one unit over the four cells nearest to its centre, and the features are the sums of the map:
-soft counts of each class, and their total. Not in the paper, whose presence network (``presence_net``) never learns
-which classes there are in the time that a laptop has. ``count_training`` trains it.
+soft counts of each class, and their total; or, where the model counts by groups, the number of groups and the soft
+counts in each of them, in order: three more channels then say whether a cell shows a group, where its middle is,
+and where the middle of the group is that the cell's object belongs to (``grouping``). Not in the paper, whose presence
+network (``presence_net``) never learns which classes there are in the time that a laptop has, and whose totals keep
+nothing of what counts depend on. ``count_training`` trains it.
 """
 
 import copy
@@ -15,13 +18,15 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from probscene.inference.features import enter
+from probscene.inference.grouping import tally
+from probscene.model import Groups
 
 STRIDE = 8  # pixels of the reduced image a cell
 BORDER = STRIDE // 2  # clear pixels around a reduced image, so that objects at its edge have cells on either side
 
 
 class CountNet(nn.Module):
-    """Soft counts of the classes and their total: D = classes + 1.
+    """Soft counts of the classes and their total, D = classes + 1; of groups, D = 1 + (classes - 1) * most.
 
     Args:
         classes: the kinds that are counted.
@@ -29,6 +34,7 @@ class CountNet(nn.Module):
         canvas: height and width of the images; they are reduced by 2, 4 or 8 to about 128.
         width: channels at strides 2, 4 and 8.
         blocks: residual blocks at strides 4 and 8.
+        groups: by what objects are counted; over the whole image where None.
     """
 
     def __init__(
@@ -38,9 +44,16 @@ class CountNet(nn.Module):
         canvas: tuple[int, int],
         width: tuple[int, int, int] = (16, 32, 64),
         blocks: tuple[int, int] = (1, 1),
+        groups: Groups | None = None,
     ):
         super().__init__()
+        self.groups = groups
+        self.group_class = -1 if groups is None else classes.index(groups.kind)
+        self.objects = tuple(name for i, name in enumerate(classes) if i != self.group_class)
         self.names = (*classes, "total")
+        if groups is not None:
+            each = (f"{name} {number + 1}" for number in range(groups.most) for name in self.objects)
+            self.names = (groups.kind, *each)
         self.channels = channels
         self.reduce = min(8, 2 ** max(0, round(math.log2(max(canvas) / 128))))
         a, b, c = width
@@ -50,8 +63,9 @@ class CountNet(nn.Module):
             *(_Residual(b) for _ in range(blocks[0])),
             *_conv(b, c, 3, 2),
             *(_Residual(c) for _ in range(blocks[1])),
-            nn.Conv2d(c, len(classes) + 1, 1),
+            nn.Conv2d(c, 1 + len(self.objects) + (0 if groups is None else 3), 1),
         )
+        self.register_buffer("group_cells", torch.ones(()))  # cells that an ordinary group covers
         with torch.no_grad():  # start from "nothing here", which nearly every cell holds
             self.body[-1].weight.mul_(0.3)
             self.body[-1].bias.zero_()
@@ -59,7 +73,11 @@ class CountNet(nn.Module):
         self._fused: nn.Module | None = None
 
     def forward(self, x: Tensor) -> Tensor:
-        """Logits ``(N, 1 + classes, h, w)`` of the cells; ``x (N, C, 8h, 8w)`` is a reduced image."""
+        """Logits of the cells ``(N, 1 + objects, h, w)`` of reduced images ``x (N, C, 8h, 8w)``.
+
+        If there are groups, three more channels: the logit that a cell shows a group, how many cells away that group's
+        middle is, and how many that of the group of the object that the cell holds.
+        """
         return self.body(x.contiguous(memory_format=torch.channels_last))
 
     def enter(self, images: Tensor) -> Tensor:
@@ -70,15 +88,27 @@ class CountNet(nn.Module):
 
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
-        """``(N, D)`` soft counts and total, drawn toward whole numbers, of ``(N, 1 or 3, H, W)`` uint8 images."""
+        """``(N, D)`` soft counts, drawn toward whole numbers, of ``(N, 1 or 3, H, W)`` uint8 images."""
         if self._fused is None:
             self._fused = _fuse(self.body)
         out = []
         for some in images.split(64):
             x = self.enter(some).contiguous(memory_format=torch.channels_last)
-            out.append(self._fused(x).softmax(1)[:, 1:].sum((2, 3)))
-        counts = torch.cat(out) if out else torch.zeros(0, len(self.names) - 1)
-        return toward_whole(torch.cat([counts, counts.sum(1, keepdim=True)], 1))
+            out.append(self._read(self._fused(x)))
+        return toward_whole(torch.cat(out)) if out else torch.zeros(0, len(self.names))
+
+    def _read(self, logits: Tensor) -> Tensor:
+        number = 1 + len(self.objects)
+        objects = logits[:, :number].softmax(1)[:, 1:]
+        if self.groups is None:
+            counts = objects.sum((2, 3))
+            return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
+        height, width = logits.shape[2:]
+        size = height if self.groups.along == "y" else width
+        here = (torch.arange(size) + 0.5).view(-1, 1) if self.groups.along == "y" else torch.arange(size) + 0.5
+        surface, way, pull = logits[:, number:].unbind(1)
+        votes = STRIDE * (here + way), STRIDE * (here + pull)
+        return tally(objects, surface.sigmoid(), *votes, size * STRIDE, float(self.group_cells), self.groups.most)
 
     def train(self, mode: bool = True) -> "CountNet":
         """As in torch; what inference has fused is made anew."""

@@ -10,7 +10,7 @@ Reference:
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -39,6 +39,7 @@ class CountSchedule:
         learning_rate: of Adam, after a warm-up of 50 steps; it falls to 0 along a cosine.
         muon_rate: of Muon, which takes the inner convolutions, likewise.
         count_weight: of the squared error of the soft counts.
+        group_weight: of the cross-entropy and the error of the cells' votes for their group, a cell.
         min_visible: objects less visible than this are not counted.
     """
 
@@ -52,6 +53,7 @@ class CountSchedule:
     learning_rate: float = 8e-3
     muon_rate: float = 0.1
     count_weight: float = 0.5
+    group_weight: float = 0.5
     min_visible: float = 0.25
 
 
@@ -127,13 +129,24 @@ class CountTraining:
                 group["lr"] = rate * factor
         image = self.net.enter(batch.image)
         centre = batch.centre / self.net.reduce + BORDER
-        label = batch.label.masked_fill(batch.visible < s.min_visible, -1)
+        label = self._objects(batch.label).masked_fill(batch.visible < s.min_visible, -1)
+        middle = torch.zeros_like(label, dtype=torch.float32)
+        if self.net.groups is not None:
+            middle = batch.middle / self.net.reduce + BORDER
+            image = torch.cat([image, self._ways(batch, *image.shape[-2:])], 1)
         margin = 0
         if self.done < s.steps * (1 - s.whole) and min(image.shape[-2:]) > s.crop:
-            image, centre, label = self._crop(image, centre, label)
+            image, centre, label, middle = self._crop(image, centre, label, middle)
             margin = (s.crop // STRIDE - s.window) // 2
-        target = cells(centre, label, len(self.net.names) - 1, image.shape[-2] // STRIDE, image.shape[-1] // STRIDE)
-        loss = count_loss(self.net(image), target, margin, s.count_weight)
+        height, width = image.shape[-2] // STRIDE, image.shape[-1] // STRIDE
+        target = cells(centre, label, len(self.net.objects), height, width)
+        number = 1 + len(self.net.objects)
+        logits = self.net(image[:, : self.net.channels])
+        loss = count_loss(logits[:, :number], target, margin, s.count_weight)
+        if self.net.groups is not None:
+            ways, axis = image[:, self.net.channels :], "xy".index(self.net.groups.along)
+            votes = group_targets(ways, centre, label, middle, axis, height, width)
+            loss = loss + s.group_weight * group_loss(logits[:, number:], votes, margin)
         self.net.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
@@ -145,7 +158,27 @@ class CountTraining:
             optimiser.step()
         return loss.item()
 
-    def _crop(self, image: Tensor, centre: Tensor, label: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _objects(self, label: Tensor) -> Tensor:
+        """Classes as the network counts them: groups are none of its objects."""
+        if self.net.groups is None:
+            return label
+        return label.where(label != self.net.group_class, -1) - (label > self.net.group_class).long()
+
+    def _ways(self, batch: Examples, height: int, width: int) -> Tensor:
+        """For each pixel of the bordered reduced images whether it shows a group, and how far that group's middle is,
+        pixels, ``(N, 2, height, width)``."""
+        r = self.net.reduce
+        seen = batch.instance[:, r // 2 :: r, r // 2 :: r].long()
+        N, h, w = seen.shape
+        middle = batch.middle.gather(1, (seen - 1).clamp(min=0).flatten(1)).view(N, h, w)
+        shown = (seen > 0) & (middle >= 0)
+        here = torch.arange(h)[:, None] if self.net.groups.along == "y" else torch.arange(w)[None, :]
+        way = (middle / r - here).where(shown, 0.0)
+        cells_each = shown.sum() / STRIDE**2 / (batch.label == self.net.group_class).sum().clamp(min=1)
+        self.net.group_cells.lerp_(cells_each, max(0.01, 1 / (self.done + 1)))
+        return F.pad(torch.stack([shown.float(), way], 1), (BORDER, width - w - BORDER, BORDER, height - h - BORDER))
+
+    def _crop(self, image: Tensor, centre: Tensor, label: Tensor, middle: Tensor) -> tuple[Tensor, ...]:
         """Crops ``(K, C, crop, crop)`` with an object somewhere in their window, or at random places."""
         s = self.schedule
         N, C, H, W = image.shape
@@ -154,10 +187,10 @@ class CountTraining:
         pick = torch.randperm(len(scene))[:near] if near <= len(scene) else torch.randint(len(scene), (near,))
         jitter = (torch.rand(near, 2) - 0.5) * (s.window * STRIDE)
         which = torch.cat([scene[pick], torch.randint(N, (s.crops - near,))])
-        middle = torch.cat(
+        around = torch.cat(
             [centre[scene[pick], node[pick]] + jitter, torch.rand(s.crops - near, 2) * torch.tensor([W, H])]
         )
-        corner = middle.floor().long() - s.crop // 2
+        corner = around.floor().long() - s.crop // 2
         pad = s.crop
         corner = torch.minimum(corner.clamp(min=-pad), torch.tensor([W, H]))
         padded = F.pad(image, (pad,) * 4)
@@ -165,7 +198,10 @@ class CountTraining:
         rows = (corner[:, 1:] + pad + span)[:, :, None]
         columns = (corner[:, :1] + pad + span)[:, None, :]
         crops = padded.permute(0, 2, 3, 1)[which[:, None, None], rows, columns].permute(0, 3, 1, 2)
-        return crops, centre[which] - corner[:, None].float(), label[which]
+        corner = corner[:, None].float()
+        if self.net.groups is not None:
+            middle = middle[which] - corner[..., "xy".index(self.net.groups.along)]
+        return crops, centre[which] - corner, label[which], middle
 
 
 def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) -> Tensor:
@@ -174,8 +210,36 @@ def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) 
     An object spreads one unit bilinearly over the four cells around its centre; where objects crowd into a cell it
     holds at most one between them.
     """
-    N = len(label)
-    mass = torch.zeros(N, classes, height, width)
+    mass = torch.zeros(len(label), classes, height, width)
+    for n, m, y, x, share in _shares(centre, label, height, width):
+        mass.index_put_((n, label[n, m], y, x), share, accumulate=True)
+    mass = mass / mass.sum(1, keepdim=True).clamp(min=1.0)
+    return torch.cat([1 - mass.sum(1, keepdim=True), mass], 1)
+
+
+def group_targets(
+    ways: Tensor, centre: Tensor, label: Tensor, middle: Tensor, axis: int, height: int, width: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What the cells should vote, each ``(N, height, width)``: whether a cell shows a group, how many cells away its
+    middle is, how much of an object the cell holds and how many cells away the middle of that object's group is.
+
+    Args:
+        ways: ``(N, 2, H, W)`` the first two of the pixels, in pixels.
+        centre, label: ``(N, M, 2)`` and ``(N, M)`` of the objects.
+        middle: ``(N, M)`` of their groups, pixels along the axis.
+        axis: 0 for x, 1 for y.
+    """
+    shown, way = ways[:, :, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE].unbind(1)
+    mass, pull = torch.zeros_like(shown), torch.zeros_like(shown)
+    for n, m, y, x, share in _shares(centre, label, height, width):
+        mass.index_put_((n, y, x), share, accumulate=True)
+        away = middle[n, m] - ((x, y)[axis] + 0.5) * STRIDE
+        pull.index_put_((n, y, x), share * away, accumulate=True)
+    return shown, way / STRIDE, mass, pull / mass.clamp(min=1e-6) / STRIDE
+
+
+def _shares(centre: Tensor, label: Tensor, height: int, width: int) -> Iterator[tuple[Tensor, ...]]:
+    """The objects' shares of the four cells around their centres: image, node, row, column and share, each ``(S,)``."""
     at = centre / STRIDE - 0.5
     low = at.floor()
     part = at - low
@@ -184,11 +248,8 @@ def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) 
         for dy in (0, 1):
             x, y = low[..., 0] + dx, low[..., 1] + dy
             share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
-            inside = (label >= 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            n, m = inside.nonzero(as_tuple=True)
-            mass.index_put_((n, label[n, m], y[n, m], x[n, m]), share[n, m], accumulate=True)
-    mass = mass / mass.sum(1, keepdim=True).clamp(min=1.0)
-    return torch.cat([1 - mass.sum(1, keepdim=True), mass], 1)
+            n, m = ((label >= 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)).nonzero(as_tuple=True)
+            yield n, m, y[n, m], x[n, m], share[n, m]
 
 
 def count_loss(logits: Tensor, target: Tensor, margin: int, count_weight: float) -> Tensor:
@@ -204,3 +265,21 @@ def count_loss(logits: Tensor, target: Tensor, margin: int, count_weight: float)
     entropy = -(target * log_prob).sum((1, 2, 3))
     error = (log_prob.exp() - target)[:, 1:].sum((2, 3))
     return (entropy + count_weight * (error.square().sum(1) + error.sum(1).square())).mean()
+
+
+def group_loss(votes: Tensor, target: tuple[Tensor, Tensor, Tensor, Tensor], margin: int) -> Tensor:
+    """Cross-entropy of where groups are seen, and the absolute error, in cells, of the votes of what is seen and of
+    objects; summed over an image.
+
+    Args:
+        votes: ``(N, 3, h, w)``: logit that a cell shows a group, its vote and its object's vote, see ``CountNet``.
+        target: see ``group_targets``.
+        margin: cells at the border that do not count.
+    """
+    h, w = votes.shape[-2:]
+    inner = (..., slice(margin, h - margin), slice(margin, w - margin))
+    logit, way, pull = votes[inner].unbind(1)
+    shown, true_way, mass, true_pull = (x[inner] for x in target)
+    entropy = F.binary_cross_entropy_with_logits(logit, shown, reduction="none")
+    error = shown * (way - true_way).abs() + 4 * mass * (pull - true_pull).abs()
+    return (entropy + error).sum((1, 2)).mean()

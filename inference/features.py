@@ -22,12 +22,17 @@ class Examples(NamedTuple):
         label: ``(N, M)`` int64 class of each node, -1 where it has none or cannot be seen.
         centre: ``(N, M, 2)`` float32 x and y of the middle of its whole silhouette, pixels.
         visible: ``(N, M)`` visible fraction.
+        middle: ``(N, M)`` float32, where along the groups' axis the middle of each node's group is, pixels; -1 where it
+            has none. Empty if the model has no groups.
+        instance: ``(N, H, W)`` int16, node index + 1. Empty if the model has no groups.
     """
 
     image: Tensor
     label: Tensor
     centre: Tensor
     visible: Tensor
+    middle: Tensor
+    instance: Tensor
 
 
 class FeatureNet(Protocol):
@@ -41,16 +46,23 @@ class FeatureNet(Protocol):
 Draw = Callable[[int], Examples]
 
 
-def examples(batch: RenderBatch, classes: Tensor) -> Examples:
+def examples(batch: RenderBatch, classes: Tensor, group: Tensor | None = None, along: str = "y") -> Examples:
     """The labels of a rendered batch.
 
     Args:
         batch: from a renderer.
         classes: ``(kinds + 1,)`` int64, the class of each kind of the grammar, -1 for none; the last entry is -1.
+        group: ``(N, M)`` int64, the node that each node is counted with, -1 for none; see ``grouping.group_of``.
+        along: the axis along which groups follow one another, ``"x"`` or ``"y"``.
     """
     label = classes[batch.kind].masked_fill(batch.pixels == 0, -1)
     box = batch.amodal_box
-    return Examples(batch.image, label, (box[..., :2] + box[..., 2:]) / 2, batch.visible)
+    centre = (box[..., :2] + box[..., 2:]) / 2
+    middle, instance = torch.zeros(len(label), 0), torch.zeros(len(label), 0, 0, dtype=torch.int16)
+    if group is not None:
+        middle = centre[..., "xy".index(along)].gather(1, group.clamp(min=0)).where(group >= 0, -1.0)
+        instance = batch.instance
+    return Examples(batch.image, label, centre, batch.visible, middle, instance)
 
 
 def class_table(kinds: tuple[str, ...], classes: tuple[str, ...]) -> Tensor:
