@@ -167,7 +167,7 @@ def generate(
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
     format: Annotated[
         list[str] | None,
-        typer.Option(help="coco (if not given), yolo, kitti, webdataset, or images for no labels; several may be given."),
+        typer.Option(help="coco (if not given), yolo, kitti, webdataset, or images for no labels; may be given again."),
     ] = None,
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,

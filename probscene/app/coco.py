@@ -23,23 +23,29 @@ def categories(model: SceneModel) -> list[dict[str, Any]]:
     return [{"id": i, "name": name, "supercategory": model.name} for i, name in enumerate(model.classes, 1)]
 
 
+def labelled(model: SceneModel, batch: RenderBatch) -> Tensor:
+    """The category ids ``(N, M)`` int64 of the nodes that are labelled in every format: those of a class that have a
+    visible pixel; 0 at the others.
+    """
+    category = torch.tensor([_category(model, name) for name in model.grammar.kinds])
+    return torch.where((batch.kind >= 0) & (batch.pixels > 0), category[batch.kind.clamp(min=0)], 0)
+
+
 def annotations(model: SceneModel, batch: RenderBatch, first: int) -> list[dict[str, Any]]:
     """Annotations of rendered scenes, but for their ids: one for each node of a class that has a visible pixel.
 
     Args:
         batch: the renders, of images ``first``, ``first + 1``, ...
     """
-    category = torch.tensor([_category(model, name) for name in model.grammar.kinds])
-    shown = (batch.kind >= 0) & (batch.pixels > 0)
-    shown &= category[batch.kind.clamp(min=0)] > 0
+    category = labelled(model, batch)
     found = []
-    for i in range(len(shown)):
-        nodes = shown[i].nonzero()[:, 0]
+    for i in range(len(category)):
+        nodes = category[i].nonzero()[:, 0]
         for node, mask in zip(nodes.tolist(), _masks(batch.instance[i], nodes), strict=True):
             found.append(
                 {
                     "image_id": first + i,
-                    "category_id": int(category[batch.kind[i, node]]),
+                    "category_id": int(category[i, node]),
                     "bbox": _corner_and_size(batch.box[i, node]),
                     "segmentation": mask,
                     "area": int(batch.pixels[i, node]),

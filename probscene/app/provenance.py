@@ -22,7 +22,8 @@ from probscene.dataset import grey
 from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
-from probscene.sampling import Scenes, realise, seed_everything
+from probscene.policy import Policy
+from probscene.sampling import Scenes, realise, sample, seed_everything
 
 CHUNK = 64
 
@@ -38,6 +39,21 @@ def chunk_randomness(seed: int, chunk: int) -> Iterator[None]:
         yield
     finally:
         pyro.util.set_rng_state(before)
+
+
+def draw_chunk(model: SceneModel, policy: Policy, seed: int, chunk: int) -> Scenes:
+    """The scenes of a chunk, all 64, the same whatever else the process does.
+
+    Raises:
+        SamplingError, ModelError: see ``sample``.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # sums of floats depend on how many threads share them
+    try:
+        with chunk_randomness(seed, chunk):
+            return sample(model, policy, CHUNK)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def image_name(index: int) -> str:

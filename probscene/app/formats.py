@@ -1,0 +1,48 @@
+"""Which formats a dataset is written in: those asked for, and those that a finished folder holds.
+
+    coco        annotations.json
+    yolo        labels/000000.txt ... and data.yaml
+    kitti       Kitti/raw/training/ with image_2, label_2 and instance
+    webdataset  shard-000000.tar ..., images and labels together
+    images      no labels
+
+All are written from the same renders and share ``images/``: KITTI's image files are hard links to those there, copies
+where the file system has none. Shards hold images of their own; for them alone, no ``images/`` is written.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from probscene.errors import ProbsceneError
+
+FORMATS = ("coco", "yolo", "kitti", "webdataset", "images")
+_MARKS = {"coco": "annotations.json", "yolo": "data.yaml", "kitti": "Kitti", "webdataset": "shard-000000.tar"}
+
+
+def chosen(format: str | Iterable[str]) -> tuple[str, ...]:
+    """The formats that are asked for, each once, in the order of ``FORMATS``.
+
+    Args:
+        format: names, each of which may be several with commas between them.
+
+    Raises:
+        ProbsceneError: an unknown name, or none.
+    """
+    names = [name.strip() for part in ([format] if isinstance(format, str) else format) for name in part.split(",")]
+    unknown = [name for name in names if name not in FORMATS]
+    if unknown or not names:
+        actual = repr(unknown[0]) if unknown else "none"
+        raise ProbsceneError(f"Expected formats among {', '.join(FORMATS)}, actual {actual}.")
+    return _normal(names)
+
+
+def found(folder: Path) -> tuple[str, ...]:
+    """The formats of a finished dataset, as ``chosen`` gives them."""
+    names = [name for name, mark in _MARKS.items() if (folder / mark).exists()]
+    return _normal([*names, *(["images"] if (folder / "images").exists() else [])])
+
+
+def _normal(names: list[str]) -> tuple[str, ...]:
+    """``images`` adds something to shards alone: the other formats have that folder anyway."""
+    implied = {"coco", "yolo", "kitti"} & set(names)
+    return tuple(name for name in FORMATS if name in names and not (name == "images" and implied))
