@@ -42,37 +42,38 @@ class Tally(NamedTuple):
     """Units of each image by their count.
 
     Attributes:
-        units: ``(N, K)`` float64, how many units of an image have the count k.
-        resampled: ``(R, K)`` float64, the same summed over images, for each resample of the images.
+        total: ``(K,)`` float64, how many units of all images have the count k.
+        resampled: ``(R, K)`` float64, the same for each resample of the images.
     """
 
-    units: NDArray[np.float64]
+    total: NDArray[np.float64]
     resampled: NDArray[np.float64]
 
     @property
     def empty(self) -> bool:
         """Whether there is no unit in any image."""
-        return not self.units.any()
+        return not self.total.any()
 
-    @property
-    def mean(self) -> float:
-        """The mean count of a unit; NaN where there is none."""
-        total = self.units.sum(0)
-        return float(total @ np.arange(len(total)) / total.sum()) if total.any() else float("nan")
+    def mean(self) -> Interval | None:
+        """The mean count of a unit; None where there is none."""
+        if self.empty:
+            return None
+        bins = np.arange(len(self.total))
+        return around(self.total @ bins / self.total.sum(), _shares(self.resampled) @ bins)
 
     def histogram(self) -> Histogram:
         """Shares of the units by count, ``(K,)``, with the interval of each; zeros where there is no unit."""
-        low, high = np.zeros((2, self.units.shape[1])) if self.empty else _quantiles(_shares(self.resampled))
-        return Histogram(self.units.sum(0) / max(1.0, self.units.sum()), low, high)
+        low, high = np.zeros((2, len(self.total))) if self.empty else _quantiles(_shares(self.resampled))
+        return Histogram(self.total / max(1.0, self.total.sum()), low, high)
 
     def distance(self, other: "Tally") -> Distance | None:
         """How far two tallies are apart; None where one is empty."""
         if self.empty or other.empty:
             return None
         R = min(len(self.resampled), len(other.resampled))
-        size = max(self.units.shape[1], other.units.shape[1])
-        p, q = (np.pad(x.units.sum(0) / x.units.sum(), (0, size - x.units.shape[1])) for x in (self, other))
-        drawn = [np.pad(_shares(x.resampled[:R]), ((0, 0), (0, size - x.units.shape[1]))) for x in (self, other)]
+        size = max(len(self.total), len(other.total))
+        p, q = (np.pad(x.total / x.total.sum(), (0, size - len(x.total))) for x in (self, other))
+        drawn = [np.pad(_shares(x.resampled[:R]), ((0, 0), (0, size - len(x.total)))) for x in (self, other)]
         change = drawn[0] - drawn[1]
         return Distance(
             around(total_variation(p, q), np.abs(change).sum(1) / 2, least=0.0),
@@ -80,12 +81,12 @@ class Tally(NamedTuple):
         )
 
 
-def resamples(number: int, size: int = 300, seed: int = 0) -> NDArray[np.float64]:
+def resamples(number: int, size: int = 200, seed: int = 0) -> NDArray[np.float32]:
     """How often each of ``number`` images is drawn in each of ``size`` resamples, ``(R, N)``."""
-    return np.random.default_rng(seed).multinomial(number, np.full(number, 1 / number), size).astype(np.float64)
+    return np.random.default_rng(seed).multinomial(number, np.full(number, 1 / number), size).astype(np.float32)
 
 
-def tally(count: ArrayLike, image: ArrayLike, weight: NDArray[np.float64]) -> Tally:
+def tally(count: ArrayLike, image: ArrayLike, weight: NDArray[np.float32]) -> Tally:
     """A tally of units.
 
     Args:
@@ -103,12 +104,12 @@ def tally(count: ArrayLike, image: ArrayLike, weight: NDArray[np.float64]) -> Ta
             f"Expected counts of 0 or more in images 0..{N - 1}, actual {count.shape} counts from "
             f"{count.min(initial=0)} in {image.shape} images {image.min(initial=0)}..{image.max(initial=0)}."
         )
-    units = np.zeros((N, 1 + int(count.max(initial=0))))
-    np.add.at(units, (image, count), 1.0)
-    return Tally(units, weight @ units)
+    units = np.zeros((N, 1 + int(count.max(initial=0))), np.float32)  # whole numbers, exact in either width
+    np.add.at(units, (image, count), 1)
+    return Tally(units.sum(0, dtype=np.float64), (weight @ units).astype(np.float64))
 
 
-def tally_images(count: ArrayLike, weight: NDArray[np.float64]) -> Tally:
+def tally_images(count: ArrayLike, weight: NDArray[np.float32]) -> Tally:
     """``tally`` of one unit an image, ``count (N,)``."""
     return tally(count, np.arange(len(np.asarray(count))), weight)
 
@@ -123,7 +124,7 @@ def around(value: float, drawn: ArrayLike, least: float = -np.inf, level: float 
     return Interval(float(value), float(max(least, value + low)), float(max(least, value + high)))
 
 
-def mean_interval(values: ArrayLike, weight: NDArray[np.float64]) -> Interval:
+def mean_interval(values: ArrayLike, weight: NDArray[np.float32]) -> Interval:
     """The mean of one value an image, ``values (N,)``."""
     values = np.asarray(values, np.float64)
     return around(values.mean(), weight @ values / weight.sum(1))
