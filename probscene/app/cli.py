@@ -187,10 +187,15 @@ def evaluate(
     run: RunFolder,
     target: Annotated[Path, typer.Option(metavar="DIR", help="The images to judge by.")],
     labels: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="counts.csv: image,CLASS,CLASS,...; one row an image.")
+        Path | None, typer.Option(metavar="FILE", help="A counts.csv (image,CLASS,...) or a provenance.jsonl.")
     ] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+    features: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NET", help="FID and KID by: run, efficientnet or inception=FILE; repeatable."),
+    ] = None,
+    num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
 ) -> None:
     """Compare prior and learnt structures with the truth, or with what the feature network sees."""
     from rich.console import Console
@@ -199,7 +204,7 @@ def evaluate(
     from probscene.app.display import Display
     from probscene.app.evaluate import evaluate
     from probscene.app.files import make_folder, write_json
-    from probscene.app.labels import read_counts
+    from probscene.app.labels import read_labels
     from probscene.app.run import Run
 
     opened = Run.open(run)
@@ -208,8 +213,8 @@ def evaluate(
         make_folder(json.parent)
     with Display() as show:
         images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
-        truth = None if labels is None else read_counts(labels, opened.model.classes, images)
-        found = evaluate(opened, images, truth, show, num)
+        truth = None if labels is None else read_labels(labels, opened.model, images)
+        found = evaluate(opened, images, truth, show, num, features=features or (), images=num_images)
     tables.show(found, Console(highlight=False))
     if json is not None:
         write_json(json, found.record())
@@ -222,7 +227,7 @@ def report(
         Path | None, typer.Option(metavar="FILE", help="report.html in the run folder if not given.")
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="counts.csv of the run's target, for the truth.")
+        Path | None, typer.Option(metavar="FILE", help="counts.csv or provenance.jsonl of the run's target.")
     ] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
 ) -> None:

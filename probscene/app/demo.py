@@ -20,7 +20,7 @@ from probscene.app.display import Display
 from probscene.app.evaluate import evaluate
 from probscene.app.files import make_folder, write_json
 from probscene.app.generate import generate, generate_scenes
-from probscene.app.labels import counts_of_dataset, read_counts, write_counts
+from probscene.app.labels import counts_of_dataset, read_labels, write_counts
 from probscene.app.loading import load_model
 from probscene.app.preview import pixels, scenes, side_by_side, write_picture
 from probscene.app.run import Run
@@ -100,7 +100,7 @@ def _fit(
 
 def _judge(run: Run, target: ImageFolder, out: Path, show: Display) -> None:
     model = run.model
-    found = evaluate(run, target, read_counts(out / "truth.csv", model.classes, target), show)
+    found = evaluate(run, target, read_labels(out / "truth.csv", model, target), show)
     write_json(out / "evaluation.json", found.record())
     report.write(run, found, target)
     pictures = {

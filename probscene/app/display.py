@@ -27,6 +27,7 @@ STAGES = {
     "drawing": ("Drawing a target", "images"),
     "generating": ("Generating", "images"),
     "counting": ("Counting", "scenes"),
+    "comparing": ("Comparing", "images"),
 }
 """By stage: what it does, and in what it counts."""
 

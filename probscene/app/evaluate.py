@@ -1,14 +1,15 @@
 """``probscene evaluate``: which structures are learnt, beside the prior's, the truth's and what the network sees.
 
-Sources of counts: ``prior`` and ``learnt`` are sampled structures; ``truth`` is a ``counts.csv`` of the target's
+Sources of counts: ``prior`` and ``learnt`` are sampled structures; ``truth`` is a file of labels of the target's
 images; ``estimate`` is what the run's feature network counts in them, rounded. The last is no truth: the network learnt
 on prior renders alone and errs where objects crowd, but it is there without a single label.
 
-Axis letters: N scenes, L images, C classes.
+Where kinds nest (cars on roads), children are counted by node and by the node's rank: which no context-free prior can
+weigh, and totals hide.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,53 +17,20 @@ import numpy as np
 import torch
 
 import probscene
-from probscene.app.fit import RENDERED_AT_ONCE, Progress, feature_net
-from probscene.app.labels import Counts, class_counts
-from probscene.app.provenance import chunk_randomness
+from probscene.app.estimate import estimated
+from probscene.app.fit import Progress, feature_net
+from probscene.app.image_distances import IMAGES, Distances, image_distances
+from probscene.app.labels import Labels
+from probscene.app.likelihood import Likelihood, likelihood
 from probscene.app.run import Run
+from probscene.app.seen import features_in, own_net
+from probscene.app.source import Source
+from probscene.app.structures import Relation, sampled
 from probscene.dataset import ImageFolder
-from probscene.derive import derive_complete
-from probscene.errors import ProbsceneError, RunError
-from probscene.inference.features import embed_all
-from probscene.inference.metrics import (
-    Histogram,
-    histogram,
-    histogram_interval,
-    pooled_shares,
-    pooled_shares_interval,
-    total_variation,
-    wasserstein,
-)
+from probscene.errors import ProbsceneError
+from probscene.inference.metrics import histogram, pooled_shares, total_variation, wasserstein
 from probscene.inference.presets import Preset
-from probscene.model import SceneModel
-from probscene.policy import Policy
-
-SAMPLED_AT_ONCE = 500
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """Counts of one source.
-
-    Attributes:
-        counts: ``(N, C)`` int64.
-        total: ``(N,)`` int64 objects of all classes; an estimate's is rounded by itself.
-    """
-
-    counts: Counts
-    total: Counts
-
-    @staticmethod
-    def of(counts: Counts) -> "Source":
-        return Source(counts, counts.sum(1))
-
-    def number(self) -> Histogram:
-        """Shares of scenes with 0, 1, 2, ... objects."""
-        return histogram_interval(self.total)
-
-    def classes(self) -> Histogram:
-        """Shares of the classes among all objects, ``(C,)``."""
-        return pooled_shares_interval(self.counts)
+from probscene.inference.tally import Tally
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,17 +42,24 @@ class Evaluation:
         target: path of the target's images.
         classes: the C names.
         sources: ``prior``, ``learnt``, then ``truth`` and ``estimate`` where they are known.
+        likelihoods: of the truth's structures under ``prior`` and ``learnt``, where they are known.
+        images: FID and KID by the features' name; see ``image_distances``.
     """
 
     run: Run
     target: Path
     classes: tuple[str, ...]
     sources: dict[str, Source]
+    likelihoods: dict[str, Likelihood] = field(default_factory=dict)
+    images: dict[str, Distances] = field(default_factory=dict)
 
     def distance(self, a: str, b: str) -> dict[str, Any]:
         """How far source ``a`` is from ``b``: total variation of the number of objects and of the pooled class shares,
         Wasserstein-1 of the number in objects an image, and the total variation of each class's own counts. Shares of
-        a source without objects are not compared: None."""
+        a source without objects are not compared: None.
+
+        ``kinds`` and ``children`` have both distances with their intervals, of each class's counts and, where kinds
+        nest, of the children by ``nesting.GROUPS``; None where a source has no such node."""
         one, other = self.sources[a], self.sources[b]
         number = histogram(one.total), histogram(other.total)
         shares = pooled_shares(one.counts), pooled_shares(other.counts)
@@ -97,6 +72,12 @@ class Evaluation:
             "number_wasserstein": wasserstein(*number),
             "classes": total_variation(*shares) if shares[0].any() and shares[1].any() else None,
             "each_class": each,
+            "kinds": {name: _apart(x, y) for name, x, y in zip(self.classes, one.kinds, other.kinds, strict=True)},
+            "children": {
+                _key(relation): {group: _apart(found, other.nested[relation][group]) for group, found in each.items()}
+                for relation, each in one.nested.items()
+                if relation in other.nested
+            },
         }
 
     def distances(self) -> dict[str, dict[str, dict[str, Any]]]:
@@ -115,6 +96,11 @@ class Evaluation:
             "classes": list(self.classes),
             "distances": self.distances(),
             "sources": {name: self._source(source) for name, source in self.sources.items()},
+            "log_prob": {name: _plain(found) for name, found in self.likelihoods.items()},
+            "images": {
+                name: {source: {figure.name: _plain(figure) for figure in found} for source, found in each.items()}
+                for name, each in self.images.items()
+            },
         }
 
     def _source(self, source: Source) -> dict[str, Any]:
@@ -124,26 +110,43 @@ class Evaluation:
             "number": _plain(source.number()),
             "classes": _plain(source.classes()),
             "each_class": {name: histogram(source.counts[:, c]).tolist() for c, name in enumerate(self.classes)},
+            "children": {
+                _key(relation): {
+                    group: _plain(found.histogram()) | {"mean": _plain(found.mean())} for group, found in each.items()
+                }
+                for relation, each in source.nested.items()
+            },
         }
 
 
 def evaluate(
-    run: Run, target: ImageFolder | None, truth: Counts | None, progress: Progress, num: int = 10000, seed: int = 0
+    run: Run,
+    target: ImageFolder | None,
+    truth: Labels | None,
+    progress: Progress,
+    num: int = 10000,
+    seed: int = 0,
+    features: Sequence[str] = (),
+    images: int = IMAGES,
 ) -> Evaluation:
     """Sample structures of the prior and of the guide and count, beside the truth and the network's estimate.
 
     Args:
         target: its images; without them there is only the run's own record of what the network saw.
-        truth: ``(L, C)`` counts of the target's images.
+        truth: the labels of the target's images.
         num: structures a source.
+        features: networks to compare images by, see ``seen.network``; none, as it renders.
+        images: how many are compared at most, where they are.
 
     Raises:
-        ProbsceneError: a number that is not positive.
+        ProbsceneError: a number that is not positive; see ``image_distances``.
         RunError: the fit is not finished.
     """
     if num < 1:
         raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
-    model, guide = run.model, run.guide()
+    if features and target is None:
+        raise ProbsceneError("Expected the target's images to compare features with, actual none.")
+    policies = {"prior": run.model.prior, "learnt": run.guide()}
     done = 0
 
     def each(scenes):
@@ -151,33 +154,20 @@ def evaluate(
         done += scenes
         progress("counting", done, 2 * num, "")
 
-    sources = {
-        name: Source.of(structure_counts(model, policy, num, seed, each))
-        for name, policy in (("prior", model.prior), ("learnt", guide))
-    }
+    compared = image_distances(run, target, features, progress, images, seed) if features else {}
+    sources, likelihoods = {}, {}
+    for name, policy in policies.items():
+        found = sampled(run.model, policy, num, seed, each)
+        sources[name] = Source.of(found.counts, found.children)
+        if truth is not None and truth.derivation is not None:
+            likelihoods[name] = likelihood(policy, truth.derivation)
     if truth is not None:
-        sources["truth"] = Source.of(truth)
+        sources["truth"] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
     estimate = network_counts(run, target, progress)
     if estimate is not None:
         sources["estimate"] = estimate
     path = Path(run.record["target"]) if target is None else target.path
-    return Evaluation(run, path, model.classes, sources)
-
-
-def structure_counts(
-    model: SceneModel, policy: Policy, num: int, seed: int, each: Callable[[int], None] | None = None
-) -> Counts:
-    """Class counts ``(num, C)`` of structures that a policy derives; nothing is rendered."""
-    torch.set_num_threads(1)  # the guide's tensors are tiny
-    parts = []
-    for number, first in enumerate(range(0, num, SAMPLED_AT_ONCE)):
-        size = min(SAMPLED_AT_ONCE, num - first)
-        with chunk_randomness(seed, number):
-            derivation, _ = derive_complete(model.grammar, policy, size, model.max_steps)
-        parts.append(class_counts(model, derivation))
-        if each is not None:
-            each(size)
-    return np.concatenate(parts)
+    return Evaluation(run, path, run.model.classes, sources, likelihoods, compared)
 
 
 def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> Source | None:
@@ -185,35 +175,35 @@ def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> 
 
     The features that the fit kept are taken where the images are the fit's, else the images are embedded anew.
     """
-    preset, model = Preset.of(run.record["preset"]), run.model
-    if preset.features != "count":
+    model = run.model
+    names = feature_net(Preset.of(run.record["preset"]), model).names
+    if estimated(model, names, torch.zeros(0, len(names))) is None:
         return None
-    kept = run.load("real")
-    if target is None or (kept is not None and bytes(kept["fingerprint"].tolist()).hex() == target.fingerprint):
-        features = None if kept is None else kept["features"]
-    else:
-        features = _embedded(run, preset, target, progress)
-    if features is None:
-        return None
-    rounded = features.round().clamp(min=0).long().numpy()
-    C = len(model.classes)
-    return Source(rounded[:, :C], rounded[:, C])
-
-
-def _embedded(run: Run, preset: Preset, target: ImageFolder, progress: Progress) -> torch.Tensor:
-    net, tensors, done = feature_net(preset, run.model), run.load("features"), 0
-    if tensors is None:
-        raise RunError(f"Expected the feature network in {run.path}, actual none; go on with --resume.")
-    net.load_state_dict(tensors)
+    kept, done = run.load("real"), 0
 
     def each(images):
         nonlocal done
         done += images
         progress("target", done, len(target), "")
 
-    torch.set_num_threads(run.record["threads"])
-    return embed_all(net.eval(), target.batches(RENDERED_AT_ONCE), each)
+    if target is None or (kept is not None and bytes(kept["fingerprint"].tolist()).hex() == target.fingerprint):
+        features = None if kept is None else kept["features"]
+    else:
+        features = features_in(run, target, own_net(run), each)
+    return None if features is None else Source(*estimated(model, names, features), seed=1)
 
 
-def _plain(found: Histogram) -> dict[str, list[float]]:
-    return {key: value.tolist() for key, value in found._asdict().items()}
+def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:
+    return _plain(one.distance(other))
+
+
+def _key(relation: Relation) -> str:
+    return f"{relation[1]} per {relation[0]}"
+
+
+def _plain(found: Any) -> dict[str, Any] | None:
+    """A tuple with names for JSON, and the tuples in it."""
+    if found is None:
+        return None
+    inner = {key: _plain(x) if isinstance(x, tuple) else x for key, x in found._asdict().items()}
+    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in inner.items()}

@@ -1,27 +1,57 @@
-"""``counts.csv``: how many objects of each class an image shows; the truth that learnt structures are judged by.
+"""The truth that learnt structures are judged by; fitting never reads it. Two kinds of files:
+
+``counts.csv``, how many objects of each class an image shows: the columns are ``image`` and the model's classes, in any
+order; one row an image, in any order.
 
     image,0,1,2
     000000.png,0,2,1
 
-One row an image, in any order; the columns are ``image`` and the model's classes, in any order. Fitting never reads it.
+``provenance.jsonl`` as ``generate`` writes it: one line an image with the rules of its structure, which says also what
+hangs below what, and how likely a policy would have derived it.
 """
 
 import csv
 import io
 import json
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from probscene.app.files import write_text
+from probscene.app.structures import Counts, Structures, count
 from probscene.dataset import ImageFolder
 from probscene.derivation import Derivation
-from probscene.errors import DataError
+from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
-Counts = NDArray[np.int64]
+
+class Labels(NamedTuple):
+    """The truth of L images, in the order of their files.
+
+    Attributes:
+        structures: their counts ``(L, C)``, and the children of each node where whole structures are known.
+        derivation: the structures themselves, where they are known.
+    """
+
+    structures: Structures
+    derivation: Derivation | None = None
+
+
+def read_labels(path: Path, model: SceneModel, target: ImageFolder) -> Labels:
+    """The labels of a target's images, from a ``.jsonl`` of provenance or from a CSV of counts.
+
+    Rows of files that the target left out as bad are passed over.
+
+    Raises:
+        DataError: see ``read_counts``; a line that is none of provenance, or whose rules are not the model's.
+    """
+    if Path(path).suffix != ".jsonl":
+        return Labels(Structures(read_counts(path, model.classes, target), {}))
+    derivation = _read_derivations(Path(path), model, target)
+    return Labels(count(model, derivation), derivation)
 
 
 def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder) -> Counts:
@@ -35,19 +65,15 @@ def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder) -> Co
     """
     path = Path(path)
     try:
-        rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig")), strict=True))
-    except OSError as error:
-        raise DataError(f"Expected a file of counts at {path}, actual none: {error.strerror}.") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.reader(io.StringIO(_text(path)), strict=True))
+    except csv.Error as error:
         raise DataError(f"Expected a CSV file in UTF-8, actual {path}: {error}.") from error
     header = [name.strip() for name in rows[0]] if rows else []
     if sorted(header) != sorted(["image", *classes]):
         raise DataError(
             f"Expected the columns {','.join(['image', *classes])} in {path}, actual {','.join(header) or 'none'}."
         )
-    known = {file.name for file in target.paths}
-    left_out = {file.name for file in target.bad}
-    found: dict[str, list[int]] = {}
+    named = _Named(path, target)
     for number, fields in enumerate(rows[1:], 2):
         if not fields:
             continue
@@ -56,18 +82,9 @@ def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder) -> Co
             raise DataError(f"Expected {len(header)} fields {where}, actual {len(fields)}.")
         row = dict(zip(header, fields, strict=True))
         name = row["image"].strip()
-        if name in left_out:
-            continue
-        if name not in known:
-            raise DataError(f"Expected the name of an image in {target.path} {where}, actual {name!r}.")
-        if name in found:
-            raise DataError(f"Expected one row an image, actual a second one of {name} {where}.")
-        found[name] = [_count(row[c], c, name, where) for c in classes]
-    missing = [file.name for file in target.paths if file.name not in found]
-    if missing:
-        names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-        raise DataError(f"Expected a row for every image of {target.path} in {path}, actual none for {names}.")
-    return np.array([found[file.name] for file in target.paths], np.int64)
+        if named.wanted(name, where):
+            named.found[name] = [_count(row[c], c, name, where) for c in classes]
+    return np.array(named.ordered(), np.int64)
 
 
 def write_counts(path: Path, names: list[str], counts: Counts, classes: tuple[str, ...]) -> None:
@@ -86,16 +103,96 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
         for line in map(json.loads, file):
             names.append(Path(line["image"]).name)
             rules.append(line["rules"])
-    padded = torch.full((len(rules), max(map(len, rules))), -1)
-    for i, row in enumerate(rules):
-        padded[i, : len(row)] = torch.tensor(row)
-    return names, class_counts(model, Derivation.of(model.grammar, padded))
+    return names, count(model, Derivation.of(model.grammar, _padded(rules))).counts
 
 
-def class_counts(model: SceneModel, derivation: Derivation) -> Counts:
-    """Objects of each of the model's classes in each scene, ``(N, C)``."""
-    kinds = [model.grammar.kind(name) for name in model.classes]
-    return derivation.counts(len(model.grammar.kinds))[:, kinds].numpy()
+class _Named:
+    """What a file of labels says of a target's images, by name, each exactly once."""
+
+    def __init__(self, path: Path, target: ImageFolder):
+        self.path, self.target = path, target
+        self.known = {file.name for file in target.paths}
+        self.left_out = {file.name for file in target.bad}
+        self.found: dict[str, Any] = {}
+
+    def wanted(self, name: str, where: str) -> bool:
+        """Whether a row is of an image that is used."""
+        if name in self.left_out:
+            return False
+        if name not in self.known:
+            raise DataError(f"Expected the name of an image in {self.target.path} {where}, actual {name!r}.")
+        if name in self.found:
+            raise DataError(f"Expected one row an image, actual a second one of {name} {where}.")
+        return True
+
+    def ordered(self) -> list[Any]:
+        """In the order of the target's files."""
+        missing = [file.name for file in self.target.paths if file.name not in self.found]
+        if missing:
+            names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+            raise DataError(
+                f"Expected a row for every image of {self.target.path} in {self.path}, actual none for {names}."
+            )
+        return [self.found[file.name] for file in self.target.paths]
+
+
+def _read_derivations(path: Path, model: SceneModel, target: ImageFolder) -> Derivation:
+    named = _Named(path, target)
+    for number, text in enumerate(_text(path).split("\n"), 1):
+        if not text.strip():
+            continue
+        where = f"in line {number} of {path}"
+        try:
+            line = json.loads(text)
+            name, rules, spelt = Path(line["image"]).name, list(line["rules"]), line["derivation"]
+        except (ValueError, KeyError, TypeError) as error:
+            about = f"{type(error).__name__}: {error}"
+            raise DataError(
+                f"Expected image, rules and derivation {where}, actual something else ({about})."
+            ) from error
+        if named.wanted(name, where):
+            named.found[name] = _rules(model, rules, spelt, where)
+    rules = named.ordered()
+    try:
+        derivation = Derivation.of(model.grammar, _padded(rules))
+        whole = derivation.complete.all()
+    except GrammarError:
+        whole = False
+    if not whole:
+        names = (file.name for file, row in zip(target.paths, rules, strict=True) if not _is_whole(model, row))
+        raise DataError(f"Expected structures of model {model.name!r} in {path}, actual another of {next(names)}.")
+    return derivation
+
+
+def _rules(model: SceneModel, rules: list[Any], spelt: str, where: str) -> list[int]:
+    """The rules of one structure, seen to be the model's."""
+    known = model.grammar.rules
+    own = rules and all(type(rule) is int and 0 <= rule < len(known) for rule in rules)
+    if not own or "; ".join(str(known[rule]) for rule in rules) != spelt:
+        raise DataError(f"Expected rules of model {model.name!r} {where}, actual those of another grammar.")
+    return rules
+
+
+def _is_whole(model: SceneModel, rules: list[int]) -> bool:
+    try:
+        return bool(Derivation.of(model.grammar, _padded([rules])).complete.all())
+    except GrammarError:
+        return False
+
+
+def _padded(rules: Iterable[list[int]]) -> torch.Tensor:
+    """``(L, T)`` int64, -1 pads."""
+    rows = [torch.tensor(row, dtype=torch.int64) for row in rules]
+    return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=-1)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise DataError(f"Expected a file of labels at {path}, actual none: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"Expected a text file in UTF-8, actual {path}: {error}.") from error
 
 
 def _count(text: str, column: str, name: str, where: str) -> int:

@@ -15,7 +15,7 @@ from probscene.app import charts, session
 from probscene.app.display import STAGES, Display
 from probscene.app.evaluate import Evaluation, evaluate
 from probscene.app.files import make_folder, write_text
-from probscene.app.labels import read_counts
+from probscene.app.labels import read_labels
 from probscene.app.preview import Pixels, grid, pixels, scenes, shrunk
 from probscene.app.run import Run
 from probscene.dataset import ImageFolder
@@ -35,7 +35,7 @@ def report(run: Run, show: Display, out: Path | None = None, labels: Path | None
 
     Args:
         out: ``report.html`` in the run folder where None.
-        labels: a ``counts.csv`` of the run's target.
+        labels: a ``counts.csv`` or a ``provenance.jsonl`` of the run's target.
         num: structures sampled a source.
 
     Returns:
@@ -54,7 +54,7 @@ def report(run: Run, show: Display, out: Path | None = None, labels: Path | None
         if labels is not None:
             raise
         absent = str(error)
-    truth = None if labels is None else read_counts(labels, run.model.classes, images)
+    truth = None if labels is None else read_labels(labels, run.model, images)
     return write(run, evaluate(run, images, truth, show, num), images, out, absent)
 
 

@@ -6,7 +6,12 @@ from rich.console import Console
 from rich.table import Table
 
 from probscene.app.evaluate import Evaluation
+from probscene.app.likelihood import Likelihood
+from probscene.app.nesting import GROUPS, PARENTS, label
+from probscene.app.source import Source
+from probscene.app.structures import Relation
 from probscene.inference.metrics import Histogram
+from probscene.inference.tally import Distance, Interval, Tally
 
 NAMES = {"prior": "prior", "learnt": "learnt", "truth": "truth", "estimate": "estimate *"}
 DISTANCES = {
@@ -18,14 +23,22 @@ FOOTNOTE = (
     "* An estimate without labels: what the feature network counts in the target's images, rounded; not the truth."
 )
 
+FLOOR = "The floor is what two halves of the target are apart; every figure of FID and KID is of as many images a side."
+
 
 def show(evaluation: Evaluation, console: Console) -> None:
     """Print the distances, then the histograms in percent with half the width of their 95 % intervals."""
-    for table in (*distances(evaluation.distances()), _numbers(evaluation), _classes(evaluation)):
+    more = (*_nested(evaluation), *_likelihoods(evaluation), *_images(evaluation))
+    for table in (*distances(evaluation.distances()), _numbers(evaluation), _classes(evaluation), *more):
         console.print(table)
         console.print()
+    notes = {figure.note for each in evaluation.images.values() for found in each.values() for figure in found} - {""}
     if "estimate" in evaluation.sources:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
+    if evaluation.images:
+        console.print(FLOOR, style="dim", soft_wrap=True)
+    for note in sorted(notes):
+        console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
 
 
 def distances(measured: dict[str, Any]) -> list[Table]:
@@ -35,9 +48,9 @@ def distances(measured: dict[str, Any]) -> list[Table]:
     for b, found in measured.items():
         what = "the truth" if b == "truth" else "what the feature network sees *"
         table = _table(f"Distance to {what}", "", ["prior", "learnt"])
-        for key, label in DISTANCES.items():
+        for key, words in DISTANCES.items():
             values = (found[a][key] for a in ("prior", "learnt"))
-            table.add_row(label, *("-" if value is None else f"{value:.3f}" for value in values))
+            table.add_row(words, *("-" if value is None else f"{value:.3f}" for value in values))
         tables.append(table)
     return tables
 
@@ -60,6 +73,87 @@ def _classes(evaluation: Evaluation) -> Table:
     for c, name in enumerate(evaluation.classes):
         table.add_row(name, *(_percent(found, c) for found in each))
     return table
+
+
+def rows(source: Source, relations: list[Relation]) -> dict[tuple[Relation, str], Tally]:
+    """The tallies of a source, by relation and group, that hold any node."""
+    return {
+        (relation, group): found
+        for relation in relations
+        for group, found in source.nested.get(relation, {}).items()
+        if not found.empty
+    }
+
+
+def _nested(evaluation: Evaluation) -> list[Table]:
+    """Where kinds nest: the mean of every kind of count, then how far each is from the truth and from the estimate."""
+    relations = list(evaluation.sources["learnt"].nested)
+    if not relations:
+        return []
+    each = {name: rows(source, relations) for name, source in evaluation.sources.items()}
+    known = dict.fromkeys(key for found in each.values() for key in found)
+    means = _table("Counts by what they depend on, means", "", [NAMES[name] for name in each])
+    for key in sorted(known, key=lambda key: _order(key, relations)):
+        found = (tallies.get(key) for tallies in each.values())
+        means.add_row(label(*key), *("-" if tally is None else _figure(tally.mean(), 2) for tally in found))
+    tables = [means]
+    for b in evaluation.distances():
+        what = "the truth" if b == "truth" else "what the feature network sees *"
+        columns = [f"{a}, {short}" for short in ("TV", "W1") for a in ("prior", "learnt")]
+        table = _table(f"Distance to {what}: total variation and Wasserstein-1 of counts", "", columns)
+        for c, name in enumerate(evaluation.classes):
+            one = [evaluation.sources[a].kinds[c].distance(evaluation.sources[b].kinds[c]) for a in ("prior", "learnt")]
+            table.add_row(f"{name}: number in an image", *_both(one))
+        if not each[b]:
+            continue
+        for key in sorted(each[b], key=lambda key: _order(key, relations)):
+            if key[1] == PARENTS and key[0][0] in evaluation.classes:
+                continue  # a row above
+            one = [each[a][key].distance(each[b][key]) if key in each[a] else None for a in ("prior", "learnt")]
+            table.add_row(label(*key), *_both(one))
+        tables.append(table)
+    return tables
+
+
+def _order(key: tuple[Relation, str], relations: list[Relation]) -> tuple[int, int]:
+    return relations.index(key[0]), GROUPS.index(key[1])
+
+
+def _both(found: list[Distance | None]) -> list[str]:
+    return [_figure(None if one is None else one[i], 3) for i in (0, 1) for one in found]
+
+
+def _likelihoods(evaluation: Evaluation) -> list[Table]:
+    if not evaluation.likelihoods:
+        return []
+    table = _table("log q of the labelled structures, nats a scene", "", list(evaluation.likelihoods))
+    table.add_row("mean", *map(_nats, evaluation.likelihoods.values()))
+    return [table]
+
+
+def _nats(found: Likelihood) -> str:
+    if not found.impossible:
+        return _figure(found.nats, 2)
+    rest = "" if found.nats is None else f"; the others {_figure(found.nats, 2)}"
+    return f"-inf ({100 * found.impossible:.1f} % impossible{rest})"
+
+
+def _images(evaluation: Evaluation) -> list[Table]:
+    tables = []
+    for name, each in evaluation.images.items():
+        table = _table(f"Distance of images in the features of {name}", "", list(each))
+        for figures in zip(*each.values(), strict=True):
+            title = f"{figures[0].name}, {figures[0].images} images a side"
+            table.add_row(title, *(_figure(Interval(*figure[2:5]), 4) for figure in figures))
+        tables.append(table)
+    return tables
+
+
+def _figure(found: Interval | None, digits: int) -> str:
+    """A figure and half the width of its interval."""
+    if found is None:
+        return "-"
+    return f"{found.value:.{digits}f} ± {(found.high - found.low) / 2:.{digits}f}"
 
 
 def _table(title: str, first: str, columns: list[str]) -> Table:

@@ -11,10 +11,12 @@ import scipy.stats
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from probscene.app.evaluate import Source, evaluate, network_counts, structure_counts
-from probscene.app.labels import counts_of_dataset, read_counts, write_counts
+from probscene.app.evaluate import evaluate, network_counts
+from probscene.app.labels import Labels, counts_of_dataset, read_counts, write_counts
 from probscene.app.loading import load_model
 from probscene.app.run import Run
+from probscene.app.source import Source
+from probscene.app.structures import Structures, sampled
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
 
@@ -23,6 +25,14 @@ CLASSES = ("red", "blue")
 
 def quiet(*_):
     pass
+
+
+def structure_counts(model, policy, num, seed, each=None):
+    return sampled(model, policy, num, seed, each).counts
+
+
+def labels(counts) -> Labels:
+    return Labels(Structures(counts, {}))
 
 
 def opened(folder) -> ImageFolder:
@@ -53,7 +63,7 @@ def test_structures_are_counted_as_their_distribution_says(discs):
 
 def test_distances_are_those_between_the_counts(fitted, target):
     run = Run.open(fitted)
-    found = evaluate(run, opened(target.images), target.counts, quiet, num=600)
+    found = evaluate(run, opened(target.images), labels(target.counts), quiet, num=600)
     assert list(found.sources) == ["prior", "learnt", "truth", "estimate"]
     assert np.array_equal(found.sources["prior"].counts, structure_counts(run.model, run.model.prior, 600, 0))
     assert np.array_equal(found.sources["learnt"].counts, structure_counts(run.model, run.guide(), 600, 0))
@@ -72,7 +82,7 @@ def test_distances_are_those_between_the_counts(fitted, target):
 
 
 def test_shares_of_no_objects_are_not_compared(fitted, target):
-    found = evaluate(Run.open(fitted), opened(target.images), np.zeros((40, 2), np.int64), quiet, num=50)
+    found = evaluate(Run.open(fitted), opened(target.images), labels(np.zeros((40, 2), np.int64)), quiet, num=50)
     assert found.distance("prior", "truth")["classes"] is None
     json.dumps(found.record(), allow_nan=False)
 
@@ -105,7 +115,7 @@ def test_the_command_prints_and_writes_the_same(call, fitted, target, tmp_path):
     labelled = call(*words, "--labels", target.labels, "--json", tmp_path / "new" / "e.json")
     assert labelled.code == 0, labelled.err
     record = json.loads((tmp_path / "new" / "e.json").read_text())
-    expected = evaluate(Run.open(fitted), opened(target.images), target.counts, quiet, num=500).record()
+    expected = evaluate(Run.open(fitted), opened(target.images), labels(target.counts), quiet, num=500).record()
     assert record == json.loads(json.dumps(expected))
     measured = record["distances"]["truth"]
     for key in ("number", "classes", "number_wasserstein"):
@@ -176,7 +186,7 @@ def test_labels_that_are_no_text_or_not_there(target, tmp_path):
     with pytest.raises(DataError, match="UTF-8"):
         read_counts(tmp_path / "c.csv", CLASSES, images)
     for path in (tmp_path, tmp_path / "none.csv"):
-        with pytest.raises(DataError, match="Expected a file of counts"):
+        with pytest.raises(DataError, match="Expected a file of labels"):
             read_counts(path, CLASSES, images)
 
 
