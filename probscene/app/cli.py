@@ -167,7 +167,10 @@ def generate(
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
     format: Annotated[
         list[str] | None,
-        typer.Option(help="coco (if not given), yolo, kitti, webdataset, or images for no labels; may be given again."),
+        typer.Option(
+            metavar="FORMAT",
+            help="coco (if not given), yolo, kitti, webdataset, or images for no labels; again for more.",
+        ),
     ] = None,
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,
