@@ -67,7 +67,7 @@ def fid(real: Tensor, generated: Tensor, features: str, size: int = 50, seed: in
     weight = [torch.from_numpy(resamples(len(x), size, seed + i)).double() for i, x in enumerate((real, generated))]
     drawn = [frechet(real[a > 0], generated[b > 0], a[a > 0], b[b > 0]).item() for a, b in zip(*weight, strict=True)]
     few = min(L, N) <= D
-    note = f"of {min(L, N)} images in {D} dimensions: covariances of deficient rank, the figure is far too high"
+    note = f"FID of {min(L, N)} images in {D} dimensions: covariances of deficient rank, the figure is far too high"
     return Figure("FID", features, *around(metric.compute().item(), drawn, 0.0), min(L, N), note if few else "")
 
 
@@ -91,7 +91,7 @@ def kid(real: Tensor, generated: Tensor, features: str, subset: int = SUBSET, si
         metric.update(real, real=True)
         metric.update(generated, real=False)
         value = metric.compute()[0].item()
-    note = f"of {fewest} images, fewer than the {subset} of KID's subsets" if fewest < subset else ""
+    note = f"KID of {fewest} images, fewer than the {subset} of KID's subsets" if fewest < subset else ""
     return Figure("KID", features, *around(value, _kid_drawn(real, generated, size, seed)), fewest, note)
 
 

@@ -12,12 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from probscene.app.evaluate import Evaluation
+from probscene.app.nesting import GROUPS, PARENTS, label
 from probscene.inference.metrics import Histogram
 
 INK, FAINT = "#010203", "#010204"
 SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
 VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
 SMALL = 1e-3  # a share that would be no pixel high
+WIDE, SMALLER = (9.6, 2.9), (5.6, 2.5)  # inches
 STYLE = {
     "svg.fonttype": "none",  # text stays text, in the page's font
     "font.family": "sans-serif",
@@ -40,16 +42,36 @@ STYLE = {
 
 def numbers(evaluation: Evaluation) -> str:
     """The share of images by number of objects."""
-    each = {name: source.number() for name, source in evaluation.sources.items()}
-    bins = 1 + max(int(np.flatnonzero(found.share >= SMALL).max(initial=0)) for found in each.values())
-    each = {name: Histogram(*(x[:bins] for x in found)) for name, found in each.items()}
-    return _bars(each, [str(k) for k in range(bins)], "objects in an image", "share of images", "number")
+    return _counts(
+        {name: source.number() for name, source in evaluation.sources.items()},
+        "objects in an image",
+        "share of images",
+        "number",
+    )
 
 
 def classes(evaluation: Evaluation) -> str:
     """The share of objects by class."""
     each = {name: source.classes() for name, source in evaluation.sources.items()}
     return _bars(each, list(evaluation.classes), "class", "share of objects", "class")
+
+
+def nested(evaluation: Evaluation) -> list[str]:
+    """Where kinds nest: images by the number of each class, then parents by the number of their children."""
+    sources, charts = evaluation.sources, []
+    if not sources["learnt"].nested:
+        return charts
+    for c, kind in enumerate(evaluation.classes):
+        each = {name: source.kinds[c].histogram() for name, source in sources.items()}
+        charts.append(_counts(each, f"{kind} per image", "share of images", kind, SMALLER))
+    for relation in sources["learnt"].nested:
+        known = {name: source.nested[relation] for name, source in sources.items() if relation in source.nested}
+        for group in GROUPS:
+            each = {name: found[group].histogram() for name, found in known.items() if not found[group].empty}
+            if len(each) > 1 and not (group == PARENTS and relation[0] in evaluation.classes):  # that one is above
+                what = label(relation, group)
+                charts.append(_counts(each, what, "share of images" if group == PARENTS else "share", what, SMALLER))
+    return charts
 
 
 def curves(log: list[dict]) -> list[str]:
@@ -73,13 +95,22 @@ def curves(log: list[dict]) -> list[str]:
     return charts
 
 
-def _bars(each: dict[str, Histogram], ticks: list[str], x: str, y: str, salt: str) -> str:
+def _counts(each: dict[str, Histogram], x: str, y: str, salt: str, size: tuple[float, float] = WIDE) -> str:
+    """Shares by count, up to the last that can be seen."""
+    bins = 1 + max(int(np.flatnonzero(found.share >= SMALL).max(initial=0)) for found in each.values())
+    each = {name: Histogram(*(x[:bins] for x in found)) for name, found in each.items()}
+    step = 1 if size == WIDE else -(-bins // 12)
+    return _bars(each, [str(k) if k % step == 0 else "" for k in range(bins)], x, y, salt, size)
+
+
+def _bars(
+    each: dict[str, Histogram], ticks: list[str], x: str, y: str, salt: str, size: tuple[float, float] = WIDE
+) -> str:
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt, "axes.grid": True}):
-        figure, axes = _figure(9.6, 2.9)
+        figure, axes = _figure(*size)
         width = 0.82 / len(each)
         for i, (name, found) in enumerate(each.items()):
-            size = len(found.share)
-            at = np.arange(size) + (i - (len(each) - 1) / 2) * width
+            at = np.arange(len(found.share)) + (i - (len(each) - 1) / 2) * width
             axes.bar(at, found.share, width * 0.92, color=SOURCES[name])
             error = np.clip([found.share - found.low, found.high - found.share], 0, None)
             axes.errorbar(at, found.share, error, fmt="none", ecolor=INK, elinewidth=0.8)

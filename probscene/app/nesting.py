@@ -35,9 +35,8 @@ def label(relation: Relation, group: str) -> str:
     """A group of a relation in words."""
     parent, child = relation
     words = {
-        PARENTS: f"{parent}: number in an image",
+        PARENTS: f"{parent} per image",
         ALL: f"{child} per {parent}",
-        LATER: f"{child} per later {parent}",
         OTHERS: f"{child} per {parent} but the first",
     }
-    return words.get(group, f"{child} of the {group} {parent}")
+    return words.get(group, f"{child} per {group} {parent}")

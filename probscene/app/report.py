@@ -11,7 +11,7 @@ from typing import Any
 
 from PIL import Image
 
-from probscene.app import charts, session
+from probscene.app import charts, session, tables
 from probscene.app.display import STAGES, Display
 from probscene.app.evaluate import Evaluation, evaluate
 from probscene.app.files import make_folder, write_text
@@ -82,6 +82,8 @@ def write(
             ),
             numbers=charts.numbers(evaluation),
             classes=charts.classes(evaluation),
+            nested=_nested(evaluation),
+            figures=_figures(evaluation),
             note=_note(evaluation),
             curves="".join(f'<div class="chart card">{chart}</div>' for chart in charts.curves(_log(run))),
             grammar=html.escape(str(model.grammar)),
@@ -135,6 +137,23 @@ def _note(evaluation: Evaluation) -> str:
         "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; its "
         "counts are rounded."
     )
+
+
+def _nested(evaluation: Evaluation) -> str:
+    found = "".join(f'<div class="chart card">{chart}</div>' for chart in charts.nested(evaluation))
+    return f'<h3>By what counts depend on</h3><div class="row two">{found}</div>' if found else ""
+
+
+def _figures(evaluation: Evaluation) -> str:
+    """Every table of the evaluation that the charts do not hold."""
+    parts = []
+    for table in (*tables.nested(evaluation), *tables.likelihoods(evaluation), *tables.images(evaluation)):
+        head = [str(column.header).removesuffix(" *") for column in table.columns]
+        rows = list(zip(*(column.cells for column in table.columns), strict=True))
+        parts.append(
+            f'<h3>{html.escape(str(table.title).replace(" *", ""))}</h3><div class="chart">{_table(head, rows)}</div>'
+        )
+    return "".join(parts)
 
 
 def _log(run: Run) -> list[dict[str, Any]]:

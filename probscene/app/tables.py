@@ -11,9 +11,10 @@ from probscene.app.nesting import GROUPS, PARENTS, label
 from probscene.app.source import Source
 from probscene.app.structures import Relation
 from probscene.inference.metrics import Histogram
-from probscene.inference.tally import Distance, Interval, Tally
+from probscene.inference.tally import Interval, Tally
 
 NAMES = {"prior": "prior", "learnt": "learnt", "truth": "truth", "estimate": "estimate *"}
+FITTED = ("prior", "learnt")
 DISTANCES = {
     "number": "number of objects, total variation",
     "classes": "classes, total variation",
@@ -28,7 +29,7 @@ FLOOR = "The floor is what two halves of the target are apart; every figure of F
 
 def show(evaluation: Evaluation, console: Console) -> None:
     """Print the distances, then the histograms in percent with half the width of their 95 % intervals."""
-    more = (*_nested(evaluation), *_likelihoods(evaluation), *_images(evaluation))
+    more = (*nested(evaluation), *likelihoods(evaluation), *images(evaluation))
     for table in (*distances(evaluation.distances()), _numbers(evaluation), _classes(evaluation), *more):
         console.print(table)
         console.print()
@@ -75,7 +76,7 @@ def _classes(evaluation: Evaluation) -> Table:
     return table
 
 
-def rows(source: Source, relations: list[Relation]) -> dict[tuple[Relation, str], Tally]:
+def _rows(source: Source, relations: list[Relation]) -> dict[tuple[Relation, str], Tally]:
     """The tallies of a source, by relation and group, that hold any node."""
     return {
         (relation, group): found
@@ -85,12 +86,12 @@ def rows(source: Source, relations: list[Relation]) -> dict[tuple[Relation, str]
     }
 
 
-def _nested(evaluation: Evaluation) -> list[Table]:
+def nested(evaluation: Evaluation) -> list[Table]:
     """Where kinds nest: the mean of every kind of count, then how far each is from the truth and from the estimate."""
     relations = list(evaluation.sources["learnt"].nested)
     if not relations:
         return []
-    each = {name: rows(source, relations) for name, source in evaluation.sources.items()}
+    each = {name: _rows(source, relations) for name, source in evaluation.sources.items()}
     known = dict.fromkeys(key for found in each.values() for key in found)
     means = _table("Counts by what they depend on, means", "", [NAMES[name] for name in each])
     for key in sorted(known, key=lambda key: _order(key, relations)):
@@ -98,20 +99,22 @@ def _nested(evaluation: Evaluation) -> list[Table]:
         means.add_row(label(*key), *("-" if tally is None else _figure(tally.mean(), 2) for tally in found))
     tables = [means]
     for b in evaluation.distances():
-        what = "the truth" if b == "truth" else "what the feature network sees *"
-        columns = [f"{a}, {short}" for short in ("TV", "W1") for a in ("prior", "learnt")]
-        table = _table(f"Distance to {what}: total variation and Wasserstein-1 of counts", "", columns)
-        for c, name in enumerate(evaluation.classes):
-            one = [evaluation.sources[a].kinds[c].distance(evaluation.sources[b].kinds[c]) for a in ("prior", "learnt")]
-            table.add_row(f"{name}: number in an image", *_both(one))
-        if not each[b]:
-            continue
-        for key in sorted(each[b], key=lambda key: _order(key, relations)):
-            if key[1] == PARENTS and key[0][0] in evaluation.classes:
-                continue  # a row above
-            one = [each[a][key].distance(each[b][key]) if key in each[a] else None for a in ("prior", "learnt")]
-            table.add_row(label(*key), *_both(one))
-        tables.append(table)
+        keys = [key for key in each[b] if not (key[1] == PARENTS and key[0][0] in evaluation.classes)]
+        for field, title in (("total_variation", "total variation"), ("wasserstein", "Wasserstein-1")):
+            what = "the truth" if b == "truth" else "what the feature network sees *"
+            table = _table(f"Counts by what they depend on, {title} to {what}", "", ["prior", "learnt"])
+            found = {
+                f"{name} per image": [(evaluation.sources[a].kinds[c], evaluation.sources[b].kinds[c]) for a in FITTED]
+                for c, name in enumerate(evaluation.classes)
+            } | {
+                label(*key): [(each[a].get(key), each[b][key]) for a in FITTED]
+                for key in sorted(keys, key=lambda key: _order(key, relations))
+            }
+            for words, pairs in found.items():
+                apart = (one and one.distance(other) for one, other in pairs)
+                table.add_row(words, *(_figure(found and getattr(found, field), 3) for found in apart))
+            if each[b]:
+                tables.append(table)
     return tables
 
 
@@ -119,11 +122,8 @@ def _order(key: tuple[Relation, str], relations: list[Relation]) -> tuple[int, i
     return relations.index(key[0]), GROUPS.index(key[1])
 
 
-def _both(found: list[Distance | None]) -> list[str]:
-    return [_figure(None if one is None else one[i], 3) for i in (0, 1) for one in found]
-
-
-def _likelihoods(evaluation: Evaluation) -> list[Table]:
+def likelihoods(evaluation: Evaluation) -> list[Table]:
+    """How likely prior and guide would have derived the truth's structures, where they are known."""
     if not evaluation.likelihoods:
         return []
     table = _table("log q of the labelled structures, nats a scene", "", list(evaluation.likelihoods))
@@ -138,15 +138,20 @@ def _nats(found: Likelihood) -> str:
     return f"-inf ({100 * found.impossible:.1f} % impossible{rest})"
 
 
-def _images(evaluation: Evaluation) -> list[Table]:
+def images(evaluation: Evaluation) -> list[Table]:
+    """FID and KID, a table for each network, where they were measured."""
     tables = []
     for name, each in evaluation.images.items():
         table = _table(f"Distance of images in the features of {name}", "", list(each))
         for figures in zip(*each.values(), strict=True):
             title = f"{figures[0].name}, {figures[0].images} images a side"
-            table.add_row(title, *(_figure(Interval(*figure[2:5]), 4) for figure in figures))
+            table.add_row(title, *(_short(figure) for figure in figures))
         tables.append(table)
     return tables
+
+
+def _short(figure: Any) -> str:
+    return f"{figure.value:.4g} ± {(figure.high - figure.low) / 2:.2g}"
 
 
 def _figure(found: Interval | None, digits: int) -> str:
@@ -160,7 +165,7 @@ def _table(title: str, first: str, columns: list[str]) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold")
     table.add_column(first)
     for name in columns:
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     return table
 
 
