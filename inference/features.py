@@ -77,16 +77,19 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
         images: ``(N, 1 or 3, H, W)`` uint8.
         reduce: block average, 1, 2, 4, ...; H and W are padded with zeros to a multiple.
     """
-    x = images[:, :channels].to(torch.int16)
+    x = images[:, :channels]
     N, C, H, W = x.shape
     if H % reduce or W % reduce:
         x = torch.nn.functional.pad(x, (0, -W % reduce, 0, -H % reduce))
     if reduce > 1:
-        # Sums of at most 64 bytes fit in 16 bits; two passes over small integers beat pooling in floating point.
+        # Sums of at most 64 bytes fit in 16 bits; two passes over small integers beat pooling in floating point. Rows
+        # go first: they lie whole in memory, planar or interleaved.
         if reduce > 8:
             raise ProbsceneError(f"Expected reduce at most 8, actual {reduce}.")
-        x = sum(x[..., i::reduce] for i in range(reduce))
-        x = sum(x[..., i::reduce, :] for i in range(reduce))
+        rows = x[..., ::reduce, :].to(torch.int16)
+        for i in range(1, reduce):
+            rows += x[..., i::reduce, :]
+        x = sum(rows[..., i::reduce] for i in range(reduce))
     return x.float() * (1 / (255 * reduce * reduce))
 
 

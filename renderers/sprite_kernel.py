@@ -71,6 +71,19 @@ def opaque(texels: ti.template(), base, stride, u, v, red, green, blue):
 
 
 @ti.func
+def plain(texels: ti.template(), at: ti.i32):
+    """A texel's colour in three bytes, red the lowest."""
+    s = texels[at]
+    return ti.cast((s & 0xFF) | ((s >> 8) & 0xFF00) | ((s >> 16) & 0xFF0000), u32)
+
+
+@ti.func
+def on_texels(start: i64, step: i64, other: i64):
+    """Whether positions from ``start`` on fall on texels' centres: steps of one texel, or of none."""
+    return (start >> 24) & 255 == 0 and step == i64(ONE) and other == 0
+
+
+@ti.func
 def coverage(real: ti.template(), r, u: i64, v: i64):
     """How much of a pixel the hard edges of a magnified sprite leave, 0..256."""
     x, y = ti.cast(u, f64), ti.cast(v, f64)
@@ -93,6 +106,8 @@ def paint_sprite(
     label, labels = ti.cast(node + 1, ti.i16), (node + 1) * i64(LANES)
     has_inside = real[r + U_IN_LO] <= real[r + U_IN_HI] and real[r + V_IN_LO] <= real[r + V_IN_HI]
     even = whole[w + EVEN] != 0
+    copied = red == 256 and green == 256 and blue == 256
+    copied = copied and on_texels(whole[w + U], du, whole[w + U_DY]) and on_texels(whole[w + V], whole[w + V_DY], dv)
     colour = u32(0)
     if even:
         u, v = ti.cast(real[r + U_IN_HI], i64), ti.cast(real[r + V_IN_HI], i64)
@@ -124,7 +139,11 @@ def paint_sprite(
                     u, v = u_row + du * c, v_row + dv * c
                     if pixel & 3 == 0 and c + 4 <= end:
                         p0, p1, p2, p3 = colour, colour, colour, colour
-                        if not even:
+                        if copied:
+                            at = ti.cast(base + (v >> 32) * stride + (u >> 32), ti.i32)
+                            p0, p1 = plain(texels, at), plain(texels, at + 1)
+                            p2, p3 = plain(texels, at + 2), plain(texels, at + 3)
+                        elif not even:
                             p0 = opaque(texels, base, stride, u, v, red, green, blue)
                             p1 = opaque(texels, base, stride, u + du, v + dv, red, green, blue)
                             p2 = opaque(texels, base, stride, u + 2 * du, v + 2 * dv, red, green, blue)

@@ -19,12 +19,14 @@ import probscene
 from probscene.app.files import write_text
 from probscene.app.loading import load_model, renderer_for
 from probscene.app.run import Run
+from probscene.batch import RenderBatch
 from probscene.dataset import ImageFolder, grey
-from probscene.drawing import Drawing
+from probscene.derivation import Derivation
 from probscene.errors import RunError
 from probscene.inference.count_net import CountNet
 from probscene.inference.count_training import CountTraining
 from probscene.inference.features import Examples, FeatureNet, class_table, embed_all, examples
+from probscene.inference.grouping import group_of
 from probscene.inference.latent import Guide
 from probscene.inference.learn import Learner
 from probscene.inference.objective import ScoreFunction
@@ -103,7 +105,11 @@ class View:
     def draw(self, num: int) -> Examples:
         """``num`` labelled renders of the prior."""
         scenes = sample(self.model, self.model.prior, num)
-        drawn = examples(self.render(scenes.drawing), self.classes)
+        groups, grammar = self.model.groups, self.model.grammar
+        by = ()
+        if groups is not None:
+            by = (group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind)), groups.along)
+        drawn = examples(self.render(scenes.drawing), self.classes, *by)
         return drawn._replace(image=self._as_read(drawn.image))
 
     def observe(self, net: FeatureNet, candidates: int = 1) -> Callable[[Scenes], Tensor]:
@@ -116,10 +122,8 @@ class View:
 
         def features(scenes: Scenes) -> Tensor:
             torch.set_num_threads(self.threads)
-            drawings = [scenes.drawing]
-            drawings += [realise(self.model, scenes.derivation).drawing for _ in range(candidates - 1)]
             starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
-            images = (self._clearest([d[i : i + RENDERED_AT_ONCE] for d in drawings]) for i in starts)
+            images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), candidates) for i in starts)
             parts = [net.embed(self._as_read(some)) for some in images]
             torch.set_num_threads(1)
             return torch.cat(parts)
@@ -130,24 +134,35 @@ class View:
         """Renders ``(N, 3, H, W)`` as ``ImageFolder`` would read them from files, ``(N, channels, H, W)``."""
         return grey(images) if self.model.channels == 1 else images
 
-    def _clearest(self, drawings: list[Drawing]) -> Tensor:
-        """Images ``(N, 3, H, W)``, each from the drawing that covers least of its least visible object."""
-        rendered = [self.render(drawing) for drawing in drawings]
-        if len(rendered) == 1:
-            return rendered[0].image
-        least = torch.stack([batch.visible.where(batch.kind >= 0, 1.0).amin(1) for batch in rendered])
-        best = least.argmax(0)
-        image = rendered[0].image
-        for number, batch in enumerate(rendered):
-            image[best == number] = batch.image[best == number]
+    def _clearest(self, scenes: Scenes, rows: slice, candidates: int) -> Tensor:
+        """Images ``(N, 3, H, W)``, each of the drawing that covers least of its least visible object."""
+        batch, derivation = self.render(scenes.drawing[rows]), scenes.derivation[rows]
+        image, best = batch.image, _least_visible(batch, derivation)
+        for _ in range(candidates - 1):
+            again = (best < 1).nonzero().flatten()  # nothing is clearer than what is whole
+            if not len(again):
+                break
+            some = derivation[again]
+            batch = self.render(realise(self.model, some).drawing)
+            least = _least_visible(batch, some)
+            better = least > best[again]
+            image[again[better]], best[again[better]] = batch.image[better], least[better]
         return image
+
+
+def _least_visible(batch: RenderBatch, derivation: Derivation) -> Tensor:
+    """``(N,)`` visible fraction of the least visible object; what has others on it is meant to be covered."""
+    parent = derivation.parent[:, : batch.kind.shape[1]]  # the program's own derivation has as many nodes as it needs
+    carries = torch.zeros(len(parent), parent.shape[1] + 1, dtype=torch.bool)
+    carries.scatter_(1, parent.where(parent >= 0, parent.shape[1]), True)
+    return batch.visible.where((batch.kind >= 0) & ~carries[:, :-1], 1.0).amin(1)
 
 
 def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet:
     """The untrained feature network of a preset."""
     if preset.features == "presence":
         return PresenceNet(model.classes)
-    return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks)
+    return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)
 
 
 def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> CountNet | PresenceNet:
@@ -250,7 +265,7 @@ def _learn(
         epochs = preset.pretrain_epochs
         pretrain(
             guide,
-            model.prior,
+            model.prior if model.pretraining is None else model.pretraining,
             preset.pretrain_derivations,
             epochs,
             learning_rate=preset.pretrain_rate,

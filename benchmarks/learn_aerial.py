@@ -1,0 +1,135 @@
+"""Whether a fit learns structure that depends on context, on Aerial 2D, and what the baselines learn in the same time.
+
+    python benchmarks/learn_aerial.py --out FOLDER [--presets quick default] [--fits lstm pcfg grammar-vae mmd]
+
+The target's images are drawn by the model's own target program with its own sprites, as in the paper: well spaced cars,
+nine on the first road and three on the others, in the mean. Each seed has a target of its own, and fits see the folder
+alone. Printed is the total variation of 20,000 learnt structures from the distributions that the target was drawn from,
+the mean numbers of cars, and log q of 5,000 structures that no image shows, in nats a scene: its bound is the target's
+own log p. The fits of one preset and seed share their feature network, which depends on nothing else.
+"""
+
+import argparse
+import json
+import math
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from probscene.app.files import write_json
+from probscene.app.fit import create, fit
+from probscene.app.generate import generate_scenes
+from probscene.app.run import Run
+from probscene.derive import derive_complete
+from probscene.inference.metrics import total_variation
+from probscene.inference.presets import DEFAULT, QUICK, Preset
+from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
+from probscene.policy import Policy
+from probscene.relations import per_parent
+from probscene.sampling import seed_everything
+
+PRESETS = {"quick": QUICK, "default": DEFAULT}
+FITS = ("lstm", "pcfg", "grammar-vae", "mmd", "witness", "js")
+COLUMNS = ("roads", "first", "others", "mean_first", "mean_others", "log_q")
+
+
+def chosen(preset: str, fit: str) -> Preset:
+    """The preset with another guide or objective."""
+    base = PRESETS[preset]
+    if fit in ("lstm", "pcfg", "grammar-vae"):
+        return base.guided(fit)
+    return base.toward(fit)
+
+
+def poisson(mean: float) -> np.ndarray:
+    """Cars on a road of the target, cut at 20."""
+    p = np.array([mean**n / math.factorial(n) for n in range(21)])
+    return p / p.sum()
+
+
+def judged(policy: Policy) -> dict[str, float]:
+    """How far a policy's structures are from the target's."""
+    seed_everything(99)
+    derivation, _ = derive_complete(GRAMMAR, policy, 20_000, MODEL.max_steps)
+    found = per_parent(derivation, GRAMMAR.kind("road"), GRAMMAR.kind("car"))
+    first, others = found.count[found.rank == 0], found.count[found.rank > 0]
+    roads = derivation.counts(len(GRAMMAR.kinds))[:, GRAMMAR.kind("road")]
+    held_out, _ = derive_complete(GRAMMAR, TARGET, 5_000, MODEL.max_steps)
+    with torch.no_grad():
+        log_q = policy.log_prob(held_out).mean().item()
+
+    def apart(counts, truth):
+        return total_variation(np.bincount(counts.numpy()) / len(counts), truth)
+
+    return {
+        "roads": apart(roads, np.array([0, 0.05, 0.15, 0.4, 0.4])),
+        "first": apart(first, poisson(9)),
+        "others": apart(others, poisson(3)),
+        "mean_first": first.double().mean().item(),
+        "mean_others": others.double().mean().item(),
+        "log_q": log_q,
+    }
+
+
+def fit_images(preset: str, name: str, seed: int, out: Path) -> tuple[Policy, dict[str, float]]:
+    """A fit from images, resumed if it was begun."""
+    path, shared = out / f"{preset}-{name}-{seed}", out / f"features-{preset}-{seed}"
+    if (path / "run.json").exists():
+        run = Run.open(path)
+    else:
+        run = create("aerial2d", out / f"target-{seed}" / "images", path, chosen(preset, name), seed)
+    took, last = {}, [None, time.monotonic()]
+
+    def progress(stage, done, total, note):
+        if stage != last[0]:
+            last[:] = [stage, time.monotonic()]
+        took[stage] = time.monotonic() - last[1]
+
+    kept = ("features.safetensors", "real.safetensors")
+    if shared.is_dir() and not (path / kept[0]).exists():
+        for file in kept:
+            shutil.copyfile(shared / file, path / file)
+    guide = fit(run, progress)
+    if not shared.is_dir():
+        aside = shared.with_suffix(".part")
+        aside.mkdir(exist_ok=True)
+        for file in kept:
+            shutil.copyfile(path / file, aside / file)
+        aside.rename(shared)
+    return guide, took
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
+    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
+    parser.add_argument("--fits", nargs="+", choices=FITS, default=list(FITS[:4]))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--images", type=int, default=5000)
+    args = parser.parse_args()
+    rows = [{"fit": "prior", **judged(MODEL.prior)}, {"fit": "target", **judged(TARGET)}]
+    for seed in args.seeds:
+        target = MODEL.target(0)
+        images = args.out / f"target-{seed}"
+        generate_scenes(target, target.prior, args.images, images, seed=1000 + seed, format="images")
+        for preset in args.presets:
+            for name in args.fits:
+                guide, took = fit_images(preset, name, seed, args.out)
+                rows.append({"preset": preset, "fit": name, "seed": seed, **judged(guide), "seconds": took})
+                print(json.dumps(rows[-1]), flush=True)
+                write_json(args.out / "results.json", rows)
+    print(f"\n{'':20}" + "".join(f"{column:>22}" for column in COLUMNS))
+    for preset, name in [("", "prior"), ("", "target"), *((p, f) for p in args.presets for f in args.fits)]:
+        mine = [row for row in rows if (row.get("preset", ""), row["fit"]) == (preset, name)]
+        cells = []
+        for column in COLUMNS:
+            each = [row[column] for row in mine]
+            cells.append(f"{np.mean(each):7.3f} {min(each):6.3f}..{max(each):6.3f}")
+        print(f"{preset:8}{name:12}" + "".join(f"{cell:>22}" for cell in cells))
+
+
+if __name__ == "__main__":
+    main()
