@@ -26,11 +26,11 @@ class Likeness(NamedTuple):
 
     Attributes:
         like: ``(N,)`` whether the ball of an image holds one of the set.
-        excess: ``(N,)`` distance to the nearest of the set over the ball's radius; above 1 where not ``like``.
+        nearest: ``(N,)`` distance to the nearest of the set.
     """
 
     like: Mask
-    excess: Features
+    nearest: Features
 
 
 class Fidelity(NamedTuple):
@@ -55,9 +55,7 @@ def likeness(images: Features, others: Features, k: int = NEIGHBOURS, resolution
     k = max(k, round(k * len(images) / len(others)))
     radius = radii(images, k, resolution)
     nearest = cdist(images, others).min(1)
-    # Duplicates on both sides: a ball of radius 0 holds what is at distance 0.
-    excess = np.where(radius > 0, nearest / np.where(radius > 0, radius, 1.0), np.where(nearest > 0, np.inf, 0.0))
-    return Likeness(nearest <= radius, excess)
+    return Likeness(nearest <= radius, nearest)
 
 
 def unlike_floor(

@@ -134,7 +134,7 @@ def trust(
     to_real = likeness(generated, some, resolution=resolution)
     floor = unlike_floor(some, resolution=resolution, seed=seed)
     nowhere = ~to_generated.like if to_prior is None else ~to_generated.like & ~to_prior.like
-    excess = to_generated.excess if to_prior is None else np.minimum(to_generated.excess, to_prior.excess)
+    nearest = to_generated.nearest if to_prior is None else np.minimum(to_generated.nearest, to_prior.nearest)
     found = modes(generated, whole, before, seed)
     if looks is None:
         strangers = foreign(some, generated if before is None else np.concatenate([before, generated])[:EXAMINED])
@@ -147,9 +147,9 @@ def trust(
         names=names,
         from_prior=from_prior,
         p_value=permutation_p(generated, whole, seed=seed),
-        unlike=_measured(~to_generated.like, to_generated.excess, floor, which),
-        outside=_measured(nowhere, excess, floor, which),
-        strange=_measured(~to_real.like, to_real.excess, floor, np.arange(len(generated))),
+        unlike=_measured(~to_generated.like, to_generated.nearest, floor, which),
+        outside=_measured(nowhere, nearest, floor, which),
+        strange=_measured(~to_real.like, to_real.nearest, floor, np.arange(len(generated))),
         modes=found,
         foreign=float(strangers.mean()),
         by_appearance=looks is not None,
@@ -190,9 +190,9 @@ def _scenes(features: ArrayLike, width: int, what: str) -> Features:
     return features
 
 
-def _measured(unlike: Mask, excess: Features, floor: float, index: NDArray[np.int64]) -> Gap:
+def _measured(unlike: Mask, nearest: Features, floor: float, index: NDArray[np.int64]) -> Gap:
     low, high = interval(np.array([unlike.sum()]), len(unlike), 0.95)
-    worst = index[np.argsort(-excess, kind="stable")[:SHOWN]]
+    worst = index[np.argsort(-nearest, kind="stable")[:SHOWN]]
     return Gap(float(unlike.mean()), float(low[0]), float(high[0]), floor, worst)
 
 

@@ -65,7 +65,7 @@ class Gap(NamedTuple):
         share: of the images that were examined.
         low, high: its binomial limits, 95 %.
         floor: the largest such share between two halves of the real images.
-        worst: indices of some images, those least like the other side first, whether or not they count.
+        worst: indices of some images, those farthest from the other side first, whether or not they count.
     """
 
     share: float
