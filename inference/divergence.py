@@ -7,16 +7,20 @@ both sides, differentiating through the estimate of log q has a minimiser other 
 References:
     [1] Devaranjan, Kar, Fidler, *Meta-Sim2*, ECCV 2020, section 3.3: the kernel density log ratio.
     [2] Gretton et al., *A Kernel Two-Sample Test*, JMLR 2012: MMD and its witness function.
+    [3] Nowozin, Cseke, Tomioka, *f-GAN*, NeurIPS 2016, table 1: divergences as functions of the density ratio.
 """
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from probscene.errors import ProbsceneError
+
+BLOCK = 2**18  # kernels in memory at once
 
 
 class Divergence(Protocol):
@@ -34,12 +38,10 @@ def gaussian_kde(points: Tensor, data: Tensor, variance: float, leave_one_out: b
         variance: of the isotropic kernel, H = variance * I.
         leave_one_out: ``points`` are the first N of ``data``, and each is left out of its own estimate.
     """
-    L, D = data.shape
-    log_kernel = -0.5 / variance * _squared_distances(points, data)
-    if leave_one_out:
-        log_kernel.fill_diagonal_(-math.inf)
-        L -= 1
-    return torch.logsumexp(log_kernel, 1) - math.log(L) - 0.5 * D * math.log(2 * math.pi * variance)
+    points, data = _centred(points.unsqueeze(0), data.unsqueeze(0))
+    normal = 0.5 * data.shape[-1] * math.log(2 * math.pi * variance)
+    own = -0.5 / variance * points.square().sum(-1)
+    return (_log_sums(points, data, variance, leave_one_out) + own - normal)[0]
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,10 @@ class KDELogRatio:
     that stay sharp where the joint one has to be smooth: a sum of reverse KLs, zero where the distributions agree. On
     Multi-MNIST, true counts as features and two targets, 60 batches came to 0.4 of the distance that 100 came to
     without them (not in the paper).
+
+    The density of the smaller sample comes out too low where it is thin, so that with ten times as many real as
+    generated scenes a list with a long tail comes out longer than the target's: a geometric one of mean 3.05 came to
+    3.8, and to 2.9 with as many real as generated ones.
 
     Args:
         variance: of the joint kernel, in squared feature units; None is the paper's ``H = d I``, the feature dimension.
@@ -67,15 +73,36 @@ class KDELogRatio:
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
         _check(generated, real)
-        cost = self._log_ratio(generated, real, float(generated.shape[1]) if self.variance is None else self.variance)
+        variance = float(generated.shape[1]) if self.variance is None else self.variance
+        cost = self.of_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
         if self.marginal_variance is not None and generated.shape[1] > 1:
-            for q, p in zip(generated.split(1, 1), real.split(1, 1), strict=True):
-                cost = cost + self._log_ratio(q, p, self.marginal_variance)
+            single = (
+                features.T.contiguous().unsqueeze(-1) for features in (generated, real)
+            )  # (D, N, 1) and (D, L, 1)
+            cost = cost + self.of_ratio(self._log_ratios(*single, self.marginal_variance)).sum(0)
         return cost
 
-    def _log_ratio(self, generated: Tensor, real: Tensor, variance: float) -> Tensor:
-        log_q = gaussian_kde(generated, generated, variance, self.leave_one_out)
-        return log_q - gaussian_kde(generated, real, variance)
+    def of_ratio(self, log_ratio: Tensor) -> Tensor:
+        """The cost where the log ratio is ``log_ratio``; of the same shape."""
+        return log_ratio
+
+    def _log_ratios(self, generated: Tensor, real: Tensor, variance: float) -> Tensor:
+        generated, real = _centred(generated, real)
+        log_q = _log_sums(generated, generated, variance, self.leave_one_out)
+        return log_q - _log_sums(generated, real, variance)
+
+
+@dataclass(frozen=True)
+class JensenShannon(KDELogRatio):
+    """``log q~ / ((p~ + q~) / 2)`` from the densities of ``KDELogRatio``, joint and marginal.
+
+    It is the derivative by q of twice the Jensen-Shannon divergence [3], where the log ratio is that of the reverse KL;
+    it never exceeds log 2, so no scene is punished without bound for being where no real one is (not in [1]).
+    """
+
+    def of_ratio(self, log_ratio: Tensor) -> Tensor:
+        """``log 2 - log(1 + p~/q~)``."""
+        return math.log(2) - torch.nn.functional.softplus(-log_ratio)
 
 
 @dataclass(frozen=True)
@@ -107,6 +134,45 @@ class MMD:
         return (discrepancy + real_term.sum() / max(1, len(some) * (len(some) - 1))).expand(N)
 
 
+def _centred(points: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:
+    """Features ``(B, N, d)`` and ``(B, L, d)`` less the mean of ``data``: far from the origin they lose precision."""
+    centre = data.mean(1, keepdim=True)
+    return points - centre, data - centre
+
+
+@torch.no_grad()
+def _log_sums(points: Tensor, data: Tensor, variance: float, leave_one_out: bool = False) -> Tensor:
+    """Logarithms of B mean kernels at once, ``(B, N)``, but for the factor that depends on the point alone:
+    ``log mean_j exp((x y_j - y_j^2 / 2) / variance)`` for ``points`` x ``(B, N, d)`` and ``data`` y ``(B, L, d)``.
+
+    Log-softmax is the fastest pass that sums exponentials, and the sum is what it took from any one of them: from that
+    of the datum nearest the origin, the least rounded. Blocks are written over one another, as fresh memory is slow.
+    """
+    (B, N, d), L = points.shape, data.shape[1]
+    bias, kernels = -0.5 / variance * torch.linalg.vector_norm(data, dim=-1).square(), data.mT
+    nearest = bias.topk(min(2, L), 1).indices
+    pivot = nearest[:, :1].expand(B, N)
+    if leave_one_out:
+        pivot = pivot.where(pivot != torch.arange(N), nearest[:, 1:])
+    fill = partial(torch.addcmul, value=1 / variance) if d == 1 else partial(torch.baddbmm, alpha=1 / variance)
+    rows, samples = min(N, max(1, BLOCK // L)), min(B, max(1, BLOCK // (N * L)))
+    memory = points.new_empty(samples * rows * L)
+    found = torch.empty_like(points[..., 0])
+    for b in range(0, B, samples):
+        for i in range(0, N, rows):
+            block = slice(b, b + samples), slice(i, i + rows)
+            some = points[block]
+            x = memory[: some.shape[0] * some.shape[1] * L].view(*some.shape[:2], L)
+            fill(bias[block[0]].unsqueeze(1), some, kernels[block[0]], out=x)
+            if leave_one_out:
+                x.diagonal(i, 1, 2).fill_(-math.inf)
+            at = pivot[block].unsqueeze(-1)
+            log_kernel = x.gather(-1, at)
+            log_share = torch.log_softmax(x, -1, out=x).gather(-1, at)
+            found[block] = (log_kernel - log_share).squeeze(-1)
+    return found.sub_(math.log(L - 1 if leave_one_out else L))
+
+
 def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
     """``(N, L)``; centred first, so that features far from the origin lose no precision."""
     centre = b.mean(0)
@@ -124,5 +190,5 @@ def _check(generated: Tensor, real: Tensor) -> None:
         raise ProbsceneError(
             f"Expected at least 2 generated and 1 real scene, actual {len(generated)} and {len(real)}."
         )
-    if not (torch.isfinite(generated).all() and torch.isfinite(real).all()):
+    if not torch.isfinite(generated.sum() + real.sum()):  # NaN and infinity stay in a sum
         raise ProbsceneError("Expected finite features, actual NaN or infinity; lower the learning rate.")

@@ -5,10 +5,10 @@ from typing import Any
 
 from probscene.errors import ProbsceneError
 from probscene.inference.count_training import CountSchedule
-from probscene.inference.divergence import MMD, Divergence, KDELogRatio
+from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
 from probscene.inference.guide import GUIDES
 
-OBJECTIVES = ("kde", "mmd")
+OBJECTIVES = ("kde", "js", "witness", "mmd")
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,9 @@ class Preset:
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
         guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``.
-        objective: ``"kde"`` or ``"mmd"``, a shared reward.
-        variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first two also of ``MMD``.
+        objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
+            value for each scene; ``"mmd"``, MMD as a reward that all scenes share.
+        variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first one also of ``MMD``.
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Learner`` and ``ScoreFunction``.
         candidates: drawings of each structure, of which the clearest is looked at.
@@ -66,15 +67,16 @@ class Preset:
     def toward(self, objective: str) -> "Preset":
         """This preset with another objective.
 
-        MMD is one score for all scenes: the others' mean as a baseline would cancel it, and several clipped steps away
-        from everything that was drawn move the guide to what was not, derivations that do not end.
+        All that give each scene a cost of its own learn with this preset's steps. Shared MMD is one score for all
+        scenes: the others' mean as a baseline would cancel it, and several clipped steps away from everything that was
+        drawn move the guide to what was not, derivations that do not end.
 
         Raises:
             ProbsceneError: an unknown objective.
         """
         if objective not in OBJECTIVES:
             raise ProbsceneError(f"Expected an objective among {', '.join(OBJECTIVES)}, actual {objective!r}.")
-        if objective == self.objective or objective == "kde":
+        if objective == self.objective or objective != "mmd":
             return replace(self, objective=objective)
         rate = min(self.learning_rate, 1e-3)
         return replace(self, objective=objective, baseline="moving_average", updates=1, learning_rate=rate)
@@ -101,9 +103,10 @@ class Preset:
 
     def divergence(self) -> Divergence:
         """The objective's divergence."""
-        if self.objective == "mmd":
-            return MMD(self.variance, shared=True)
-        return KDELogRatio(self.variance, self.marginal_variance, self.leave_one_out)
+        if self.objective in ("mmd", "witness"):
+            return MMD(self.variance, shared=self.objective == "mmd")
+        ratio = JensenShannon if self.objective == "js" else KDELogRatio
+        return ratio(self.variance, self.marginal_variance, self.leave_one_out)
 
 
 QUICK = Preset()

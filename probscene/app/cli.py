@@ -79,7 +79,7 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, ma
 Model = Annotated[str, typer.Argument(metavar="MODEL", help="A built-in model (multi_mnist) or a path to a .py file.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same result.")]
 PresetName = StrEnum("PresetName", ["quick", "default", "paper"])
-Objective = StrEnum("Objective", ["kde", "mmd"])
+Objective = StrEnum("Objective", ["kde", "js", "witness", "mmd"])
 GuideName = StrEnum("GuideName", {"lstm": "lstm", "pcfg": "pcfg", "grammar_vae": "grammar-vae"})
 
 

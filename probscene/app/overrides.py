@@ -14,7 +14,7 @@ CHOICES = {
     "features": ("count", "presence"),
     "objective": OBJECTIVES,
     "baseline": BASELINES,
-    "guide": tuple(GUIDES),
+    "guide": GUIDES,
 }
 LEAST = {"num_scenes": 2}
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate")

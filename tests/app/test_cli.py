@@ -292,7 +292,7 @@ def test_what_typer_refuses_exits_with_2(call, discs, tmp_path):
      ("count=3", "count.steps"), ("count.speed=1", "of count among steps"), ("batches.x=1", "batches=..."),
      ("cosine=5", "cosine=<bool>"), ("count.steps=1.5", "count.steps=<int>"), ("num_scenes=1", "at least 2"),
      ("batches=0", "at least 1"), ("learning_rate=0", "above 0"), ("count.whole=-1", "at least 0"),
-     ("variance=nan", "above 0"), ("objective=kl", "kde, mmd"), ("guide=hmm", "lstm, pcfg"),
+     ("variance=nan", "above 0"), ("objective=kl", "kde, js"), ("guide=hmm", "lstm, pcfg"),
      ("num_scenes=none", "num_scenes=<int>")],
 )  # fmt: skip
 def test_wrong_settings(setting, part, call, discs, target, tmp_path):

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from scipy.stats import gaussian_kde as scipy_kde
 
 from probscene.errors import ProbsceneError
-from probscene.inference.divergence import MMD, KDELogRatio, gaussian_kde
+from probscene.inference import divergence as module
+from probscene.inference.divergence import MMD, JensenShannon, KDELogRatio, gaussian_kde
 from probscene.inference.guide import LSTMGuide
 
 
@@ -55,6 +56,43 @@ def test_marginals_add_the_log_ratio_of_each_feature():
     assert torch.allclose(KDELogRatio(1.0, 0.2)(generated, real), joint + single, atol=1e-5)
 
 
+@given(
+    st.integers(1, 5), st.integers(2, 30), st.integers(1, 40), st.booleans(), st.sampled_from([0.0, 300.0]),
+    st.sampled_from([3, 40, 10**6]), st.integers(0, 2**31),
+)  # fmt: skip
+def test_the_ratio_is_that_of_plain_sums_in_blocks_of_any_size(D, N, L, leave_one_out, away, block, seed):
+    """Also of features far from the origin and of a generated batch far from the real one."""
+    generator = torch.Generator().manual_seed(seed)
+    generated, real = torch.randn(N, D, generator=generator) + away, torch.randn(L, D, generator=generator)
+    generated[::7] += 60.0  # some so far away that a kernel there is no float
+
+    def log_density(data, variance, leave_one_out):
+        x, y = generated.double(), data.double()
+        log_kernel = -0.5 / variance * (x.unsqueeze(1) - y).square().sum(-1)
+        if leave_one_out:
+            log_kernel.fill_diagonal_(-torch.inf)
+        return log_kernel.logsumexp(1) - np.log(len(data) - leave_one_out)
+
+    expected = log_density(generated, 0.7, leave_one_out) - log_density(real, 0.7, False)
+    before, module.BLOCK = module.BLOCK, block
+    try:
+        found = KDELogRatio(0.7, None, leave_one_out)(generated, real)
+        bounded = JensenShannon(0.7, None, leave_one_out)(generated.double(), real.double())
+    finally:
+        module.BLOCK = before
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=3e-5 * (1 + 60 + away) ** 2)
+    # log q / ((p + q) / 2), of densities and not of their logarithms' ratio
+    middle = torch.logaddexp(expected, torch.zeros_like(expected)) - np.log(2)
+    torch.testing.assert_close(bounded, expected - middle, rtol=1e-6, atol=1e-6)
+    assert (bounded <= np.log(2) + 1e-9).all()
+
+
+@pytest.mark.parametrize("ratio", [KDELogRatio, JensenShannon])
+def test_a_cost_carries_no_gradient(ratio):
+    generated = torch.randn(6, 3, requires_grad=True)
+    assert not ratio()(generated, torch.randn(5, 3)).requires_grad
+
+
 @pytest.mark.parametrize("divergence", [KDELogRatio(), MMD(shared=False)])
 def test_equal_samples_cost_nothing_on_average(divergence):
     """With as many real as generated scenes and the self term left out, no side is favoured (exchangeability)."""
@@ -94,6 +132,20 @@ def test_the_witness_is_the_gradient_of_mmd(small):
         assert torch.allclose(a, b, atol=1e-6)
 
 
+def test_the_bounded_cost_is_the_gradient_of_jensen_shannon(small):
+    """sum_T q(T) cost(T) grad log q(T) = 2 grad JS(p, q), exactly, on an enumerable grammar."""
+    guide = LSTMGuide(small.grammar, 4, hidden=8)
+    log_q = guide.log_prob(small.derivations)
+    q, p = log_q.exp(), small.target
+    log_m = ((p + q) / 2).log()
+    divergence = ((q * (log_q - log_m)).sum() + (p * (p.log() - log_m)).sum()) / 2
+    exact = torch.autograd.grad(divergence, guide.parameters(), retain_graph=True)
+    cost = JensenShannon().of_ratio(log_q - p.log()).detach()
+    score = torch.autograd.grad((q.detach() * cost * log_q).sum(), guide.parameters())
+    for a, b in zip(exact, score, strict=True):
+        assert torch.allclose(2 * a, b, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("generated", "real", "says"),
     [
@@ -104,6 +156,6 @@ def test_the_witness_is_the_gradient_of_mmd(small):
     ],
 )
 def test_bad_features_are_named(generated, real, says):
-    for divergence in (KDELogRatio(), MMD()):
+    for divergence in (KDELogRatio(), JensenShannon(), MMD()):
         with pytest.raises(ProbsceneError, match=says):
             divergence(generated, real)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from probscene.errors import ProbsceneError
-from probscene.inference.divergence import MMD, KDELogRatio
+from probscene.inference.divergence import MMD, JensenShannon, KDELogRatio
 from probscene.inference.guide import LSTMGuide
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.presets import PRESETS, QUICK, Preset, preset
@@ -36,6 +36,26 @@ def test_a_shared_reward_keeps_a_gradient(small):
     for _ in range(2):
         loss(small.program, LSTMGuide(small.grammar, 4, hidden=8), 50, real=small.features[:1] + torch.randn(30, 1))
     assert loss.batch.advantage.abs().min() > 0
+
+
+def test_objectives_and_their_settings():
+    for name, expected in {
+        "kde": KDELogRatio(1.0, 0.1), "js": JensenShannon(1.0, 0.1), "witness": MMD(1.0, shared=False), "mmd": MMD(1.0)
+    }.items():  # fmt: skip
+        chosen = QUICK.toward(name)
+        assert (chosen.objective, chosen.divergence()) == (name, expected)
+        assert (chosen.updates == QUICK.updates) == (chosen.baseline == QUICK.baseline) == (name != "mmd")
+
+
+def test_guides_and_their_settings():
+    assert QUICK.guided("lstm") == QUICK
+    for kind in ("pcfg", "grammar-vae"):
+        chosen = PRESETS["paper"].guided(kind)
+        assert chosen.guide_settings()["kind"] == kind
+        assert chosen.learning_rate == PRESETS["paper"].learning_rate
+    assert chosen.guide_settings() == {"kind": "grammar-vae", "hidden": 100, "num_latents": 32}
+    with pytest.raises(ProbsceneError, match="lstm, pcfg, grammar-vae, actual 'hmm'"):
+        QUICK.guided("hmm")
 
 
 def test_unknown_names_are_refused():
