@@ -103,10 +103,11 @@ class CountTraining:
                 rows = slice(i * s.images, (i + 1) * s.images)
                 total += self._step(Examples(*(x[rows] for x in drawn)))
                 self.done += 1
-            if not math.isfinite(total):
+            if not math.isfinite(total) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
                 raise ProbsceneError(
-                    f"Expected a finite loss of the count network, actual {total} at step {self.done}; try a lower "
-                    "learning rate."
+                    f"Expected a finite loss of the count network, actual {total} at step {self.done}; begin again "
+                    f"with lower rates, such as count.muon_rate={s.muon_rate / 4:g} and "
+                    f"count.learning_rate={s.learning_rate / 4:g}."
                 )
             if each is not None:
                 each(self, total / steps)

@@ -69,14 +69,19 @@ class Learner:
                     factor = 0.5 * (1 + math.cos(math.pi * progress)) if self.cosine else 1.0
                     group["lr"] = self.learning_rate * factor
                 self.optimiser.zero_grad()
-                loss = self.objective(self.model, self.guide, self.num_scenes, real=real)
+                try:
+                    loss = self.objective(self.model, self.guide, self.num_scenes, real=real)
+                except ProbsceneError as error:
+                    self.guide.load_state_dict(before)
+                    raise type(error)(f"At batch {self.done + 1} of {self.batches}: {error}") from error
                 loss.backward()
                 self.optimiser.step()
             if not all(torch.isfinite(p).all() for p in self.guide.parameters()):
                 self.guide.load_state_dict(before)
                 raise ProbsceneError(
-                    f"Expected finite parameters, actual NaN or infinity at batch {self.done}; the guide is as it was "
-                    "before it. Try a lower learning rate or a larger bandwidth."
+                    f"At batch {self.done + 1} of {self.batches}: Expected finite parameters, actual NaN or infinity; "
+                    "the guide is as it was before it. Begin again with a lower rate, such as "
+                    f"learning_rate={self.learning_rate / 4:g}, or a larger variance."
                 )
             self.done += 1
             if each is not None:

@@ -5,12 +5,14 @@ layers; binary presences under sigmoid cross-entropy. The features are the avera
 connected layers. Widths are not given in the paper and are arguments here; grey images are copied to three channels.
 """
 
+import math
 from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.errors import ProbsceneError
 from probscene.inference.features import Draw, Examples
 from probscene.inference.resume import batch_seed, restore_training, training_state
 from probscene.sampling import seed_everything
@@ -97,7 +99,11 @@ class PresenceTraining:
         self.done, self.reached = 0, 0.0
 
     def run(self, each: Callable[["PresenceTraining", float], None] | None = None) -> None:
-        """Take the epochs that are left; ``each`` sees the training and the mean loss after every one."""
+        """Take the epochs that are left; ``each`` sees the training and the mean loss after every one.
+
+        Raises:
+            ProbsceneError: the loss, or a parameter, is no longer finite.
+        """
         seed_everything(batch_seed(self.seed, 0))
         classes = self.net.out.out_features
         image, present = None, torch.zeros(self.images, classes)
@@ -120,6 +126,11 @@ class PresenceTraining:
                 total += loss.item() * len(rows)
                 right += ((logits > 0) == (present[rows] > 0)).float().mean().item() * len(rows)
             self.done += 1
+            if not math.isfinite(total) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
+                raise ProbsceneError(
+                    f"Expected a finite loss of the presence network, actual {total} in epoch {self.done}; begin again "
+                    "with features=count."
+                )
             self.reached = right / len(image)
             if each is not None:
                 each(self, total / len(image))

@@ -1,5 +1,6 @@
 """Maximum-likelihood pretraining of a guide on derivations of the prior (Meta-Sim2, section 3.3: "essential")."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -7,6 +8,7 @@ from torch import nn
 
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
+from probscene.errors import ProbsceneError
 from probscene.policy import Policy
 
 
@@ -29,6 +31,9 @@ def pretrain(
 
     Returns:
         The last epoch's mean negative log-likelihood, nats a scene.
+
+    Raises:
+        ProbsceneError: it, or a parameter, is no longer finite.
     """
     data, _ = derive_complete(guide.grammar, prior, num_derivations, guide.max_steps)
     optimiser = torch.optim.Adam(guide.parameters(), lr=learning_rate)
@@ -42,6 +47,11 @@ def pretrain(
             optimiser.step()
             total += nll.item() * len(rows)
         loss = total / num_derivations
+        if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in guide.parameters()):
+            raise ProbsceneError(
+                f"Expected a finite likelihood in pretraining, actual {loss} in epoch {epoch + 1}; begin again with a "
+                f"lower rate, such as pretrain_rate={learning_rate / 10:g}."
+            )
         if progress is not None:
             progress(epoch, loss)
     return loss

@@ -43,6 +43,7 @@ class ImageFolder:
     Attributes:
         paths: the L files.
         resized: how many of them are of another size.
+        distinct: how many of them are left without those that equal another one in every pixel.
         bad: the files left out, each with the fault.
         notes: what a person should know, one sentence each.
         fingerprint: SHA-256, hexadecimal, of the names, the bytes of the files, the canvas and the channels: equal
@@ -65,11 +66,13 @@ class ImageFolder:
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths: list[Path] = []
         self.bad: dict[Path, str] = {}
-        sizes = Counter()
+        sizes, pictures = Counter(), set()
         for i, file in enumerate(files):
             try:
                 data = _read(file)
-                sizes[_decoded(data, self.canvas, channels)[1]] += 1
+                picture, size = _decoded(data, self.canvas, channels)
+                sizes[size] += 1
+                pictures.add(hashlib.blake2b(picture, digest_size=16).digest())
             except _Bad as fault:
                 self.bad[file] = str(fault)
             else:
@@ -79,6 +82,7 @@ class ImageFolder:
                 progress(i + 1, len(files))
         self._judge(skip_bad)
         self.fingerprint = digest.hexdigest()
+        self.distinct = len(pictures)
         sizes.pop(self.canvas, None)
         self.resized = sizes.total()
         self.notes = self._notes(sizes, others)

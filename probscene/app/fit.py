@@ -22,7 +22,7 @@ from probscene.app.run import Run
 from probscene.batch import RenderBatch
 from probscene.dataset import ImageFolder, grey
 from probscene.derivation import Derivation
-from probscene.errors import RunError
+from probscene.errors import DataError, RunError
 from probscene.inference.count_net import CountNet
 from probscene.inference.count_training import CountTraining
 from probscene.inference.features import Examples, FeatureNet, class_table, embed_all, examples
@@ -34,6 +34,7 @@ from probscene.inference.presence_net import PresenceNet, PresenceTraining
 from probscene.inference.presets import Preset
 from probscene.inference.pretrain import pretrain
 from probscene.inference.resume import batch_seed
+from probscene.inference.two_sample import NEEDED, check_features
 from probscene.model import SceneModel
 from probscene.sampling import Scenes, realise, sample, seed_everything
 
@@ -76,7 +77,7 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
         target: the run's target images, where they are open already.
 
     Raises:
-        DataError: the target folder cannot be used.
+        DataError: the target folder cannot be used: see ``check_target`` and ``check_features``.
         RunError: it is not the one that the run was begun with.
         ProbsceneError: something in the fit is no longer finite; the last checkpoint stays.
     """
@@ -217,10 +218,30 @@ def _real_features(
         done += images
         progress("target", done, len(target), "")
 
+    check_target(target)
     features = embed_all(net, target.batches(RENDERED_AT_ONCE), each)
+    check_features(features)
     fingerprint = torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
     run.save("real", {"features": features, "fingerprint": fingerprint})
     return features
+
+
+def check_target(target: ImageFolder) -> None:
+    """See that a density of features can be estimated from the images.
+
+    Raises:
+        DataError: too few, or all the same.
+    """
+    if len(target) < NEEDED:
+        raise DataError(
+            f"Expected at least {NEEDED} images in {target.path}, from which the distribution of their features is "
+            f"estimated, actual {len(target)}; add images."
+        )
+    if target.distinct == 1:
+        raise DataError(
+            f"Expected images that differ in {target.path}, actual {len(target)} that are all the same; a distribution "
+            "cannot be learnt from one image."
+        )
 
 
 def open_target(run: Run, progress: Progress) -> ImageFolder:

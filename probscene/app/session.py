@@ -47,6 +47,7 @@ def begin(
     Run.check_free(out)
     loaded = checked_model(model)
     images = open_images(target, loaded, skip_bad, show)
+    fit.check_target(images)
     return fit.create(model, target, out, preset, seed, skip_bad, threads), images
 
 

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
+import torch
 from PIL import Image
 
 import probscene
@@ -157,7 +160,7 @@ def test_bad_images(spoil, call, discs, target, fitted, tmp_path):
 
 
 def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, discs, target, tmp_path):
-    folder = copied(target, tmp_path / "images")
+    folder = copied(target, tmp_path / "images", 40)
     spoil_corrupt(folder)
     Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(folder / "small.png")
     words = ["fit", discs.file, "--target", folder, "--out", tmp_path / "run", *discs.settings, "--set", "batches=1"]
@@ -166,7 +169,30 @@ def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, d
     assert result.err.count("000003.png") == 1 and result.err.count("resized to 64x64") == 1
     stages = [line.split(":")[0] for line in result.err.splitlines() if not line.startswith("Note: ")]
     assert stages == ["Target's images", "Feature network", "Target's features", "Pretraining", "Structure"]
-    assert len(Run.open(tmp_path / "run").load("real")["features"]) == 10
+    assert len(Run.open(tmp_path / "run").load("real")["features"]) == 40
+
+
+def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp_path):
+    few, same = copied(target, tmp_path / "few", 39), tmp_path / "same"
+    same.mkdir()
+    for i in range(50):
+        shutil.copy(target.images / "000000.png", same / f"{i}.png")
+    out = tmp_path / "run"
+    check_fault(call("fit", discs.file, "--target", few, "--out", out), 2, "at least 40 images", "actual 39")
+    check_fault(call("fit", discs.file, "--target", same, "--out", out), 2, "images that differ", "50 that are all the")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "where"),
+    [("count.learning_rate=1e38", "at step"), ("pretrain_rate=1e38", "epoch 1"), ("learning_rate=1e38", "At batch 1")],
+)
+def test_what_is_no_longer_finite_stops_with_the_step_and_a_remedy(call, discs, target, tmp_path, setting, where):
+    out = tmp_path / "run"
+    result = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, "--set", setting)
+    check_fault(result, 2, where, "egin again with", "lower rate")
+    for kept in out.glob("*.safetensors"):
+        assert all(torch.isfinite(tensor).all() for tensor in safetensors.torch.load_file(kept).values())
 
 
 # What is wrong with the model.

@@ -10,7 +10,7 @@ from pyro import poutine
 
 from probscene.derivation import Derivation
 from probscene.derive import derive
-from probscene.drawing import Sprites
+from probscene.drawing import Atlas, Sprites, disc
 from probscene.errors import GrammarError, ModelError
 from probscene.grammar import Grammar
 from probscene.policy import Policy
@@ -131,3 +131,22 @@ def test_draw_looks_only_at_its_own_nodes():
         scene.draw(Sprites.disc("bus", x, 1.0, radius=2.0))
     with pytest.raises(ModelError, match="broadcast"):
         scene.draw(Sprites.disc("car", torch.zeros(2, 5), 1.0, radius=2.0))
+
+
+def test_a_layer_draws_fewer_of_its_nodes_where_present_says_so():
+    scene = two_roads()
+    even = torch.arange(6).expand(2, 6) % 2 == 0
+    (layer,) = scene.draw(Sprites.disc(("car", "bus"), 1.0, 1.0, radius=2.0), background=(0, 0, 0)).layers[:1]
+    (fewer,) = scene.draw(Sprites(("car", "bus"), layer.atlas, 0, 1.0, 1.0, present=even)).layers
+    assert torch.equal(fewer.present, layer.present & even)
+
+
+def test_decoration_belongs_to_no_node_and_has_no_label():
+    scene = two_roads()
+    there = torch.tensor([[True, False, True], [False, False, True]])
+    x = torch.tensor([[1.0, torch.nan, 3.0], [torch.nan, torch.nan, 6.0]])
+    (layer,) = scene.draw(Sprites((), Atlas((disc(4),)), 0, x, 2.0, present=there)).layers
+    assert torch.equal(layer.present, there) and not layer.labelled and layer.y.shape == (2, 3)
+    for wrong in (None, there[:1], there.float(), there[0]):
+        with pytest.raises(ModelError, match=r"present, bool \(2 scenes, how many\)"):
+            scene.draw(Sprites((), Atlas((disc(4),)), 0, 1.0, 2.0, present=wrong))
