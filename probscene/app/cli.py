@@ -245,6 +245,47 @@ def report(
 
 
 @app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Finished runs of one model.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write, a PNG.")],
+    target: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="The images to judge by; the runs' own if not given.")
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="counts.csv or provenance.jsonl of the target, for the truth.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
+    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+) -> None:
+    """Draw the prior, several runs and the truth side by side, and print how far each is from the truth."""
+    from rich.console import Console
+
+    from probscene.app import compare, comparison_table, fit, mosaic, session
+    from probscene.app.display import Display
+    from probscene.app.files import make_folder, write_json
+    from probscene.app.labels import read_labels
+
+    opened = compare.open_runs(runs)
+    mosaic.make_place(out)
+    first = next(iter(opened.values()))
+    if json is not None:
+        make_folder(json.parent)
+    with Display() as show:
+        images = None
+        if target is not None:
+            images = session.open_images(target, first.model, first.record["skip_bad"], show)
+        elif labels is not None:
+            images = fit.open_target(first, show)
+        truth = None if labels is None else read_labels(labels, first.model, images)
+        found = compare.compare(opened, images, truth, show, num)
+        mosaic.draw(found, out)
+    comparison_table.show(found, Console(highlight=False))
+    print(f"The picture is {out}")
+    if json is not None:
+        write_json(json, found.record())
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")] = Path("demo"), seed: Seed = 0
 ) -> None:

@@ -58,7 +58,7 @@ def test_help_is_quick_because_it_imports_nothing_heavy():
 
 def test_version_and_help(call):
     assert call("version").out == f"probscene {probscene.__version__}\n"
-    commands = ("check", "preview", "fit", "generate", "evaluate", "report", "demo", "version")
+    commands = ("check", "preview", "fit", "generate", "evaluate", "report", "compare", "demo", "version")
     assert all(f"\n  {command} " in call("--help").out for command in commands)
 
 
