@@ -28,7 +28,8 @@ class Variant(NamedTuple):
 
 
 class Sheet:
-    """Variants of sprites, made when first drawn and kept for the next call.
+    """Variants of sprites, made when first drawn and kept for the next call: ``texels`` has their four channels, one in
+    each 16-bit lane, ``colours`` at the same places the first three as bytes.
 
     A variant is framed by clear texels, so that it fades over one. What touches the edge of its sprite is framed
     by copies of its edge when magnified, for the kernel to cut by coverage. What does not touch the edge is trimmed.
@@ -43,6 +44,7 @@ class Sheet:
         self._variants: list[Variant] = []
         self._used = 0
         self.texels = np.zeros(1 << 16, np.uint64)
+        self.colours = np.zeros(1 << 16, np.uint32)
 
     def trim(self) -> None:
         """Forget everything once it has grown large; to be called between drawings."""
@@ -96,10 +98,11 @@ class Sheet:
         if self._used > _MOST:
             raise ModelError(f"Expected at most {_MOST} texels in one drawing, actual more; draw fewer.")
         if self._used > self.texels.size:
-            grown = np.zeros(min(max(2 * self.texels.size, self._used), _MOST), np.uint64)
-            grown[:offset] = self.texels[:offset]
-            self.texels = grown
+            size = min(max(2 * self.texels.size, self._used), _MOST)
+            self.texels, self.colours = (np.resize(kept, size) for kept in (self.texels, self.colours))
         self.texels[offset : self._used] = words
+        red, green, blue = (words >> np.uint64(16 * lane) & np.uint64(255) for lane in range(3))
+        self.colours[offset : self._used] = red | green << np.uint64(8) | blue << np.uint64(16)
         return offset
 
 

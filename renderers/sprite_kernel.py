@@ -71,13 +71,6 @@ def opaque(texels: ti.template(), base, stride, u, v, red, green, blue):
 
 
 @ti.func
-def plain(texels: ti.template(), at: ti.i32):
-    """A texel's colour in three bytes, red the lowest."""
-    s = texels[at]
-    return ti.cast((s & 0xFF) | ((s >> 8) & 0xFF00) | ((s >> 16) & 0xFF0000), u32)
-
-
-@ti.func
 def on_texels(start: i64, step: i64, other: i64):
     """Whether positions from ``start`` on fall on texels' centres: steps of one texel, or of none."""
     return (start >> 24) & 255 == 0 and step == i64(ONE) and other == 0
@@ -95,8 +88,8 @@ def coverage(real: ti.template(), r, u: i64, v: i64):
 @ti.func
 def paint_sprite(
     k, scene, height, width, nodes,
-    whole: ti.template(), real: ti.template(), texels: ti.template(), image: ti.template(), words: ti.template(),
-    instance: ti.template(), quads: ti.template(), result: ti.template(),
+    whole: ti.template(), real: ti.template(), texels: ti.template(), colours: ti.template(), image: ti.template(),
+    words: ti.template(), instance: ti.template(), quads: ti.template(), result: ti.template(),
 ):  # fmt: skip
     w, r = k * INTEGERS, k * REALS
     x0, y0 = whole[w + X0], whole[w + Y0]
@@ -141,8 +134,7 @@ def paint_sprite(
                         p0, p1, p2, p3 = colour, colour, colour, colour
                         if copied:
                             at = ti.cast(base + (v >> 32) * stride + (u >> 32), ti.i32)
-                            p0, p1 = plain(texels, at), plain(texels, at + 1)
-                            p2, p3 = plain(texels, at + 2), plain(texels, at + 3)
+                            p0, p1, p2, p3 = colours[at], colours[at + 1], colours[at + 2], colours[at + 3]
                         elif not even:
                             p0 = opaque(texels, base, stride, u, v, red, green, blue)
                             p1 = opaque(texels, base, stride, u + du, v + dv, red, green, blue)
@@ -255,6 +247,7 @@ def paint(
     whole: ti.types.ndarray(ti.i64, 1),
     real: ti.types.ndarray(ti.f64, 1),
     texels: ti.types.ndarray(ti.u64, 1),
+    colours: ti.types.ndarray(ti.u32, 1),
     image: ti.types.ndarray(ti.u8, 1),
     words: ti.types.ndarray(ti.u32, 1),
     instance: ti.types.ndarray(ti.i16, 1),
@@ -273,7 +266,7 @@ def paint(
                 for k in range(first[scene], first[scene + 1]):
                     paint_sprite(
                         k, scene, height, width, nodes,
-                        whole, real, texels, image, words, instance, quads, result,
+                        whole, real, texels, colours, image, words, instance, quads, result,
                     )  # fmt: skip
                 for node in range(nodes):
                     t = (scene * nodes + node) * RESULTS

@@ -70,11 +70,11 @@ class SpriteRenderer:
         for start in range(0, scenes, step):
             stop = min(start + step, scenes)
             part = slice(start * height * width, _even(stop * height * width))
-            colours, ids = image[3 * part.start : 3 * part.stop], instance[part]
+            rgb, ids = image[3 * part.start : 3 * part.stop], instance[part]
             kernel.paint(
                 min(self.threads, stop - start), stop - start, height, width, nodes,
                 np.zeros(1, np.int32), first[start : stop + 1].copy(), table.whole, table.real, self._sheet.texels,
-                colours, colours.view(np.uint32), ids, ids.view(np.int64), result[start:stop].reshape(-1),
+                self._sheet.colours, rgb, rgb.view(np.uint32), ids, ids.view(np.int64), result[start:stop].reshape(-1),
             )  # fmt: skip
         return _batch(
             drawing,
