@@ -199,11 +199,13 @@ def evaluate(
         typer.Option(metavar="NET", help="FID and KID by: run, efficientnet or inception=FILE; repeatable."),
     ] = None,
     num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
+    scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
+    some_labels: Annotated[bool, typer.Option("--some-labels", help="Labels need not cover all images.")] = False,
 ) -> None:
-    """Compare prior and learnt structures with the truth, or with what the feature network sees."""
+    """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
     from rich.console import Console
 
-    from probscene.app import session, tables
+    from probscene.app import session, tables, verdict, verdict_text
     from probscene.app.display import Display
     from probscene.app.evaluate import evaluate
     from probscene.app.files import make_folder, write_json
@@ -216,11 +218,15 @@ def evaluate(
         make_folder(json.parent)
     with Display() as show:
         images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
-        truth = None if labels is None else read_labels(labels, opened.model, images)
+        truth = None if labels is None else read_labels(labels, opened.model, images, some_labels)
         found = evaluate(opened, images, truth, show, num, features=features or (), images=num_images)
-    tables.show(found, Console(highlight=False))
+        judged = verdict.judge(opened, images, show, scenes, found) if scenes else None
+    console = Console(highlight=False)
+    if judged is not None:
+        verdict_text.show(judged, console)
+    tables.show(found, console)
     if json is not None:
-        write_json(json, found.record())
+        write_json(json, found.record() | ({} if judged is None else {"trust": judged.record()}))
 
 
 @app.command()
@@ -233,6 +239,7 @@ def report(
         Path | None, typer.Option(metavar="FILE", help="counts.csv or provenance.jsonl of the run's target.")
     ] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+    scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
 ) -> None:
     """Write one self-contained HTML page about a run."""
     from probscene.app.display import Display
@@ -240,7 +247,7 @@ def report(
     from probscene.app.run import Run
 
     with Display() as show:
-        path = report(Run.open(run), show, out, labels, num)
+        path = report(Run.open(run), show, out, labels, num, scenes)
     print(f"The report is {path}")
 
 

@@ -28,6 +28,7 @@ STAGES = {
     "generating": ("Generating", "images"),
     "counting": ("Counting", "scenes"),
     "comparing": ("Comparing", "images"),
+    "judging": ("Judging", "images"),
 }
 """By stage: what it does, and in what it counts."""
 

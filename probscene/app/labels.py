@@ -40,24 +40,27 @@ class Labels(NamedTuple):
     derivation: Derivation | None = None
 
 
-def read_labels(path: Path, model: SceneModel, target: ImageFolder) -> Labels:
+def read_labels(path: Path, model: SceneModel, target: ImageFolder, some: bool = False) -> Labels:
     """The labels of a target's images, from a ``.jsonl`` of provenance or from a CSV of counts.
 
     Rows of files that the target left out as bad are passed over.
+
+    Args:
+        some: there need not be one for every image; those without are left out.
 
     Raises:
         DataError: see ``read_counts``; a line that is none of provenance, or whose rules are not the model's.
     """
     if Path(path).suffix != ".jsonl":
-        return Labels(Structures(read_counts(path, model.classes, target), {}))
-    derivation = _read_derivations(Path(path), model, target)
+        return Labels(Structures(read_counts(path, model.classes, target, some), {}))
+    derivation = _read_derivations(Path(path), model, target, some)
     return Labels(count(model, derivation), derivation)
 
 
-def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder) -> Counts:
+def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder, some: bool = False) -> Counts:
     """The counts ``(L, C)`` of a target's images, in the order of its files.
 
-    Rows of files that the target left out as bad are passed over.
+    Rows of files that the target left out as bad are passed over; with ``some``, so are images without a row.
 
     Raises:
         DataError: no such file, other columns, a row of another length, an image that is not there, twice there or
@@ -73,7 +76,7 @@ def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder) -> Co
         raise DataError(
             f"Expected the columns {','.join(['image', *classes])} in {path}, actual {','.join(header) or 'none'}."
         )
-    named = _Named(path, target)
+    named = _Named(path, target, some)
     for number, fields in enumerate(rows[1:], 2):
         if not fields:
             continue
@@ -107,10 +110,10 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
 
 
 class _Named:
-    """What a file of labels says of a target's images, by name, each exactly once."""
+    """What a file of labels says of a target's images, or of some, by name, each exactly once."""
 
-    def __init__(self, path: Path, target: ImageFolder):
-        self.path, self.target = path, target
+    def __init__(self, path: Path, target: ImageFolder, some: bool):
+        self.path, self.target, self.some = path, target, some
         self.known = {file.name for file in target.paths}
         self.left_out = {file.name for file in target.bad}
         self.found: dict[str, Any] = {}
@@ -128,16 +131,21 @@ class _Named:
     def ordered(self) -> list[Any]:
         """In the order of the target's files."""
         missing = [file.name for file in self.target.paths if file.name not in self.found]
-        if missing:
+        if missing and not (self.some and self.found):
             names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
             raise DataError(
-                f"Expected a row for every image of {self.target.path} in {self.path}, actual none for {names}."
+                f"Expected a row for every image of {self.target.path} in {self.path}, actual none for {names}"
+                f"{'' if self.some else '; if only some are labelled, add --some-labels'}."
             )
-        return [self.found[file.name] for file in self.target.paths]
+        return [self.found[name] for name in self.names()]
+
+    def names(self) -> list[str]:
+        """Of the images that it is about, in the order of the target's files."""
+        return [file.name for file in self.target.paths if file.name in self.found]
 
 
-def _read_derivations(path: Path, model: SceneModel, target: ImageFolder) -> Derivation:
-    named = _Named(path, target)
+def _read_derivations(path: Path, model: SceneModel, target: ImageFolder, some: bool) -> Derivation:
+    named = _Named(path, target, some)
     for number, text in enumerate(_text(path).split("\n"), 1):
         if not text.strip():
             continue
@@ -159,7 +167,7 @@ def _read_derivations(path: Path, model: SceneModel, target: ImageFolder) -> Der
     except GrammarError:
         whole = False
     if not whole:
-        names = (file.name for file, row in zip(target.paths, rules, strict=True) if not _is_whole(model, row))
+        names = (name for name, row in zip(named.names(), rules, strict=True) if not _is_whole(model, row))
         raise DataError(f"Expected structures of model {model.name!r} in {path}, actual another of {next(names)}.")
     return derivation
 

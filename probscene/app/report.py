@@ -11,13 +11,14 @@ from typing import Any
 
 from PIL import Image
 
-from probscene.app import charts, session, tables
+from probscene.app import charts, session, tables, verdict_text
 from probscene.app.display import STAGES, Display
 from probscene.app.evaluate import Evaluation, evaluate
 from probscene.app.files import make_folder, write_text
 from probscene.app.labels import read_labels
 from probscene.app.preview import Pixels, grid, pixels, scenes, shrunk
 from probscene.app.run import Run
+from probscene.app.verdict import SCENES, Judged, judge
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
 
@@ -30,13 +31,21 @@ LEGEND = {
 }
 
 
-def report(run: Run, show: Display, out: Path | None = None, labels: Path | None = None, num: int = 10000) -> Path:
+def report(
+    run: Run,
+    show: Display,
+    out: Path | None = None,
+    labels: Path | None = None,
+    num: int = 10000,
+    judged_by: int = SCENES,
+) -> Path:
     """Write the page.
 
     Args:
         out: ``report.html`` in the run folder where None.
         labels: a ``counts.csv`` or a ``provenance.jsonl`` of the run's target.
         num: structures sampled a source.
+        judged_by: scenes rendered for the verdict, none where 0.
 
     Returns:
         Where it is.
@@ -55,11 +64,18 @@ def report(run: Run, show: Display, out: Path | None = None, labels: Path | None
             raise
         absent = str(error)
     truth = None if labels is None else read_labels(labels, run.model, images)
-    return write(run, evaluate(run, images, truth, show, num), images, out, absent)
+    evaluation = evaluate(run, images, truth, show, num)
+    judged = judge(run, images, show, judged_by, evaluation) if images and judged_by else None
+    return write(run, evaluation, images, out, absent, judged)
 
 
 def write(
-    run: Run, evaluation: Evaluation, images: ImageFolder | None, out: Path | None = None, absent: str = ""
+    run: Run,
+    evaluation: Evaluation,
+    images: ImageFolder | None,
+    out: Path | None = None,
+    absent: str = "",
+    judged: Judged | None = None,
 ) -> Path:
     """``report`` from what is known already; ``absent`` says why there are no target images."""
     out = Path(out) if out is not None else run.path / "report.html"
@@ -74,6 +90,7 @@ def write(
             subtitle=html.escape(
                 f"Run {run.path.resolve()}, {target}, seed {record['seed']}, version {record['version']}"
             ),
+            trust=_trust(judged, images),
             headline=_headline(evaluation),
             samples=_samples(run, images, absent),
             legend="".join(
@@ -92,6 +109,19 @@ def write(
         ),
     )
     return out
+
+
+def _trust(judged: Judged | None, images: ImageFolder | None) -> str:
+    if judged is None or images is None:
+        return "<p>There is no verdict: no scenes were rendered to compare with target images.</p>"
+    if judged.trust is None:
+        return verdict_text.section(judged, "", "")
+    real = [pixels(images.load(i)[None])[0] for i in judged.unlike]
+    return verdict_text.section(
+        judged,
+        _picture(real, f"Target images least like any generated scene: {', '.join(judged.names)}"),
+        _picture(list(judged.strange), "Generated scenes least like any target image"),
+    )
 
 
 def _headline(evaluation: Evaluation) -> str:

@@ -111,7 +111,7 @@ def test_a_network_that_does_not_count_gives_no_estimate(fitted, target):
 
 
 def test_the_command_prints_and_writes_the_same(call, fitted, target, tmp_path):
-    words = ["evaluate", fitted, "--target", target.images, "--num", 500]
+    words = ["evaluate", fitted, "--target", target.images, "--num", 500, "--scenes", 0]  # for those: test_verdict
     labelled = call(*words, "--labels", target.labels, "--json", tmp_path / "new" / "e.json")
     assert labelled.code == 0, labelled.err
     record = json.loads((tmp_path / "new" / "e.json").read_text())
