@@ -57,7 +57,7 @@ class Agreement(NamedTuple):
 
     @property
     def worst(self) -> str:
-        return max(self.each, key=lambda name: self.each[name].seen - self.each[name].high)
+        return max(self.each, key=lambda name: self.each[name].seen / self.each[name].high)
 
     def agrees(self, verdict: Verdict) -> bool:
         """Whether the labels say of the structures what the verdict says of the features."""
@@ -111,7 +111,7 @@ def agreement(learnt: Source, truth: Source, classes: tuple[str, ...], seed: int
     largest = np.max([floor / scale[name] for name, (_, _, floor) in found.items()], 0)
     limit = float(np.quantile(largest, 0.975))
     each = {
-        name: Compared(distance, float(seen.mean()), float(floor.mean()), limit * scale[name])
+        name: Compared(float(distance), float(seen.mean()), float(floor.mean()), limit * scale[name])
         for name, (distance, seen, floor) in found.items()
     }
     return Agreement(each, judged, len(truth.total))

@@ -65,7 +65,7 @@ def test_faults_come_before_any_work(run, images, target, tmp_path):
 
 
 def test_the_command_prints_and_writes_them(call, fitted, target, tmp_path):
-    words = ["evaluate", fitted, "--target", target.images, "--num", 50, "--images", 10]
+    words = ["evaluate", fitted, "--target", target.images, "--num", 50, "--images", 10, "--scenes", 0]
     shown = call(*words, "--features", "run", "--features", "efficientnet", "--json", tmp_path / "e.json")
     assert shown.code == 0, shown.err
     record = json.loads((tmp_path / "e.json").read_text())["images"]

@@ -138,7 +138,7 @@ def test_a_policy_that_derives_none_of_the_structures(plates):
 
 
 def test_the_command_shows_what_depends_on_context(call, plates, found, tmp_path):
-    words = ["evaluate", plates.run.path, "--target", plates.images, "--num", 800]
+    words = ["evaluate", plates.run.path, "--target", plates.images, "--num", 800, "--scenes", 0]
     shown = call(*words, "--labels", plates.lines, "--json", tmp_path / "e.json")
     assert shown.code == 0, shown.err
     assert json.loads((tmp_path / "e.json").read_text()) == json.loads(json.dumps(found.record()))
@@ -151,7 +151,7 @@ def test_the_command_shows_what_depends_on_context(call, plates, found, tmp_path
 
 
 def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
-    shown = call("evaluate", fitted, "--target", target.images, "--labels", target.labels, "--num", 100)
+    shown = call("evaluate", fitted, "--target", target.images, "--labels", target.labels, "--num", 100, "--scenes", 0)
     titles = [line.strip() for line in shown.out.splitlines() if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
         "Distance to the truth", "Distance to what the feature network sees *", "Images by number of objects",
@@ -165,7 +165,7 @@ def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_pat
     assert "log q of the labelled structures" in text and "impossible" in text
     from probscene.app.display import Display
 
-    labelled = report(plates.run, Display(), tmp_path / "s.html", plates.lines, num=200)
+    labelled = report(plates.run, Display(), tmp_path / "s.html", plates.lines, num=200, judged_by=0)
     assert "log q of the labelled structures" in labelled.read_text(encoding="utf-8")
 
 

@@ -47,7 +47,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def text(call, fitted, target) -> str:
-    done = call("report", fitted, "--labels", target.labels, "--num", 300)
+    done = call("report", fitted, "--labels", target.labels, "--num", 300, "--scenes", 0)
     assert done.code == 0 and done.out == f"The report is {fitted / 'report.html'}\n"
     return (fitted / "report.html").read_text(encoding="utf-8")
 
@@ -100,7 +100,7 @@ def test_colours_are_the_pages_own(text):
 
 
 def test_the_same_run_gives_the_same_page(text, call, fitted, target, tmp_path):
-    call("report", fitted, "--labels", target.labels, "--num", 300, "--out", tmp_path / "new" / "r.html")
+    call("report", fitted, "--labels", target.labels, "--num", 300, "--scenes", 0, "--out", tmp_path / "new" / "r.html")
     assert (tmp_path / "new" / "r.html").read_text(encoding="utf-8") == text
 
 
@@ -109,19 +109,19 @@ def test_names_are_escaped_and_a_target_that_is_gone_leaves_a_gap(fitted, target
     shutil.copytree(fitted, folder)
     record = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(record | {"target": str(tmp_path / "<i>gone")}))
-    path = report(Run.open(folder), Display(), num=100)
+    path = report(Run.open(folder), Display(), num=100, judged_by=0)
     page = Page(path.read_text(encoding="utf-8"))
     assert "<i>gone, which is not there" in page.text and "<b>&amp;" in page.text
     assert page.text.count("before learning") == 1 and "Target: some" not in page.text
     with pytest.raises(DataError, match="not there"):
-        report(Run.open(folder), Display(), labels=target.labels, num=100)
+        report(Run.open(folder), Display(), labels=target.labels, num=100, judged_by=0)
 
 
 def test_a_run_without_log_and_times_has_a_report_and_an_unfinished_one_has_none(fitted, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
     for name in ("log.jsonl", "timing.json"):
         (tmp_path / "run" / name).unlink()
-    text = report(Run.open(tmp_path / "run"), Display(), num=100).read_text(encoding="utf-8")
+    text = report(Run.open(tmp_path / "run"), Display(), num=100, judged_by=0).read_text(encoding="utf-8")
     assert "No times were recorded." in text and text.count("<svg") == 2
     (tmp_path / "run" / "report.html").unlink()
     (tmp_path / "run" / "guide.safetensors").unlink()
