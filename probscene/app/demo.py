@@ -24,6 +24,7 @@ from probscene.app.labels import counts_of_dataset, read_labels, write_counts
 from probscene.app.loading import load_model
 from probscene.app.preview import pixels, scenes, side_by_side, write_picture
 from probscene.app.run import Run
+from probscene.app.verdict import judge
 from probscene.dataset import ImageFolder
 from probscene.errors import ModelError
 from probscene.inference.presets import QUICK, Preset
@@ -63,9 +64,10 @@ def demo(
         if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
             _judge(run, opened or session.open_images(target, loaded, False, show), out, show)
     console = Console(highlight=False)
-    measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))["distances"]
-    for table in tables.distances({"truth": measured["truth"]}):
+    measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))
+    for table in tables.distances({"truth": measured["distances"]["truth"]}):
         console.print(table)
+    print(f"\nVerdict without labels: {measured['trust']['verdict']}. {measured['trust']['because']}")
     spent = sum(session.timing(run).values())
     print(f"\nFitting took {spent:.0f} s and saw only {target}. Where to look:")
     for name, what in (
@@ -101,8 +103,9 @@ def _fit(
 def _judge(run: Run, target: ImageFolder, out: Path, show: Display) -> None:
     model = run.model
     found = evaluate(run, target, read_labels(out / "truth.csv", model, target), show)
-    write_json(out / "evaluation.json", found.record())
-    report.write(run, found, target)
+    judged = judge(run, target, show, evaluation=found)
+    write_json(out / "evaluation.json", found.record() | {"trust": judged.record()})
+    report.write(run, found, target, judged=judged)
     pictures = {
         "Prior": pixels(scenes(model, model.prior, SAMPLES, 0).image),
         "Learnt": pixels(scenes(model, run.guide(), SAMPLES, 0).image),

@@ -29,7 +29,7 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     out = tmp_path / "demo"
 
     def go():
-        demo(out, 0, str(discs.file), SHORT, images=20, num=5, threads=1)
+        demo(out, 0, str(discs.file), SHORT, images=40, num=5, threads=1)
 
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -43,7 +43,7 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
         "target", "truth.csv", "run", "dataset", "evaluation.json", "grid.png"
     }  # fmt: skip
     assert {path.suffix for path in (out / "target" / "images").iterdir()} == {".png"}
-    assert len(list((out / "target" / "images").iterdir())) == 20
+    assert len(list((out / "target" / "images").iterdir())) == 40
     assert len(json.loads((out / "dataset" / "annotations.json").read_text())["images"]) == 5
     assert Run.open(out / "run").record["target"] == str((out / "target" / "images").resolve())
     assert (out / "run" / "report.html").stat().st_size > 10000
@@ -59,10 +59,10 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
 
 
 def test_a_folder_of_another_seed_and_a_model_without_a_target(discs, tmp_path):
-    module.generate_scenes(module.load_model(str(discs.file)).target(0), module.load_model(str(discs.file)).prior, 20,
+    module.generate_scenes(module.load_model(str(discs.file)).target(0), module.load_model(str(discs.file)).prior, 40,
                            tmp_path / "demo" / "target", 0, "images")  # fmt: skip
     with pytest.raises(DataError, match="seed 0.*seed 1"):
-        demo(tmp_path / "demo", 1, str(discs.file), SHORT, images=20, num=5, threads=1)
+        demo(tmp_path / "demo", 1, str(discs.file), SHORT, images=40, num=5, threads=1)
     plates = Path(__file__).with_name("plates.py")
     with pytest.raises(ModelError, match="has none"):
         demo(tmp_path / "other", 0, str(plates), SHORT)
