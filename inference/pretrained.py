@@ -19,7 +19,7 @@ from efficientnet_lite_pytorch import EfficientNet
 from torch import Tensor, nn
 from torchvision.models import inception_v3
 
-from probscene.errors import DataError
+from probscene.errors import DataError, ProbsceneError
 
 AT_ONCE = 16  # images a pass, whatever the batch: memory stays flat
 LAST = torch.channels_last  # in memory; twice as fast on a CPU
@@ -117,6 +117,21 @@ class Inception(_Frozen):
     def pooled(self, x: Tensor) -> Tensor:
         """``(N, 2048)`` of images that have entered."""
         return self.net(x)
+
+
+def pretrained(choice: str) -> EfficientNetLite | Inception:
+    """The network of ``efficientnet`` or ``inception=FILE``.
+
+    Raises:
+        ProbsceneError: another word.
+        DataError: see ``Inception``.
+    """
+    name, _, file = choice.partition("=")
+    if choice == "efficientnet":
+        return EfficientNetLite()
+    if name == "inception" and file:
+        return Inception(Path(file))
+    raise ProbsceneError(f"Expected efficientnet or inception=FILE, actual {choice!r}.")
 
 
 def _named(net: str, number: int) -> tuple[str, ...]:

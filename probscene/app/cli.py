@@ -127,6 +127,10 @@ def fit(
     preset: Annotated[PresetName | None, typer.Option(help="How long to learn; 'default' if not given.")] = None,
     objective: Annotated[Objective | None, typer.Option(help="The divergence, instead of the preset's.")] = None,
     guide: Annotated[GuideName | None, typer.Option(help="What learns the rules; 'lstm' if not given.")] = None,
+    features: Annotated[
+        str | None,
+        typer.Option(metavar="NET", help="What sees images: count, presence, efficientnet or inception=FILE."),
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
     ] = None,
@@ -143,10 +147,10 @@ def fit(
         _seed(seed)
     if threads is not None and threads < 1:
         raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
-    chosen = _preset(preset, objective, guide, settings or [])
+    chosen = _preset(preset, objective, guide, features, settings or [])
     with Display() as show:
         if resume:
-            given = chosen if preset or objective or guide or settings else None
+            given = chosen if preset or objective or guide or features or settings else None
             run, images = session.resume(out, show, model, target, given, seed=seed, skip_bad=skip_bad, threads=threads)
         elif model is None or target is None:
             raise ProbsceneError(
@@ -314,7 +318,9 @@ def _seed(seed: int) -> int:
     return seed
 
 
-def _preset(name: str | None, objective: str | None, guide: str | None, settings: list[str]) -> "Preset":
+def _preset(
+    name: str | None, objective: str | None, guide: str | None, features: str | None, settings: list[str]
+) -> "Preset":
     from probscene.app.overrides import override
     from probscene.inference.presets import preset
 
@@ -323,6 +329,8 @@ def _preset(name: str | None, objective: str | None, guide: str | None, settings
         chosen = chosen.toward(str(objective))
     if guide is not None:
         chosen = chosen.guided(str(guide))
+    if features is not None:
+        chosen = chosen.seeing(features)
     return override(chosen, settings)
 
 

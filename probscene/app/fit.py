@@ -6,6 +6,7 @@ part.
 """
 
 import dataclasses
+import hashlib
 import json
 import os
 import time
@@ -31,8 +32,9 @@ from probscene.inference.latent import Guide
 from probscene.inference.learn import Learner
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.presence_net import PresenceNet, PresenceTraining
-from probscene.inference.presets import Preset
+from probscene.inference.presets import TRAINED, Preset
 from probscene.inference.pretrain import pretrain
+from probscene.inference.projection import Projected, discriminant, self_share
 from probscene.inference.resume import batch_seed
 from probscene.inference.two_sample import NEEDED, check_features
 from probscene.model import SceneModel
@@ -57,7 +59,9 @@ def create(
     Raises:
         ProbsceneError: see ``load_model`` and ``Run.create``.
     """
-    load_model(model)
+    loaded = load_model(model)
+    if preset.features not in TRAINED:
+        feature_net(preset, loaded)
     record = {
         "version": probscene.__version__,
         "target": str(Path(target).resolve()),
@@ -159,22 +163,54 @@ def _least_visible(batch: RenderBatch, derivation: Derivation) -> Tensor:
     return batch.visible.where((batch.kind >= 0) & ~carries[:, :-1], 1.0).amin(1)
 
 
-def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet:
-    """The untrained feature network of a preset."""
+def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet | Projected:
+    """The feature network of a preset, untrained, or pretrained with an empty projection.
+
+    Raises:
+        DataError: see ``Inception``.
+    """
     if preset.features == "presence":
         return PresenceNet(model.classes)
+    if preset.features != "count":
+        from probscene.inference.pretrained import pretrained  # torchvision takes seconds to import
+
+        net, file = pretrained(preset.features), preset.features.partition("=")[2]
+        digest = hashlib.sha256(Path(file).read_bytes()).digest() if file else bytes(32)
+        return Projected(net, preset.directions, digest)
     return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)
 
 
-def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> CountNet | PresenceNet:
+def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> CountNet | PresenceNet | Projected:
     seed_everything(batch_seed(run.record["seed"], 0))
     net = feature_net(preset, view.model)
     tensors = run.load("features")
-    if tensors is None:
-        _train(run, preset, view, net, progress)
-    else:
+    if tensors is not None:
         net.load_state_dict(tensors)
+    elif isinstance(net, Projected):
+        _project(run, preset, view, net, progress)
+    else:
+        _train(run, preset, view, net, progress)
     return net.eval()
+
+
+def _project(run: Run, preset: Preset, view: View, net: Projected, progress: Progress) -> None:
+    """Two renders of each of some structures, in a minute or so; what is interrupted begins again."""
+    seed_everything(batch_seed(run.record["seed"], 1))
+    model, observe, parts = view.model, view.observe(net.pretrained), []
+    policy = model.prior if model.pretraining is None else model.pretraining
+    for first in range(0, preset.pairs, RENDERED_AT_ONCE):
+        progress("features", first, preset.pairs, "")
+        scenes = sample(model, policy, min(RENDERED_AT_ONCE, preset.pairs - first))
+        parts.append((observe(scenes), observe(realise(model, scenes.derivation))))
+    one, other = (torch.cat(part) for part in zip(*parts, strict=True))
+    net.projection = discriminant(one, other, preset.directions, preset.num_scenes)
+    share = self_share(net.projection(other[: preset.num_scenes]))
+    ratio = net.ratio.tolist()
+    note = f"variance over noise {ratio[0]:.1f} to {ratio[-1]:.1f}, own kernel's share {share:.2f}"
+    progress("features", preset.pairs, preset.pairs, note)
+    line = json.dumps({"stage": "projection", "ratio": ratio, "self_share": share})
+    write_text(run.path / "log.jsonl", f"{line}\n")
+    run.save("features", net.state_dict())
 
 
 def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, progress: Progress) -> None:

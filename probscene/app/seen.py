@@ -6,7 +6,6 @@ Axis letters: N scenes, L images, D features, C H W.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -84,15 +83,13 @@ def network(choice: str, run: Run) -> tuple[str, FeatureNet]:
         DataError: see ``Inception``.
         RunError: see ``own_net``.
     """
-    from probscene.inference.pretrained import EfficientNetLite, Inception  # torchvision takes seconds to import
-
-    name, _, file = choice.partition("=")
     if choice == "run":
         return "run", own_net(run)
-    if choice == "efficientnet":
-        return "efficientnet-lite0", EfficientNetLite()
-    if name == "inception" and file:
-        return "inception-v3", Inception(Path(file))
+    name, _, file = choice.partition("=")
+    if choice == "efficientnet" or (name == "inception" and file):
+        from probscene.inference.pretrained import pretrained  # torchvision takes seconds to import
+
+        return {"efficientnet": "efficientnet-lite0", "inception": "inception-v3"}[name], pretrained(choice)
     raise ProbsceneError(f"Expected features among {CHOICES}, actual {choice!r}.")
 
 

@@ -16,7 +16,7 @@ from probscene.app.run import Run
 from probscene.checks import check
 from probscene.dataset import ImageFolder
 from probscene.errors import ModelError, RunError
-from probscene.inference.presets import Preset
+from probscene.inference.presets import TRAINED, Preset
 from probscene.model import SceneModel
 
 TIMING = "timing.json"
@@ -98,6 +98,8 @@ def carry_out(run: Run, target: ImageFolder | None, show: Display) -> None:
     before = timing(run)
     if run.record["preset"]["features"] == "presence":
         show.units["features"] = "epochs"
+    elif run.record["preset"]["features"] not in TRAINED:
+        show.units["features"] = "structures"
     try:
         fit.fit(run, show, target)
     finally:

@@ -1,0 +1,116 @@
+"""A fit by a pretrained network's features, through the command line."""
+
+import json
+
+import pytest
+import safetensors.torch
+import torch
+from torchvision.models import inception_v3
+
+from probscene.app.fit import feature_net
+from probscene.app.run import Run
+from probscene.app.seen import own_net
+from probscene.dataset import ImageFolder
+from probscene.errors import RunError
+from probscene.inference.presets import QUICK, preset
+from probscene.inference.projection import SHARE
+
+FEW = {"pairs": 40, "directions": 3, "batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
+WORDS = ["--preset", "quick", "--threads", "1", *(w for k, v in FEW.items() for w in ("--set", f"{k}={v}"))]
+
+
+@pytest.fixture(scope="module")
+def run(call, discs, target, tmp_path_factory):
+    out = tmp_path_factory.mktemp("pretrained") / "run"
+    words = ["fit", discs.file, "--target", target.images, "--out", out, "--features", "efficientnet", *WORDS]
+    done = call(*words)
+    assert done.code == 0, done.err
+    return Run.open(out), words
+
+
+def test_the_network_is_recorded_and_only_its_projection_kept(run, target):
+    run, _ = run
+    assert run.record["preset"]["features"] == "efficientnet" and run.record["preset"]["marginal_variance"] is None
+    net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
+    assert (run.path / "features.safetensors").stat().st_size < 40_000
+    seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
+    assert seen.shape == (9, len(net.names)) == (9, 3)
+    assert torch.allclose(seen, run.load("real")["features"][:9], atol=1e-4)
+
+
+def test_the_log_says_how_the_projection_came_out(run):
+    first, *rest = map(json.loads, (run[0].path / "log.jsonl").read_text().splitlines())
+    assert first["stage"] == "projection" and first["ratio"] == sorted(first["ratio"], reverse=True)
+    assert first["self_share"] == pytest.approx(SHARE, rel=0.05) and first["ratio"][0] > 2
+    assert [line["stage"] for line in rest] == ["structure"] * 2
+
+
+def test_it_goes_on_to_the_same_result(run, call, tmp_path, discs, target):
+    run, words = run
+    again = tmp_path / "again"
+    words = [again if word == run.path else word for word in words]
+    assert call(*words).code == 0
+    guide = (again / "guide.safetensors").read_bytes()
+    assert guide == (run.path / "guide.safetensors").read_bytes()
+    for name in ("guide", "real"):
+        (again / f"{name}.safetensors").unlink()
+    done = call("fit", "--out", again, "--resume", "--features", "count", *WORDS)
+    assert done.code == 2 and "features" in done.err and "efficientnet" in done.err
+    done = call("fit", "--out", again, "--resume")
+    assert done.code == 0, done.err
+    assert (again / "guide.safetensors").read_bytes() == guide
+
+
+def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
+    run, _ = run
+    words = [
+        "--target",
+        target.images,
+        "--labels",
+        target.labels,
+        "--num",
+        200,
+        "--scenes",
+        40,
+        "--json",
+        tmp_path / "e.json",
+    ]
+    done = call("evaluate", run.path, *words)
+    assert done.code == 0, done.err
+    found = json.loads((tmp_path / "e.json").read_text())
+    assert found["trust"] is not None
+    assert "estimate" not in found["sources"] and "truth" in found["sources"]  # a direction is no count
+    assert call("report", run.path, "--num", 200, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
+
+
+@pytest.mark.parametrize(
+    ("features", "part"),
+    [("vgg", "efficientnet or inception=FILE"), ("inception", "inception=FILE"), ("inception=", "inception=FILE"),
+     ("inception=none.pth", "a file of weights"), ("efficientnet=x", "efficientnet or")],
+)  # fmt: skip
+def test_another_network_is_refused_before_a_folder_is_made(features, part, call, discs, target, tmp_path):
+    words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--features", features]
+    done = call(*words, *WORDS)
+    assert done.code == 2 and part in done.err and not (tmp_path / "run").exists()
+
+
+def test_a_trained_network_keeps_the_presets_scenes():
+    for name in ("quick", "paper"):
+        assert preset(name).seeing("count").num_scenes == preset(name).num_scenes
+    assert QUICK.seeing("presence").features == "presence"
+    assert QUICK.seeing("efficientnet").num_scenes < QUICK.num_scenes
+
+
+def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_path):
+    model, chosen = run[0].model, QUICK.seeing(f"inception={tmp_path / 'w.safetensors'}")
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        weights = inception_v3(weights=None, aux_logits=False, init_weights=False).state_dict()
+        safetensors.torch.save_file(weights, tmp_path / "w.safetensors")
+        net = feature_net(chosen, model)
+        if seed == 0:
+            assert net.embed(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).shape == (2, 8)
+            state = net.state_dict()
+            feature_net(chosen, model).load_state_dict(state)
+    with pytest.raises(RunError, match="put that file back"):
+        net.load_state_dict(state)
