@@ -172,6 +172,7 @@ def compare(
             f"{other.record['target']}; say with --target which to compare with."
         )
     model, done = first.model, 0
+    columns = list(range(len(model.classes))) if truth is None else truth.columns(model)
 
     def each(scenes):
         nonlocal done
@@ -182,7 +183,7 @@ def compare(
     likelihoods: dict[str, Likelihood] = {}
     for name, policy in {PRIOR: model.prior, **{name: run.guide() for name, run in runs.items()}}.items():
         found = sampled(model, policy, num, seed, each)
-        sources[name] = Source.of(found.counts, found.children)
+        sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:
             likelihoods[name] = likelihood(policy, truth.derivation)
     if truth is not None:
@@ -191,7 +192,7 @@ def compare(
         seen = (network_counts(run, target, progress) for run in runs.values())
         if (estimate := next((source for source in seen if source is not None), None)) is not None:
             sources[ESTIMATE] = estimate
-    return Comparison(first, path, model.classes, sources, likelihoods, runs=runs)
+    return Comparison(first, path, tuple(model.classes[c] for c in columns), sources, likelihoods, runs=runs)
 
 
 def _of(counts: dict[str, np.ndarray]) -> tuple[dict[str, Shares], dict[str, float]]:

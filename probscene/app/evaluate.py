@@ -40,7 +40,7 @@ class Evaluation:
     Attributes:
         run: the run.
         target: path of the target's images.
-        classes: the C names.
+        classes: the C names; only those that are labelled, where there are labels.
         sources: ``prior``, ``learnt``, then ``truth`` and ``estimate`` where they are known.
         likelihoods: of the truth's structures under ``prior`` and ``learnt``, where they are known.
         images: FID and KID by the features' name; see ``image_distances``.
@@ -154,20 +154,21 @@ def evaluate(
         done += scenes
         progress("counting", done, 2 * num, "")
 
+    columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
     compared = image_distances(run, target, features, progress, images, seed) if features else {}
     sources, likelihoods = {}, {}
     for name, policy in policies.items():
         found = sampled(run.model, policy, num, seed, each)
-        sources[name] = Source.of(found.counts, found.children)
+        sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:
             likelihoods[name] = likelihood(policy, truth.derivation)
     if truth is not None:
         sources["truth"] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
     estimate = network_counts(run, target, progress)
     if estimate is not None:
-        sources["estimate"] = estimate
+        sources["estimate"] = estimate.only(columns)
     path = Path(run.record["target"]) if target is None else target.path
-    return Evaluation(run, path, run.model.classes, sources, likelihoods, compared)
+    return Evaluation(run, path, tuple(run.model.classes[c] for c in columns), sources, likelihoods, compared)
 
 
 def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> Source | None:

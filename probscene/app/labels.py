@@ -1,7 +1,7 @@
 """The truth that learnt structures are judged by; fitting never reads it. Two kinds of files:
 
 ``counts.csv``, how many objects of each class an image shows: the columns are ``image`` and the model's classes, in any
-order; one row an image, in any order.
+order; one row an image, in any order. A class that nobody has labelled has no column, and is not compared.
 
     image,0,1,2
     000000.png,0,2,1
@@ -34,10 +34,16 @@ class Labels(NamedTuple):
     Attributes:
         structures: their counts ``(L, C)``, and the children of each node where whole structures are known.
         derivation: the structures themselves, where they are known.
+        classes: the C that are labelled, in the model's order; all of the model's where None.
     """
 
     structures: Structures
     derivation: Derivation | None = None
+    classes: tuple[str, ...] | None = None
+
+    def columns(self, model: SceneModel) -> list[int]:
+        """Of the model's classes, the C that are labelled, by number."""
+        return [model.classes.index(name) for name in self.classes or model.classes]
 
 
 def read_labels(path: Path, model: SceneModel, target: ImageFolder, some: bool = False) -> Labels:
@@ -52,9 +58,17 @@ def read_labels(path: Path, model: SceneModel, target: ImageFolder, some: bool =
         DataError: see ``read_counts``; a line that is none of provenance, or whose rules are not the model's.
     """
     if Path(path).suffix != ".jsonl":
-        return Labels(Structures(read_counts(path, model.classes, target, some), {}))
+        classes = _labelled(Path(path), model.classes)
+        return Labels(Structures(read_counts(path, classes, target, some), {}), classes=classes)
     derivation = _read_derivations(Path(path), model, target, some)
     return Labels(count(model, derivation), derivation)
+
+
+def _labelled(path: Path, classes: tuple[str, ...]) -> tuple[str, ...]:
+    """The classes that have a column; all where none has, or a column is of something else."""
+    header = {field.strip(' "\r') for field in _text(path).partition("\n")[0].split(",")}
+    found = tuple(name for name in classes if name in header)
+    return found if found and header == {"image", *found} else classes
 
 
 def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder, some: bool = False) -> Counts:

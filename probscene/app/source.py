@@ -36,6 +36,13 @@ class Source:
     def of(counts: Counts, children: dict[Relation, PerParent] | None = None, seed: int = 0) -> "Source":
         return Source(counts, counts.sum(1), children or {}, seed)
 
+    def only(self, columns: list[int]) -> "Source":
+        """Of some of the classes, as if there were no others."""
+        if columns == list(range(self.counts.shape[1])):
+            return self
+        counts = self.counts[:, columns]
+        return Source(counts, counts.sum(1), self.children, self.seed)
+
     def number(self) -> Histogram:
         """Shares of scenes with 0, 1, 2, ... objects."""
         return histogram_interval(self.total)

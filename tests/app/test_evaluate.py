@@ -151,7 +151,7 @@ def changed(line: int, text: str | None):
 
 
 LABELS = {
-    "no class": (lambda lines: [line.rsplit(",", 1)[0] for line in lines], "image,red,blue"),
+    "no class": (lambda lines: [line.split(",")[0] for line in lines], "image,red,blue"),
     "another class": (changed(0, "image,red,green"), "image,red,blue", "image,red,green"),
     "no image column": (changed(0, "name,red,blue"), "image,red,blue"),
     "no header": (changed(0, None), "image,red,blue"),
