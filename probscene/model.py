@@ -94,6 +94,11 @@ class SceneModel:
         if self.channels not in (1, 3):
             raise ModelError(f"Expected channels 1 or 3 in model {self.name!r}, actual {self.channels}.")
 
+    @property
+    def pretraining_policy(self) -> Policy:
+        """What a guide is pretrained on."""
+        return self.prior if self.pretraining is None else self.pretraining
+
     def __call__(self, num_scenes: int, structure: Policy | None = None) -> Drawing:
         """Run the program; under the prior where no structure policy is given."""
         return self.program(num_scenes, self.prior if structure is None else structure)

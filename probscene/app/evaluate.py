@@ -18,7 +18,7 @@ import torch
 
 import probscene
 from probscene.app.estimate import estimated
-from probscene.app.fit import Progress, feature_net
+from probscene.app.fit import Progress
 from probscene.app.image_distances import IMAGES, Distances, image_distances
 from probscene.app.labels import Labels
 from probscene.app.likelihood import Likelihood, likelihood
@@ -26,6 +26,7 @@ from probscene.app.run import Run
 from probscene.app.seen import features_in, own_net
 from probscene.app.source import Source
 from probscene.app.structures import Relation, sampled
+from probscene.app.view import feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import ProbsceneError
 from probscene.inference.metrics import histogram, pooled_shares, total_variation, wasserstein

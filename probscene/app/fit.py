@@ -6,10 +6,8 @@ part.
 """
 
 import dataclasses
-import hashlib
 import json
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,16 +16,15 @@ from torch import Tensor
 
 import probscene
 from probscene.app.files import write_text
-from probscene.app.loading import load_model, renderer_for
+from probscene.app.keeper import Keeper
+from probscene.app.loading import load_model
 from probscene.app.run import Run
-from probscene.batch import RenderBatch
-from probscene.dataset import ImageFolder, grey
-from probscene.derivation import Derivation
+from probscene.app.view import RENDERED_AT_ONCE, View, feature_net
+from probscene.dataset import ImageFolder
 from probscene.errors import DataError, RunError
 from probscene.inference.count_net import CountNet
 from probscene.inference.count_training import CountTraining
-from probscene.inference.features import Examples, FeatureNet, class_table, embed_all, examples
-from probscene.inference.grouping import group_of
+from probscene.inference.features import FeatureNet, embed_all
 from probscene.inference.latent import Guide
 from probscene.inference.learn import Learner
 from probscene.inference.objective import ScoreFunction
@@ -42,9 +39,6 @@ from probscene.sampling import Scenes, realise, sample, seed_everything
 
 Progress = Callable[[str, int, int, str], None]
 """Called with the stage, what of it is done, of how much, and a note such as the loss."""
-
-SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
-RENDERED_AT_ONCE = 64  # images in memory
 
 
 def create(
@@ -99,87 +93,6 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     return guide
 
 
-class View:
-    """A model seen through its renderer: labelled prior renders to train on, and features of scenes."""
-
-    def __init__(self, model: SceneModel, threads: int):
-        self.model, self.threads = model, threads
-        self.render = renderer_for(model, threads)
-        self.classes = class_table(model.grammar.kinds, model.classes)
-
-    def draw(self, num: int) -> Examples:
-        """``num`` labelled renders of the prior."""
-        scenes = sample(self.model, self.model.prior, num)
-        groups, grammar = self.model.groups, self.model.grammar
-        by = ()
-        if groups is not None:
-            by = (group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind)), groups.along)
-        drawn = examples(self.render(scenes.drawing), self.classes, *by)
-        return drawn._replace(image=self._as_read(drawn.image))
-
-    def observe(self, net: FeatureNet, candidates: int = 1) -> Callable[[Scenes], Tensor]:
-        """Render and embed, a few images at a time.
-
-        Args:
-            candidates: parameters are drawn so many times for each structure, and the drawing in which the least
-                visible object shows most is kept: what covers an object says nothing about its structure.
-        """
-
-        def features(scenes: Scenes) -> Tensor:
-            torch.set_num_threads(self.threads)
-            starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
-            images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), candidates) for i in starts)
-            parts = [net.embed(self._as_read(some)) for some in images]
-            torch.set_num_threads(1)
-            return torch.cat(parts)
-
-        return features
-
-    def _as_read(self, images: Tensor) -> Tensor:
-        """Renders ``(N, 3, H, W)`` as ``ImageFolder`` would read them from files, ``(N, channels, H, W)``."""
-        return grey(images) if self.model.channels == 1 else images
-
-    def _clearest(self, scenes: Scenes, rows: slice, candidates: int) -> Tensor:
-        """Images ``(N, 3, H, W)``, each of the drawing that covers least of its least visible object."""
-        batch, derivation = self.render(scenes.drawing[rows]), scenes.derivation[rows]
-        image, best = batch.image, _least_visible(batch, derivation)
-        for _ in range(candidates - 1):
-            again = (best < 1).nonzero().flatten()  # nothing is clearer than what is whole
-            if not len(again):
-                break
-            some = derivation[again]
-            batch = self.render(realise(self.model, some).drawing)
-            least = _least_visible(batch, some)
-            better = least > best[again]
-            image[again[better]], best[again[better]] = batch.image[better], least[better]
-        return image
-
-
-def _least_visible(batch: RenderBatch, derivation: Derivation) -> Tensor:
-    """``(N,)`` visible fraction of the least visible object; what has others on it is meant to be covered."""
-    parent = derivation.parent[:, : batch.kind.shape[1]]  # the program's own derivation has as many nodes as it needs
-    carries = torch.zeros(len(parent), parent.shape[1] + 1, dtype=torch.bool)
-    carries.scatter_(1, parent.where(parent >= 0, parent.shape[1]), True)
-    return batch.visible.where((batch.kind >= 0) & ~carries[:, :-1], 1.0).amin(1)
-
-
-def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet | Projected:
-    """The feature network of a preset, untrained, or pretrained with an empty projection.
-
-    Raises:
-        DataError: see ``Inception``.
-    """
-    if preset.features == "presence":
-        return PresenceNet(model.classes)
-    if preset.features != "count":
-        from probscene.inference.pretrained import pretrained  # torchvision takes seconds to import
-
-        net, file = pretrained(preset.features), preset.features.partition("=")[2]
-        digest = hashlib.sha256(Path(file).read_bytes()).digest() if file else bytes(32)
-        return Projected(net, preset.directions, digest)
-    return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)
-
-
 def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> CountNet | PresenceNet | Projected:
     seed_everything(batch_seed(run.record["seed"], 0))
     net = feature_net(preset, view.model)
@@ -197,7 +110,7 @@ def _project(run: Run, preset: Preset, view: View, net: Projected, progress: Pro
     """Two renders of each of some structures, in a minute or so; what is interrupted begins again."""
     seed_everything(batch_seed(run.record["seed"], 1))
     model, observe, parts = view.model, view.observe(net.pretrained), []
-    policy = model.prior if model.pretraining is None else model.pretraining
+    policy = model.pretraining_policy
     for first in range(0, preset.pairs, RENDERED_AT_ONCE):
         progress("features", first, preset.pairs, "")
         scenes = sample(model, policy, min(RENDERED_AT_ONCE, preset.pairs - first))
@@ -322,7 +235,7 @@ def _learn(
         epochs = preset.pretrain_epochs
         pretrain(
             guide,
-            model.prior if model.pretraining is None else model.pretraining,
+            model.pretraining_policy,
             preset.pretrain_derivations,
             epochs,
             learning_rate=preset.pretrain_rate,
@@ -336,42 +249,3 @@ def _learn(
     learner.run(each)
     keep.finish()
     return guide
-
-
-class Keeper:
-    """Checkpoints of one training, at most every ``SAVE_EVERY`` seconds, with the lines of the log that belong to them.
-
-    The log is written before the checkpoint, and lines past the checkpoint are dropped when a run goes on.
-    """
-
-    def __init__(self, run: Run, name: str, training):
-        self.run, self.name, self.training = run, f"{name}-checkpoint", training
-        self.log = run.path / "log.jsonl"
-        self.lines = self.log.read_text(encoding="utf-8").splitlines() if self.log.exists() else []
-        self.saved = time.monotonic()
-        tensors = run.load(self.name)
-        if tensors is not None:
-            training.restore(tensors)
-        stage = {"features": "features", "guide": "structure"}[name]
-        self.lines = [line for line in self.lines if not self._is_past(json.loads(line), stage)]
-
-    def __call__(self, line: dict[str, float | str]) -> None:
-        self.lines.append(json.dumps(line))
-        if time.monotonic() - self.saved > SAVE_EVERY:
-            self._save()
-            self.saved = time.monotonic()
-
-    def finish(self) -> None:
-        """Write the log to its end."""
-        write_text(self.log, "".join(f"{line}\n" for line in self.lines))
-
-    def forget(self) -> None:
-        """Delete the checkpoint of a finished training."""
-        (self.run.path / f"{self.name}.safetensors").unlink(missing_ok=True)
-
-    def _save(self) -> None:
-        self.finish()
-        self.run.save(self.name, self.training.state())
-
-    def _is_past(self, line: dict, stage: str) -> bool:
-        return line["stage"] == stage and line.get("step", line.get("batch")) > self.training.done

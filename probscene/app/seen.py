@@ -10,10 +10,10 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from probscene.app.fit import RENDERED_AT_ONCE, feature_net
 from probscene.app.loading import renderer_for
 from probscene.app.provenance import CHUNK, as_written, chunk_randomness
 from probscene.app.run import Run
+from probscene.app.view import RENDERED_AT_ONCE, feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import ProbsceneError, RunError
 from probscene.inference.features import FeatureNet, embed_all

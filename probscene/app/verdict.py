@@ -13,11 +13,12 @@ from torch import Tensor
 
 from probscene.app.agreement import Agreement, agreement
 from probscene.app.evaluate import Evaluation
-from probscene.app.fit import Progress, View
+from probscene.app.fit import Progress
 from probscene.app.preview import Pixels, pixels, shrunk
 from probscene.app.provenance import CHUNK, chunk_randomness
 from probscene.app.run import Run
 from probscene.app.seen import features_in, own_net, threads
+from probscene.app.view import View
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features import FeatureNet
@@ -91,7 +92,7 @@ def judge(
             None, f"Expected at least {NEEDED} real images for a verdict, actual {len(target)} in {target.path}."
         )
     preset, model, net, looks = Preset.of(run.record["preset"]), run.model, own_net(run), EfficientNetLite()
-    policies = (run.guide(), model.prior if model.pretraining is None else model.pretraining)
+    policies = (run.guide(), model.pretraining_policy)
     done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target)
 
     def each(images: int) -> None:

@@ -387,17 +387,17 @@ def test_a_bug_is_one_line_and_a_traceback_on_demand(call, discs, tmp_path, monk
 
 CHILD = """
 import os, signal, sys
-from probscene.app import cli, files, fit
+from probscene.app import cli, files, keeper
 
 kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
-fit.SAVE_EVERY = 0.0
+keeper.SAVE_EVERY = 0.0
 line, replace = [{}], os.replace
 
 def at_once():
     if line[0].get("stage") == stage and line[0].get("step", line[0].get("batch")) >= number:
         os.kill(os.getpid(), kind)
 
-keep = fit.Keeper.__call__
+keep = keeper.Keeper.__call__
 def keeping(self, said):
     line[0] = said
     keep(self, said)
@@ -409,7 +409,7 @@ def replacing(source, path):  # the worst moment: the log is ahead, the checkpoi
         at_once()
     replace(source, path)
 
-fit.Keeper.__call__, os.replace = keeping, replacing
+keeper.Keeper.__call__, os.replace = keeping, replacing
 del sys.argv[1:4]
 cli.main()
 """

@@ -7,9 +7,9 @@ import safetensors.torch
 import torch
 from torchvision.models import inception_v3
 
-from probscene.app.fit import feature_net
 from probscene.app.run import Run
 from probscene.app.seen import own_net
+from probscene.app.view import feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import RunError
 from probscene.inference.presets import QUICK, preset

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from probscene.app.fit import View
 from probscene.app.generate import generate_scenes
 from probscene.app.loading import load_model
+from probscene.app.view import View
 from probscene.dataset import ImageFolder
 from probscene.sampling import sample, seed_everything
 

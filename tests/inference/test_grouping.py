@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fit import View
+from probscene.app.view import View
 from probscene.derivation import Derivation
 from probscene.derive import derive
 from probscene.drawing import Sprites

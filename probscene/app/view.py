@@ -1,0 +1,107 @@
+"""A model seen through its renderer and a feature network, as a fit sees it.
+
+Axis letters: N scenes, M nodes, D features, C H W.
+"""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from probscene.app.loading import renderer_for
+from probscene.batch import RenderBatch
+from probscene.dataset import grey
+from probscene.derivation import Derivation
+from probscene.inference.count_net import CountNet
+from probscene.inference.features import Examples, FeatureNet, class_table, examples
+from probscene.inference.grouping import group_of
+from probscene.inference.presence_net import PresenceNet
+from probscene.inference.presets import Preset
+from probscene.inference.projection import Projected
+from probscene.model import SceneModel
+from probscene.sampling import Scenes, realise, sample
+
+RENDERED_AT_ONCE = 64  # images in memory
+
+
+class View:
+    """A model seen through its renderer: labelled prior renders to train on, and features of scenes."""
+
+    def __init__(self, model: SceneModel, threads: int):
+        self.model, self.threads = model, threads
+        self.render = renderer_for(model, threads)
+        self.classes = class_table(model.grammar.kinds, model.classes)
+
+    def draw(self, num: int) -> Examples:
+        """``num`` labelled renders of the prior."""
+        scenes = sample(self.model, self.model.prior, num)
+        groups, grammar = self.model.groups, self.model.grammar
+        by = ()
+        if groups is not None:
+            by = (group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind)), groups.along)
+        drawn = examples(self.render(scenes.drawing), self.classes, *by)
+        return drawn._replace(image=self._as_read(drawn.image))
+
+    def observe(self, net: FeatureNet, candidates: int = 1) -> Callable[[Scenes], Tensor]:
+        """Render and embed, a few images at a time.
+
+        Args:
+            candidates: parameters are drawn so many times for each structure, and the drawing in which the least
+                visible object shows most is kept: what covers an object says nothing about its structure.
+        """
+
+        def features(scenes: Scenes) -> Tensor:
+            torch.set_num_threads(self.threads)
+            starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
+            images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), candidates) for i in starts)
+            parts = [net.embed(self._as_read(some)) for some in images]
+            torch.set_num_threads(1)
+            return torch.cat(parts)
+
+        return features
+
+    def _as_read(self, images: Tensor) -> Tensor:
+        """Renders ``(N, 3, H, W)`` as ``ImageFolder`` would read them from files, ``(N, channels, H, W)``."""
+        return grey(images) if self.model.channels == 1 else images
+
+    def _clearest(self, scenes: Scenes, rows: slice, candidates: int) -> Tensor:
+        """Images ``(N, 3, H, W)``, each of the drawing that covers least of its least visible object."""
+        batch, derivation = self.render(scenes.drawing[rows]), scenes.derivation[rows]
+        image, best = batch.image, _least_visible(batch, derivation)
+        for _ in range(candidates - 1):
+            again = (best < 1).nonzero().flatten()  # nothing is clearer than what is whole
+            if not len(again):
+                break
+            some = derivation[again]
+            batch = self.render(realise(self.model, some).drawing)
+            least = _least_visible(batch, some)
+            better = least > best[again]
+            image[again[better]], best[again[better]] = batch.image[better], least[better]
+        return image
+
+
+def _least_visible(batch: RenderBatch, derivation: Derivation) -> Tensor:
+    """``(N,)`` visible fraction of the least visible object; what has others on it is meant to be covered."""
+    parent = derivation.parent[:, : batch.kind.shape[1]]  # the program's own derivation has as many nodes as it needs
+    carries = torch.zeros(len(parent), parent.shape[1] + 1, dtype=torch.bool)
+    carries.scatter_(1, parent.where(parent >= 0, parent.shape[1]), True)
+    return batch.visible.where((batch.kind >= 0) & ~carries[:, :-1], 1.0).amin(1)
+
+
+def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet | Projected:
+    """The feature network of a preset, untrained, or pretrained with an empty projection.
+
+    Raises:
+        DataError: see ``Inception``.
+    """
+    if preset.features == "presence":
+        return PresenceNet(model.classes)
+    if preset.features != "count":
+        from probscene.inference.pretrained import pretrained  # torchvision takes seconds to import
+
+        net, file = pretrained(preset.features), preset.features.partition("=")[2]
+        digest = hashlib.sha256(Path(file).read_bytes()).digest() if file else bytes(32)
+        return Projected(net, preset.directions, digest)
+    return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)
