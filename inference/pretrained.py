@@ -21,7 +21,7 @@ from torchvision.models import inception_v3
 
 from probscene.errors import DataError, ProbsceneError
 
-AT_ONCE = 16  # images a pass, whatever the batch: memory stays flat
+AT_ONCE = 4  # images a pass: what it takes is then kept for the next, and not asked from the system anew each time
 LAST = torch.channels_last  # in memory; twice as fast on a CPU
 
 
