@@ -54,7 +54,7 @@ REMEDY = {
     Verdict.OUT_OF_REACH: "Look at these images: widen the prior or the grammar, so that it can make them, or leave "
     "them out of the target folder.",
     Verdict.ANOTHER_DOMAIN: "Check that the target folder belongs to this model; if it does, its renders do not look "
-    "like the images: change its sprites, or take pretrained features.",
+    "like the images: change its sprites and their scale, or take pretrained features if it has its own.",
 }
 
 
