@@ -13,10 +13,10 @@ TABLETOP = Path(__file__).resolve().parents[2] / "examples" / "tabletop.py"
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """24 pictures of tables that are laid otherwise than the prior's."""
+    """40 pictures of tables that are laid otherwise than the prior's."""
     folder = tmp_path_factory.mktemp("photos")
     truth = load_model(str(TABLETOP)).target(0)
-    generate_scenes(truth, truth.prior, 24, folder, format="images")
+    generate_scenes(truth, truth.prior, 40, folder, format="images")
     return folder / "images"
 
 
