@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from probscene.app.loading import renderer_for
-from probscene.app.provenance import CHUNK, as_written, chunk_randomness
+from probscene.app.provenance import CHUNK, as_written, draw_chunk
 from probscene.app.run import Run
 from probscene.app.view import RENDERED_AT_ONCE, feature_net
 from probscene.dataset import ImageFolder
@@ -20,7 +20,6 @@ from probscene.inference.features import FeatureNet, embed_all
 from probscene.inference.presets import Preset
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.sampling import sample
 
 Each = Callable[[int], None]
 """Told how many more images are done."""
@@ -32,8 +31,7 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
     of their files would have them."""
     render = renderer_for(model)
     for chunk, first in enumerate(range(0, num, CHUNK)):
-        with threads(1), chunk_randomness(seed, chunk):  # a chunk is drawn whole: the number changes no scene
-            scenes = sample(model, policy, CHUNK)
+        scenes = draw_chunk(model, policy, seed, chunk)
         yield as_written(model, render(scenes.drawing[: num - first]).image)
 
 
