@@ -131,22 +131,21 @@ class CountTraining:
         image = self.net.enter(batch.image)
         centre = batch.centre / self.net.reduce + BORDER
         label = self._objects(batch.label).masked_fill(batch.visible < s.min_visible, -1)
-        middle = torch.zeros_like(label, dtype=torch.float32)
-        if self.net.groups is not None:
-            middle = batch.middle / self.net.reduce + BORDER
-            image = torch.cat([image, self._ways(batch, *image.shape[-2:])], 1)
-        margin = 0
+        which, corner, margin = torch.arange(len(image)), torch.zeros(len(image), 2, dtype=torch.int64), 0
         if self.done < s.steps * (1 - s.whole) and min(image.shape[-2:]) > s.crop:
-            image, centre, label, middle = self._crop(image, centre, label, middle)
+            which, corner = self._places(centre, label, *image.shape[-2:])
+            image, centre, label = _cut(image, which, corner, s.crop), centre[which] - corner[:, None], label[which]
             margin = (s.crop // STRIDE - s.window) // 2
         height, width = image.shape[-2] // STRIDE, image.shape[-1] // STRIDE
         target = cells(centre, label, len(self.net.objects), height, width)
         number = 1 + len(self.net.objects)
-        logits = self.net(image[:, : self.net.channels])
+        logits = self.net(image)
         loss = count_loss(logits[:, :number], target, margin, s.count_weight)
         if self.net.groups is not None:
-            ways, axis = image[:, self.net.channels :], "xy".index(self.net.groups.along)
-            votes = group_targets(ways, centre, label, middle, axis, height, width)
+            axis = "xy".index(self.net.groups.along)
+            middle = batch.middle[which] / self.net.reduce + BORDER - corner[:, axis, None]
+            shown = self._shown(batch, which, corner, height, width)
+            votes = (*shown, *object_targets(centre, label, middle, axis, height, width))
             loss = loss + s.group_weight * group_loss(logits[:, number:], votes, margin)
         self.net.zero_grad()
         loss.backward()
@@ -165,44 +164,51 @@ class CountTraining:
             return label
         return label.where(label != self.net.group_class, -1) - (label > self.net.group_class).long()
 
-    def _ways(self, batch: Examples, height: int, width: int) -> Tensor:
-        """For each pixel of the bordered reduced images whether it shows a group, and how far that group's middle is,
-        pixels, ``(N, 2, height, width)``."""
-        r = self.net.reduce
-        seen = batch.instance[:, r // 2 :: r, r // 2 :: r].long()
-        N, h, w = seen.shape
-        middle = batch.middle.gather(1, (seen - 1).clamp(min=0).flatten(1)).view(N, h, w)
-        shown = (seen > 0) & (middle >= 0)
-        here = torch.arange(h)[:, None] if self.net.groups.along == "y" else torch.arange(w)[None, :]
-        way = (middle / r - here).where(shown, 0.0)
-        cells_each = shown.sum() / STRIDE**2 / (batch.label == self.net.group_class).sum().clamp(min=1)
-        self.net.group_cells.lerp_(cells_each, max(0.01, 1 / (self.done + 1)))
-        return F.pad(torch.stack([shown.float(), way], 1), (BORDER, width - w - BORDER, BORDER, height - h - BORDER))
+    def _shown(self, batch: Examples, which: Tensor, corner: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """Whether the cells show a group at their middles, and how many cells away that group's middle is; each
+        ``(K, height, width)``.
 
-    def _crop(self, image: Tensor, centre: Tensor, label: Tensor, middle: Tensor) -> tuple[Tensor, ...]:
-        """Crops ``(K, C, crop, crop)`` with an object somewhere in their window, or at random places."""
+        Args:
+            which, corner: ``(K,)`` and ``(K, 2)``, where in which bordered reduced image the cells begin.
+        """
+        r, groups = self.net.reduce, self.net.groups
+        node = batch.instance[:, r // 2 :: r, r // 2 :: r].long() - 1  # of every reduced pixel
+        N, h, w = node.shape
+        seen = (node >= 0) & (batch.middle >= 0).gather(1, node.clamp(min=0).flatten(1)).view(N, h, w)
+        cells_each = seen.sum() / STRIDE**2 / (batch.label == self.net.group_class).sum().clamp(min=1)
+        self.net.group_cells.lerp_(cells_each, max(0.01, 1 / (self.done + 1)))
+        x, y = (
+            corner[:, axis, None] + STRIDE * torch.arange(size) + STRIDE // 2 - BORDER
+            for axis, size in ((0, width), (1, height))
+        )  # (K, width) and (K, height), pixels of the reduced image
+        inside = ((y >= 0) & (y < h))[:, :, None] & ((x >= 0) & (x < w))[:, None, :]
+        at = which[:, None, None], y.clamp(0, h - 1)[:, :, None], x.clamp(0, w - 1)[:, None, :]
+        shown = seen[at] & inside
+        middle = batch.middle[which].gather(1, node[at].clamp(min=0).flatten(1)).view(shown.shape)
+        here = x[:, None, :] if groups.along == "x" else y[:, :, None]
+        return shown.float(), (middle / r - here).where(shown, 0.0) / STRIDE
+
+    def _places(self, centre: Tensor, label: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """Image ``(K,)`` and upper left corner ``(K, 2)`` of crops with an object somewhere in their window, or at
+        random places."""
         s = self.schedule
-        N, C, H, W = image.shape
         scene, node = (label >= 0).nonzero(as_tuple=True)
         near = round(s.crops * (1 - s.anywhere)) if len(scene) else 0
         pick = torch.randperm(len(scene))[:near] if near <= len(scene) else torch.randint(len(scene), (near,))
         jitter = (torch.rand(near, 2) - 0.5) * (s.window * STRIDE)
-        which = torch.cat([scene[pick], torch.randint(N, (s.crops - near,))])
-        around = torch.cat(
-            [centre[scene[pick], node[pick]] + jitter, torch.rand(s.crops - near, 2) * torch.tensor([W, H])]
-        )
-        corner = around.floor().long() - s.crop // 2
-        pad = s.crop
-        corner = torch.minimum(corner.clamp(min=-pad), torch.tensor([W, H]))
-        padded = F.pad(image, (pad,) * 4)
-        span = torch.arange(s.crop)
-        rows = (corner[:, 1:] + pad + span)[:, :, None]
-        columns = (corner[:, :1] + pad + span)[:, None, :]
-        crops = padded.permute(0, 2, 3, 1)[which[:, None, None], rows, columns].permute(0, 3, 1, 2)
-        corner = corner[:, None].float()
-        if self.net.groups is not None:
-            middle = middle[which] - corner[..., "xy".index(self.net.groups.along)]
-        return crops, centre[which] - corner, label[which], middle
+        which = torch.cat([scene[pick], torch.randint(len(label), (s.crops - near,))])
+        size = torch.tensor([width, height])
+        around = torch.cat([centre[scene[pick], node[pick]] + jitter, torch.rand(s.crops - near, 2) * size])
+        return which, torch.minimum((around.floor().long() - s.crop // 2).clamp(min=-s.crop), size)
+
+
+def _cut(image: Tensor, which: Tensor, corner: Tensor, size: int) -> Tensor:
+    """Crops ``(K, C, size, size)`` of images ``(N, C, H, W)``, 0 beyond them."""
+    H, W = image.shape[-2:]
+    x, y = (corner[:, axis, None] + torch.arange(size) for axis in (0, 1))
+    inside = ((y >= 0) & (y < H))[:, :, None] & ((x >= 0) & (x < W))[:, None, :]
+    at = which[:, None, None], y.clamp(0, H - 1)[:, :, None], x.clamp(0, W - 1)[:, None, :]
+    return (image.permute(0, 2, 3, 1)[at] * inside[..., None]).permute(0, 3, 1, 2)
 
 
 def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) -> Tensor:
@@ -218,25 +224,23 @@ def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) 
     return torch.cat([1 - mass.sum(1, keepdim=True), mass], 1)
 
 
-def group_targets(
-    ways: Tensor, centre: Tensor, label: Tensor, middle: Tensor, axis: int, height: int, width: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What the cells should vote, each ``(N, height, width)``: whether a cell shows a group, how many cells away its
-    middle is, how much of an object the cell holds and how many cells away the middle of that object's group is.
+def object_targets(
+    centre: Tensor, label: Tensor, middle: Tensor, axis: int, height: int, width: int
+) -> tuple[Tensor, Tensor]:
+    """How much of an object each cell holds, and how many cells away the middle of that object's group is; each
+    ``(N, height, width)``.
 
     Args:
-        ways: ``(N, 2, H, W)`` the first two of the pixels, in pixels.
         centre, label: ``(N, M, 2)`` and ``(N, M)`` of the objects.
         middle: ``(N, M)`` of their groups, pixels along the axis.
         axis: 0 for x, 1 for y.
     """
-    shown, way = ways[:, :, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE].unbind(1)
-    mass, pull = torch.zeros_like(shown), torch.zeros_like(shown)
+    mass, pull = torch.zeros(len(label), height, width), torch.zeros(len(label), height, width)
     for n, m, y, x, share in _shares(centre, label, height, width):
         mass.index_put_((n, y, x), share, accumulate=True)
         away = middle[n, m] - ((x, y)[axis] + 0.5) * STRIDE
         pull.index_put_((n, y, x), share * away, accumulate=True)
-    return shown, way / STRIDE, mass, pull / mass.clamp(min=1e-6) / STRIDE
+    return mass, pull / mass.clamp(min=1e-6) / STRIDE
 
 
 def _shares(centre: Tensor, label: Tensor, height: int, width: int) -> Iterator[tuple[Tensor, ...]]:
@@ -274,7 +278,8 @@ def group_loss(votes: Tensor, target: tuple[Tensor, Tensor, Tensor, Tensor], mar
 
     Args:
         votes: ``(N, 3, h, w)``: logit that a cell shows a group, its vote and its object's vote, see ``CountNet``.
-        target: see ``group_targets``.
+        target: ``(N, h, w)`` each: whether a cell shows a group, how many cells away its middle is, how much of an
+            object the cell holds and how many cells away the middle of that object's group is.
         margin: cells at the border that do not count.
     """
     h, w = votes.shape[-2:]
