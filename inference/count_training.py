@@ -1,8 +1,9 @@
 """Training the count network on prior renders with their free labels.
 
-The loss is the cross-entropy of the cells and the squared error of the soft counts. Most of an image is empty, so the
-first part trains on crops around objects, which shows the network several times as many of them a second; the last part
-trains on whole images, without which crops leave a bias in the background. Axis letters: N images, M nodes, K crops.
+The loss is the cross-entropy of the cells and the squared error of the soft counts, and the error of the votes where
+objects are counted by groups. Most of an image is empty, so the first part trains on crops around objects, which shows
+the network several times as many of them a second; the last part trains on whole images, without which crops leave a
+bias in the background. Axis letters: N images, M nodes, K crops.
 
 Reference:
     [1] Jordan et al., *Muon: an optimizer for hidden layers in neural networks*, 2024; on Multi-MNIST it needs a third
