@@ -16,8 +16,9 @@ from pyro.infer import SVI
 from pyro.optim import LambdaLR
 
 from probscene.derive import derive_complete
+from probscene.inference.count_batches import CountSchedule
 from probscene.inference.count_net import CountNet
-from probscene.inference.count_training import CountSchedule, CountTraining
+from probscene.inference.count_training import CountTraining
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features import class_table, examples
 from probscene.inference.guide import LSTMGuide

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from probscene.errors import ProbsceneError
-from probscene.inference.count_training import CountSchedule
+from probscene.inference.count_batches import CountSchedule
 from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
 from probscene.inference.guide import GUIDES
 

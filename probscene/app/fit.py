@@ -134,6 +134,7 @@ def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, pr
     else:
         training = CountTraining(net, view.draw, preset.count, seed=seed)
         steps = preset.count.steps
+        torch.set_num_threads(1)  # its images are drawn on another core meanwhile
     keep = Keeper(run, "features", training)
 
     def each(training, loss):
@@ -142,6 +143,7 @@ def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, pr
 
     progress("features", training.done, steps, "")
     training.run(each)
+    torch.set_num_threads(run.record["threads"])
     keep.finish()
     run.save("features", net.state_dict())
     keep.forget()

@@ -13,7 +13,6 @@ from torch import Tensor
 from probscene.app.loading import renderer_for
 from probscene.batch import RenderBatch
 from probscene.dataset import grey
-from probscene.derivation import Derivation
 from probscene.inference.count_net import CountNet
 from probscene.inference.features import Examples, FeatureNet, class_table, examples
 from probscene.inference.grouping import group_of
@@ -21,6 +20,7 @@ from probscene.inference.presence_net import PresenceNet
 from probscene.inference.presets import Preset
 from probscene.inference.projection import Projected
 from probscene.model import SceneModel
+from probscene.relations import relations
 from probscene.sampling import Scenes, realise, sample
 
 RENDERED_AT_ONCE = 64  # images in memory
@@ -33,6 +33,8 @@ class View:
         self.model, self.threads = model, threads
         self.render = renderer_for(model, threads)
         self.classes = class_table(model.grammar.kinds, model.classes)
+        carriers = {parent for parent, _ in relations(model.grammar)}
+        self.covered = torch.tensor([kind in carriers for kind in model.grammar.kinds] + [True])  # the last is padding
 
     def draw(self, num: int) -> Examples:
         """``num`` labelled renders of the prior."""
@@ -69,25 +71,20 @@ class View:
     def _clearest(self, scenes: Scenes, rows: slice, candidates: int) -> Tensor:
         """Images ``(N, 3, H, W)``, each of the drawing that covers least of its least visible object."""
         batch, derivation = self.render(scenes.drawing[rows]), scenes.derivation[rows]
-        image, best = batch.image, _least_visible(batch, derivation)
+        image, best = batch.image, self._least_visible(batch)
         for _ in range(candidates - 1):
             again = (best < 1).nonzero().flatten()  # nothing is clearer than what is whole
             if not len(again):
                 break
-            some = derivation[again]
-            batch = self.render(realise(self.model, some).drawing)
-            least = _least_visible(batch, some)
+            batch = self.render(realise(self.model, derivation[again]).drawing)
+            least = self._least_visible(batch)
             better = least > best[again]
             image[again[better]], best[again[better]] = batch.image[better], least[better]
         return image
 
-
-def _least_visible(batch: RenderBatch, derivation: Derivation) -> Tensor:
-    """``(N,)`` visible fraction of the least visible object; what has others on it is meant to be covered."""
-    parent = derivation.parent[:, : batch.kind.shape[1]]  # the program's own derivation has as many nodes as it needs
-    carries = torch.zeros(len(parent), parent.shape[1] + 1, dtype=torch.bool)
-    carries.scatter_(1, parent.where(parent >= 0, parent.shape[1]), True)
-    return batch.visible.where((batch.kind >= 0) & ~carries[:, :-1], 1.0).amin(1)
+    def _least_visible(self, batch: RenderBatch) -> Tensor:
+        """``(N,)`` visible fraction of the least visible object; what can have others on it is meant to be covered."""
+        return batch.visible.where(~self.covered[batch.kind], 1.0).amin(1)
 
 
 def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet | Projected:

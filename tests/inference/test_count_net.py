@@ -4,8 +4,10 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
+from probscene.errors import ProbsceneError
+from probscene.inference.count_batches import CountSchedule, cells
 from probscene.inference.count_net import STRIDE, CountNet, toward_whole
-from probscene.inference.count_training import CountSchedule, CountTraining, cells, count_loss
+from probscene.inference.count_training import CountTraining, count_loss
 from probscene.inference.features import enter
 from probscene.inference.presence_net import PresenceNet, PresenceTraining
 
@@ -117,6 +119,32 @@ def test_training_goes_on_to_the_same_bits(dots, draw_dots, kind):
     second.run()
     for (key, a), b in zip(whole.net.state_dict().items(), second.net.state_dict().values(), strict=True):
         assert torch.equal(a, b), key
+
+
+def test_what_goes_wrong_while_drawing_ahead_ends_the_training(dots, draw_dots):
+    calls = []
+
+    def draw(num):
+        calls.append(num)
+        if len(calls) == 3:
+            raise ProbsceneError("no more ink")
+        return draw_dots(num)
+
+    net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
+    training = CountTraining(net, draw, CountSchedule(steps=72, images=2, crops=4, crop=32, window=2))
+    with pytest.raises(ProbsceneError, match="no more ink"):
+        training.run()
+    assert training.done == 32
+
+
+def test_the_last_draw_is_as_long_as_the_steps_that_are_left(dots, draw_dots):
+    calls = []
+    net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
+    schedule = CountSchedule(steps=20, images=2, crops=4, crop=32, window=2)
+    training = CountTraining(net, lambda num: calls.append(num) or draw_dots(num), schedule)
+    training.run()
+    training.run()
+    assert training.done == 20 and calls == [32, 8]
 
 
 def test_presence_net_stops_at_its_accuracy(dots, draw_dots):

@@ -15,8 +15,9 @@ from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
+from probscene.inference.count_batches import CountSchedule, object_targets
 from probscene.inference.count_net import STRIDE, CountNet
-from probscene.inference.count_training import CountSchedule, CountTraining, object_targets
+from probscene.inference.count_training import CountTraining
 from probscene.inference.grouping import ABSENT, group_of, tally
 from probscene.model import Groups, SceneModel
 from probscene.scene import SceneGraph
