@@ -6,13 +6,13 @@ letters: N images, M nodes, K crops.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from probscene.ahead import ahead
 from probscene.inference.count_net import BORDER, STRIDE, CountNet
 from probscene.inference.features import Draw, Examples
 from probscene.inference.resume import batch_seed
@@ -100,17 +100,9 @@ class CountBatches:
     def __init__(self, net: CountNet, draw: Draw, schedule: CountSchedule, seed: int):
         self.net, self.draw, self.schedule, self.seed = net, draw, schedule, seed
 
-    def ahead(self, done: int) -> Iterator[list[Batch]]:
+    def after(self, done: int) -> Iterator[list[Batch]]:
         """The batches that are left after ``done`` steps, a draw at a time, while another thread makes the next."""
-        with ThreadPoolExecutor(1) as worker:
-            current = None
-            for start in range(done, self.schedule.steps, STEPS_A_DRAW):
-                following = worker.submit(self._draw, start)
-                if current is not None:
-                    yield current.result()
-                current = following
-            if current is not None:
-                yield current.result()
+        return ahead(self._draw, range(done, self.schedule.steps, STEPS_A_DRAW))
 
     def _draw(self, done: int) -> list[Batch]:
         s = self.schedule

@@ -60,8 +60,8 @@ class CountTraining:
         """
         s = self.schedule
         self.net.train()
-        with closing(self.batches.ahead(self.done)) as ahead:
-            for batches in ahead:
+        with closing(self.batches.after(self.done)) as draws:
+            for batches in draws:
                 loss = sum(map(self._step, batches)) / len(batches)
                 if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
                     raise ProbsceneError(

@@ -9,7 +9,9 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
+from probscene.ahead import ahead
 from probscene.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -67,19 +70,17 @@ class ImageFolder:
         self.paths: list[Path] = []
         self.bad: dict[Path, str] = {}
         sizes, pictures = Counter(), set()
-        for i, file in enumerate(files):
-            try:
-                data = _read(file)
-                picture, size = _decoded(data, self.canvas, channels)
-                sizes[size] += 1
-                pictures.add(hashlib.blake2b(picture, digest_size=16).digest())
-            except _Bad as fault:
-                self.bad[file] = str(fault)
-            else:
-                self.paths.append(file)
-                digest.update(hashlib.sha256(os.fsencode(file.name)).digest() + hashlib.sha256(data).digest())
-            if progress is not None:
-                progress(i + 1, len(files))
+        with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
+            for i, (file, found) in enumerate(zip(files, checked, strict=True)):
+                if isinstance(found, _Bad):
+                    self.bad[file] = str(found)
+                else:
+                    self.paths.append(file)
+                    digest.update(hashlib.sha256(os.fsencode(file.name)).digest() + found.data)
+                    sizes[found.size] += 1
+                    pictures.add(found.picture)
+                if progress is not None:
+                    progress(i + 1, len(files))
         self._judge(skip_bad)
         self.fingerprint = digest.hexdigest()
         self.distinct = len(pictures)
@@ -97,7 +98,8 @@ class ImageFolder:
             DataError: the file has gone bad since the folder was opened.
         """
         try:
-            image, _ = _decoded(_read(self.paths[i]), self.canvas, self.channels)
+            with _quiet():
+                image, _ = _decoded(_read(self.paths[i]), self.canvas, self.channels)
         except _Bad as fault:
             raise DataError(f"Expected the image {self.paths[i]} as it was, actual a file that {fault}.") from fault
         return torch.from_numpy(image)
@@ -113,6 +115,14 @@ class ImageFolder:
             raise DataError(f"Expected a positive batch size, actual {size}.")
         for start in range(0, len(self), size):
             yield torch.stack([self.load(i) for i in range(start, min(start + size, len(self)))])
+
+    def _checked(self, file: Path) -> "_Checked | _Bad":
+        try:
+            data = _read(file)
+            picture, size = _decoded(data, self.canvas, self.channels)
+        except _Bad as fault:
+            return fault
+        return _Checked(size, hashlib.sha256(data).digest(), hashlib.blake2b(picture, digest_size=16).digest())
 
     def _judge(self, skip_bad: bool) -> None:
         if self.bad and not (skip_bad and self.paths):
@@ -156,6 +166,22 @@ class _Bad(Exception):
     """A file that does not decode; the text completes 'a file that ...'."""
 
 
+class _Checked(NamedTuple):
+    """A file that decodes: its height and width, and digests of its bytes and of its pixels."""
+
+    size: tuple[int, int]
+    data: bytes
+    picture: bytes
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Pillow's warnings about odd metadata; they are the whole process's, so no thread can do it alone."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def _listed(folder: Path) -> tuple[list[Path], list[str]]:
     """The image files of a folder, sorted by name, and the names of its other files."""
     if not folder.exists():
@@ -189,18 +215,16 @@ def _decoded(data: bytes, canvas: tuple[int, int], channels: int) -> tuple[np.nd
     if not data:
         raise _Bad("is empty")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of Pillow about odd metadata
-            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-                if image.format == "PNG":
-                    if _LAST_CHUNK not in data:
-                        raise _Bad("is truncated")
-                    with Image.open(io.BytesIO(data)) as again:
-                        again.verify()  # decoding alone does not compare the checksums
-                turned = image.getexif().get(_ORIENTATION, 1) >= 5
-                size = image.size if turned else image.size[::-1]
-                image.draft(None, (max(canvas), max(canvas)))  # a large JPEG is decoded at a half, a fourth, an eighth
-                pixels = np.array(_eight_bit(ImageOps.exif_transpose(image)).convert("L" if channels == 1 else "RGB"))
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+            if image.format == "PNG":
+                if _LAST_CHUNK not in data:
+                    raise _Bad("is truncated")
+                with Image.open(io.BytesIO(data)) as again:
+                    again.verify()  # decoding alone does not compare the checksums
+            turned = image.getexif().get(_ORIENTATION, 1) >= 5
+            size = image.size if turned else image.size[::-1]
+            image.draft(None, (max(canvas), max(canvas)))  # a large JPEG is decoded at a half, a fourth, an eighth
+            pixels = np.array(_eight_bit(ImageOps.exif_transpose(image)).convert("L" if channels == 1 else "RGB"))
     except _Bad:
         raise
     except UnidentifiedImageError as error:
