@@ -14,7 +14,6 @@ from probscene.derivation import Derivation
 from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
 from probscene.inference.guide import LSTMGuide
-from probscene.policy import Policy
 
 FLAT = Grammar("Scene -> A B | x\nA -> y(B) | z\nB -> y | B2 | ε\nB2 -> x | y")
 LISTS = Grammar("Scene -> bg Items\nItems -> Item Items | ε\nItem -> x(Things) | y\nThings -> z Things | ε")
@@ -93,34 +92,6 @@ def test_log_prob_is_the_mean_over_the_latent_vectors_of_a_plain_lstm(reference,
         assert found[i] == pytest.approx(expected, rel=1e-4, abs=1e-4)
 
 
-@given(guides(st.from_type(Grammar)).filter(lambda guide: len(guide.latents) == 1), st.integers(0, 2**31))
-def test_all_steps_at_once_are_one_after_the_other(guide, seed):
-    _, derivation = derived(guide, seed)
-    torch.testing.assert_close(guide.logits(derivation), Policy.logits(guide, derivation), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(guide.log_prob(derivation), Policy.log_prob(guide, derivation), rtol=1e-4, atol=1e-5)
-
-
-@given(guides(LISTS), st.integers(0, 2**31))
-def test_the_marginal_sums_the_traces_of_every_latent_vector(guide, seed):
-    trace, derivation = derived(guide, seed)
-    assert ("z" in trace.nodes) == (len(guide.latents) > 1)
-    each = []
-    for z in range(len(guide.latents)):
-        data = {**derivation.sites(), "z": torch.full((6, 1), z)}
-        conditioned = poutine.trace(poutine.condition(guide, data=data)).get_trace(6)
-        conditioned.compute_log_prob()
-        sites = [site["log_prob"] for name, site in conditioned.nodes.items() if name == "z" or name[:5] == "rule_"]
-        each.append(torch.cat(sites, 1).sum(1))  # log 1/|Z| + log q(T | z)
-    torch.testing.assert_close(torch.stack(each).logsumexp(0), guide.log_prob(derivation), rtol=1e-4, atol=1e-4)
-
-
-@given(guides(FLAT))
-def test_q_sums_to_one(guide):
-    every = enumerate_derivations(FLAT, 9)
-    assert len(every) == 1 + (4 + 1) * 4
-    assert guide.log_prob(every).double().exp().sum().item() == pytest.approx(1, abs=1e-5)
-
-
 @given(guides(LISTS))
 def test_what_q_lacks_to_one_is_not_complete_after_max_steps(guide):
     every = enumerate_derivations(LISTS, 7)
@@ -128,27 +99,6 @@ def test_what_q_lacks_to_one_is_not_complete_after_max_steps(guide):
     assert every.complete.all() and not unfinished.complete.any()
     ended, rest = (guide.log_prob(d).double().exp().sum().item() for d in (every, unfinished))
     assert ended + rest == pytest.approx(1, abs=1e-5)
-
-
-@given(guides(FLAT), st.integers(0, 2**31))
-def test_samples_follow_q(guide, seed):
-    every = enumerate_derivations(FLAT, 9)
-    q = guide.log_prob(every).double().exp()
-    _, drawn = derived(guide, seed, 4000)
-    rules = torch.nn.functional.pad(drawn.rules, (0, every.rules.shape[1] - drawn.rules.shape[1]), value=-1)
-    found = (rules.unsqueeze(1) == every.rules).all(-1).double()
-    assert (found.sum(1) == 1).all()
-    # Five standard deviations of a share of 4,000, and one scene.
-    assert ((found.mean(0) - q).abs() < 5 * (q * (1 - q) / 4000).sqrt() + 1 / 4000).all()
-
-
-def test_the_program_registers_its_parameters_and_every_one_gets_a_gradient():
-    guide = LSTMGuide(LISTS, max_steps=12, num_latents=3)
-    _, derivation = derived(guide, 0)
-    assert {f"guide$$${name}" for name, _ in guide.named_parameters()} == set(pyro.get_param_store().keys())
-    guide.log_prob(derivation).sum().backward()
-    for name, parameter in guide.named_parameters():
-        assert torch.isfinite(parameter.grad).all() and parameter.grad.abs().sum() > 0, name
 
 
 def test_a_fresh_guide_ignores_the_indices():
