@@ -5,6 +5,31 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from probscene.drawing import Drawing
+from probscene.world import World
+
+
+class Space(NamedTuple):
+    """What a 3D scene has beside it; the camera's axes are KITTI's, see ``world``.
+
+    Attributes:
+        depth: ``(N, H, W)`` float32, metres along the camera's z; infinity where there is sky.
+        semantic: ``(N, H, W)`` uint8 index into ``names``.
+        names: what ``semantic`` means: ``"sky"``, the drawing's kinds in their order, the ground's surface names in
+            the order in which they first occur, and ``"decoration"``.
+        truncated: ``(N, M)`` float32, share of the amodal box, as large as it would be on an endless canvas, that lies
+            outside the image.
+        box: ``(N, M, 7)`` float32, the 3D box: height, width and length in metres, x, y, z of the middle of its bottom
+            in the camera's axes, and its rotation about the camera's y axis, radians in -pi..pi, 0 where the object
+            faces along the camera's x axis (``rotation_y`` of KITTI). Zeros where nothing is drawn.
+        intrinsics: ``(N, 3, 3)`` float32.
+    """
+
+    depth: Tensor
+    semantic: Tensor
+    names: tuple[str, ...]
+    truncated: Tensor
+    box: Tensor
+    intrinsics: Tensor
 
 
 class RenderBatch(NamedTuple):
@@ -19,7 +44,9 @@ class RenderBatch(NamedTuple):
         amodal_box: ``(N, M, 4)`` the extent of the whole silhouette, what others cover and what lies outside the canvas
             included; zeros if the silhouette is empty.
         pixels: ``(N, M)`` int64, visible pixels.
-        visible: ``(N, M)`` float32, visible pixels over the pixels of the whole silhouette; 0 if that is empty.
+        visible: ``(N, M)`` float32, visible pixels over the pixels of the whole silhouette; 0 if that is empty. In 3D
+            of the silhouette inside the image: what lies outside is ``space.truncated``.
+        space: in 3D.
     """
 
     image: Tensor
@@ -29,9 +56,10 @@ class RenderBatch(NamedTuple):
     amodal_box: Tensor
     pixels: Tensor
     visible: Tensor
+    space: Space | None = None
 
 
 class Renderer(Protocol):
     """Turns a drawing into labelled pixels; a drawing gives the same bytes for any batch size and thread count."""
 
-    def __call__(self, drawing: Drawing) -> RenderBatch: ...
+    def __call__(self, drawing: Drawing | World) -> RenderBatch: ...

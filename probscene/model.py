@@ -7,6 +7,7 @@ from probscene.drawing import Drawing
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.policy import Policy
+from probscene.world import World
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class SceneModel:
     name: str
     grammar: Grammar
     prior: Policy
-    program: Callable[..., Drawing]
+    program: Callable[..., Drawing | World]
     canvas: tuple[int, int]
     max_steps: int
     classes: tuple[str, ...]
@@ -99,6 +100,6 @@ class SceneModel:
         """What a guide is pretrained on."""
         return self.prior if self.pretraining is None else self.pretraining
 
-    def __call__(self, num_scenes: int, structure: Policy | None = None) -> Drawing:
+    def __call__(self, num_scenes: int, structure: Policy | None = None) -> Drawing | World:
         """Run the program; under the prior where no structure policy is given."""
         return self.program(num_scenes, self.prior if structure is None else structure)

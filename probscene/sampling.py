@@ -18,6 +18,7 @@ from probscene.drawing import Drawing
 from probscene.errors import ModelError
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.world import World
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class Scenes:
     parameters: dict[str, Tensor]
     counted: dict[str, Tensor]
     log_prob: Tensor
-    drawing: Drawing
+    drawing: Drawing | World
     failures: Tensor
 
 
@@ -53,7 +54,7 @@ def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
 
 
 def realise(
-    model: SceneModel | Callable[[int], Drawing],
+    model: SceneModel | Callable[[int], Drawing | World],
     derivation: Derivation,
     parameters: dict[str, Tensor] | None = None,
     failures: Tensor | None = None,
@@ -73,10 +74,10 @@ def realise(
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"]["value"]
-    if not isinstance(drawing, Drawing) or len(drawing) != N:
+    if not isinstance(drawing, Drawing | World) or len(drawing) != N:
         raise ModelError(
-            f"Expected the program of model {name!r} to return a Drawing of {N} scenes (scene.draw(...)), "
-            f"actual {type(drawing).__name__}."
+            f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
+            f"or scene.build(...)), actual {type(drawing).__name__}."
         )
     values, counted = {}, {}
     log_prob = torch.zeros(N)

@@ -14,6 +14,7 @@ from probscene.derivation import Derivation
 from probscene.drawing import Drawing, Layer, Sprites, resolve
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
+from probscene.world import Camera, Ground, Light, Meshes, Photo, World, resolve_ground, resolve_meshes, resolve_scene
 
 
 class SceneGraph:
@@ -69,6 +70,33 @@ class SceneGraph:
         mask = self.mask(*kinds)
         return resolve(layer, mask if layer.present is None else mask & layer.present)
 
+    def build(
+        self,
+        *layers: Meshes,
+        camera: Camera,
+        light: Light | None = None,
+        ground: Ground | None = None,
+        photo: Photo | None = None,
+    ) -> World:
+        """A 3D world of meshes to render; their order does not matter.
+
+        Raises:
+            ModelError: values of a wrong shape, out of range or not finite.
+        """
+        resolved = []
+        for layer in layers:
+            kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds
+            if kinds == ():
+                present = _decorated(layer, len(self.kind))
+                resolved.append(resolve_meshes(replace(layer, labelled=False), present))
+            else:
+                mask = self.mask(*kinds)
+                resolved.append(resolve_meshes(layer, mask if layer.present is None else mask & layer.present))
+        parts = {"camera": camera, "light": light or Light(), "photo": photo or Photo()}
+        parts = {name: resolve_scene(part, len(self.kind)) for name, part in parts.items()}
+        ground = None if ground is None else resolve_ground(ground, len(self.kind))
+        return World(self.kind, self.grammar.kinds, tuple(resolved), ground=ground, **parts)
+
     def draw(self, *layers: Sprites, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drawing:
         """What to render: layers from the back to the front.
 
@@ -78,16 +106,20 @@ class SceneGraph:
         resolved = []
         for layer in layers:
             kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds
-            resolved.append(_decoration(layer, len(self.kind)) if kinds == () else self._of_nodes(layer, kinds))
+            if kinds == ():
+                resolved.append(resolve(replace(layer, labelled=False), _decorated(layer, len(self.kind))))
+            else:
+                resolved.append(self._of_nodes(layer, kinds))
         return Drawing(self.kind, self.grammar.kinds, tuple(resolved), background)
 
 
-def _decoration(layer: Sprites, num_scenes: int) -> Layer:
+def _decorated(layer: Sprites | Meshes, num_scenes: int) -> Tensor:
+    """What of a decoration is there, ``(N, M)`` bool."""
     present = layer.present
     if present is None or present.ndim != 2 or present.shape[0] != num_scenes or present.dtype != torch.bool:
         actual = "none" if present is None else f"{present.dtype} {tuple(present.shape)}"
         raise ModelError(
-            f"Expected Sprites of no kind with present, bool ({num_scenes} scenes, how many), actual {actual}; say "
-            "which of the decoration is drawn."
+            f"Expected {type(layer).__name__} of no kind with present, bool ({num_scenes} scenes, how many), "
+            f"actual {actual}; say which of the decoration is drawn."
         )
-    return resolve(replace(layer, labelled=False), present)
+    return present

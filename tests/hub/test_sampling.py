@@ -122,7 +122,7 @@ def test_programs_that_are_none():
         pyro.sample("loose", dist.Normal(0.0, 1.0))
         return tabletop(num_scenes, structure)
 
-    with pytest.raises(ModelError, match="'tabletop' to return a Drawing of 4 scenes .* actual NoneType"):
+    with pytest.raises(ModelError, match="'tabletop' to return a Drawing or a World of 4 scenes .* actual NoneType"):
         sample(replace(MODEL, program=no_drawing), PRIOR, 4)
     with pytest.raises(ModelError, match="'loose'.*inside the scenes plate"):
         sample(replace(MODEL, program=no_plate), PRIOR, 4)
