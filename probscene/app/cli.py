@@ -78,6 +78,7 @@ app = typer.Typer(
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, made by 'probscene fit'.")]
 Model = Annotated[str, typer.Argument(metavar="MODEL", help="multi_mnist, aerial2d, or a path to a .py file.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same result.")]
+MinHeight = Annotated[float, typer.Option(min=0, help="Of objects that KITTI's labels count, pixels of their boxes.")]
 PresetName = StrEnum("PresetName", ["quick", "default", "paper"])
 Objective = StrEnum("Objective", ["kde", "js", "witness", "mmd"])
 GuideName = StrEnum("GuideName", {"lstm": "lstm", "pcfg": "pcfg", "grammar_vae": "grammar-vae"})
@@ -194,7 +195,10 @@ def evaluate(
     run: RunFolder,
     target: Annotated[Path, typer.Option(metavar="DIR", help="The images to judge by.")],
     labels: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A counts.csv (image,CLASS,...) or a provenance.jsonl.")
+        Path | None,
+        typer.Option(
+            metavar="PATH", help="A counts.csv (image,CLASS,...), a provenance.jsonl, or KITTI's folder label_2."
+        ),
     ] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
@@ -205,6 +209,7 @@ def evaluate(
     num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
     some_labels: Annotated[bool, typer.Option("--some-labels", help="Labels need not cover all images.")] = False,
+    min_height: MinHeight = 0.0,
 ) -> None:
     """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
     from rich.console import Console
@@ -222,7 +227,7 @@ def evaluate(
         make_folder(json.parent)
     with Display() as show:
         images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
-        truth = None if labels is None else read_labels(labels, opened.model, images, some_labels)
+        truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
         found = evaluate(opened, images, truth, show, num, features=features or (), images=num_images)
         judged = verdict.judge(opened, images, show, scenes, found) if scenes else None
     console = Console(highlight=False)
@@ -240,7 +245,7 @@ def report(
         Path | None, typer.Option(metavar="FILE", help="report.html in the run folder if not given.")
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="counts.csv or provenance.jsonl of the run's target.")
+        Path | None, typer.Option(metavar="PATH", help="counts.csv, provenance.jsonl or label_2 of the run's target.")
     ] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
@@ -263,8 +268,10 @@ def compare(
         Path | None, typer.Option(metavar="DIR", help="The images to judge by; the runs' own if not given.")
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="counts.csv or provenance.jsonl of the target, for the truth.")
+        Path | None,
+        typer.Option(metavar="PATH", help="counts.csv, provenance.jsonl or label_2 of the target, for the truth."),
     ] = None,
+    min_height: MinHeight = 0.0,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
 ) -> None:
@@ -287,7 +294,7 @@ def compare(
             images = session.open_images(target, first.model, first.record["skip_bad"], show)
         elif labels is not None:
             images = fit.open_target(first, show)
-        truth = None if labels is None else read_labels(labels, first.model, images)
+        truth = None if labels is None else read_labels(labels, first.model, images, min_height=min_height)
         found = compare.compare(opened, images, truth, show, num)
         mosaic.draw(found, out)
     comparison_table.show(found, Console(highlight=False))

@@ -73,6 +73,7 @@ class Comparison(Evaluation):
             "model": self.run.record["model"],
             "target": str(self.target),
             "classes": list(self.classes),
+            "notes": list(self.notes),
             "reference": self.reference,
             "runs": {
                 name: {
@@ -192,7 +193,8 @@ def compare(
         seen = (network_counts(run, target, progress) for run in runs.values())
         if (estimate := next((source for source in seen if source is not None), None)) is not None:
             sources[ESTIMATE] = estimate
-    return Comparison(first, path, tuple(model.classes[c] for c in columns), sources, likelihoods, runs=runs)
+    classes, notes = tuple(model.classes[c] for c in columns), () if truth is None else truth.notes
+    return Comparison(first, path, classes, sources, likelihoods, notes=notes, runs=runs)
 
 
 def _of(counts: dict[str, np.ndarray]) -> tuple[dict[str, Shares], dict[str, float]]:

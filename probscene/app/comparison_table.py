@@ -20,6 +20,8 @@ def show(comparison: Comparison, console: Console) -> None:
     Console(file=console.file, width=max(console.width, whole), highlight=False).print(table)
     if comparison.reference == ESTIMATE:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
+    for note in comparison.notes:
+        console.print(f"Labels: {note}", style="dim", soft_wrap=True)
 
 
 def made(comparison: Comparison) -> Table:

@@ -45,6 +45,7 @@ class Evaluation:
         sources: ``prior``, ``learnt``, then ``truth`` and ``estimate`` where they are known.
         likelihoods: of the truth's structures under ``prior`` and ``learnt``, where they are known.
         images: FID and KID by the features' name; see ``image_distances``.
+        notes: of the labels.
     """
 
     run: Run
@@ -53,6 +54,7 @@ class Evaluation:
     sources: dict[str, Source]
     likelihoods: dict[str, Likelihood] = field(default_factory=dict)
     images: dict[str, Distances] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def distance(self, a: str, b: str) -> dict[str, Any]:
         """How far source ``a`` is from ``b``: total variation of the number of objects and of the pooled class shares,
@@ -95,6 +97,7 @@ class Evaluation:
             "model": self.run.record["model"],
             "target": str(self.target),
             "classes": list(self.classes),
+            "notes": list(self.notes),
             "distances": self.distances(),
             "sources": {name: self._source(source) for name, source in self.sources.items()},
             "log_prob": {name: _plain(found) for name, found in self.likelihoods.items()},
@@ -169,7 +172,8 @@ def evaluate(
     if estimate is not None:
         sources["estimate"] = estimate.only(columns)
     path = Path(run.record["target"]) if target is None else target.path
-    return Evaluation(run, path, tuple(run.model.classes[c] for c in columns), sources, likelihoods, compared)
+    classes, notes = tuple(run.model.classes[c] for c in columns), () if truth is None else truth.notes
+    return Evaluation(run, path, classes, sources, likelihoods, compared, notes)
 
 
 def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> Source | None:

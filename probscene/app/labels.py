@@ -1,4 +1,4 @@
-"""The truth that learnt structures are judged by; fitting never reads it. Two kinds of files:
+"""The truth that learnt structures are judged by; fitting never reads it. Three kinds:
 
 ``counts.csv``, how many objects of each class an image shows: the columns are ``image`` and the model's classes, in any
 order; one row an image, in any order. A class that nobody has labelled has no column, and is not compared.
@@ -8,6 +8,8 @@ order; one row an image, in any order. A class that nobody has labelled has no c
 
 ``provenance.jsonl`` as ``generate`` writes it: one line an image with the rules of its structure, which says also what
 hangs below what, and how likely a policy would have derived it.
+
+A folder of KITTI's label files, see ``kitti_labels``.
 """
 
 import csv
@@ -21,6 +23,7 @@ import numpy as np
 import torch
 
 from probscene.app.files import write_text
+from probscene.app.kitti_labels import read_kitti
 from probscene.app.structures import Counts, Structures, count
 from probscene.dataset import ImageFolder
 from probscene.derivation import Derivation
@@ -35,28 +38,39 @@ class Labels(NamedTuple):
         structures: their counts ``(L, C)``, and the children of each node where whole structures are known.
         derivation: the structures themselves, where they are known.
         classes: the C that are labelled, in the model's order; all of the model's where None.
+        notes: what a person should know, one sentence each.
     """
 
     structures: Structures
     derivation: Derivation | None = None
     classes: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
 
     def columns(self, model: SceneModel) -> list[int]:
         """Of the model's classes, the C that are labelled, by number."""
         return [model.classes.index(name) for name in self.classes or model.classes]
 
 
-def read_labels(path: Path, model: SceneModel, target: ImageFolder, some: bool = False) -> Labels:
-    """The labels of a target's images, from a ``.jsonl`` of provenance or from a CSV of counts.
+def read_labels(
+    path: Path, model: SceneModel, target: ImageFolder, some: bool = False, min_height: float = 0.0
+) -> Labels:
+    """The labels of a target's images, from a ``.jsonl`` of provenance, a CSV of counts or a folder of KITTI's labels.
 
     Rows of files that the target left out as bad are passed over.
 
     Args:
         some: there need not be one for every image; those without are left out.
+        min_height: of an object's box that is counted, pixels of its image; a folder alone has boxes.
 
     Raises:
-        DataError: see ``read_counts``; a line that is none of provenance, or whose rules are not the model's.
+        DataError: see ``read_counts`` and ``read_kitti``; a line that is none of provenance, or whose rules are not the
+            model's; a least height for what has no boxes.
     """
+    if Path(path).is_dir():
+        counts, classes, notes = read_kitti(Path(path), model, target, some, min_height)
+        return Labels(Structures(counts, {}), classes=classes, notes=notes)
+    if min_height:
+        raise DataError(f"Expected a folder of KITTI's labels for a least height of objects, actual the file {path}.")
     if Path(path).suffix != ".jsonl":
         classes = _labelled(Path(path), model.classes)
         return Labels(Structures(read_counts(path, classes, target, some), {}), classes=classes)

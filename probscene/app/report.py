@@ -43,7 +43,7 @@ def report(
 
     Args:
         out: ``report.html`` in the run folder where None.
-        labels: a ``counts.csv`` or a ``provenance.jsonl`` of the run's target.
+        labels: of the run's target, see ``read_labels``.
         num: structures sampled a source.
         judged_by: scenes rendered for the verdict, none where 0.
 
@@ -161,12 +161,13 @@ def _picture(images: list[Pixels], caption: str) -> str:
 
 
 def _note(evaluation: Evaluation) -> str:
-    if "estimate" not in evaluation.sources:
-        return ""
-    return (
-        "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; its "
-        "counts are rounded."
-    )
+    notes = [f"Labels: {html.escape(note)}" for note in evaluation.notes]
+    if "estimate" in evaluation.sources:
+        notes.append(
+            "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; "
+            "its counts are rounded."
+        )
+    return " ".join(notes)
 
 
 def _nested(evaluation: Evaluation) -> str:

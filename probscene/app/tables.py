@@ -38,6 +38,8 @@ def show(evaluation: Evaluation, console: Console) -> None:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
     if evaluation.images:
         console.print(FLOOR, style="dim", soft_wrap=True)
+    for note in evaluation.notes:
+        console.print(f"Labels: {note}", style="dim", soft_wrap=True)
     for note in sorted(notes):
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
 

@@ -1,0 +1,167 @@
+"""KITTI's label files as the truth, against plain loops and torchvision's reader; every fault by file and line."""
+
+import csv
+import json
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torchvision
+from hypothesis import given
+from hypothesis import strategies as st
+from pycocotools.coco import COCO
+
+from probscene.app.generate import generate_scenes
+from probscene.app.kitti_labels import read_kitti, read_objects
+from probscene.app.labels import read_labels
+from probscene.app.loading import load_model
+from probscene.dataset import ImageFolder
+from probscene.errors import DataError
+
+STREET = SimpleNamespace(name="street", classes=("tree", "car", "pedestrian", "bike", "truck"))
+CLASS = {"Car": "car", "Pedestrian": "pedestrian", "Person_sitting": "pedestrian", "Cyclist": "bike", "Truck": "truck"}
+OTHERS = ("Van", "Tram", "Misc", "DontCare")
+REST = "1.50 1.60 3.90 1.00 1.70 12.00 0.10"
+
+
+def line(type, height=30.0, left=10.0) -> str:
+    return f"{type} 0.00 0 0.02 {left:.2f} 100.00 {left + 40:.2f} {100 + height:.2f} {REST}"
+
+
+def images(folder, names) -> SimpleNamespace:
+    """Of an ``ImageFolder``, the paths."""
+    return SimpleNamespace(path=Path(folder), paths=[Path(folder, name) for name in names], bad={})
+
+
+@given(st.lists(st.lists(st.sampled_from([*CLASS, *OTHERS])), min_size=1, max_size=9))
+def test_counts_are_those_of_the_lines(tmp_path_factory, frames):
+    folder = tmp_path_factory.mktemp("label_2")
+    for i, types in enumerate([*frames, ["Car"]]):  # the last one is of no image
+        (folder / f"{i:06d}.txt").write_text("".join(line(type) + "\n" for type in types))
+    target = images("x", [f"{i:06d}.{('png', 'jpg')[i % 2]}" for i in range(len(frames))])
+    counts, classes, notes = read_kitti(folder, STREET, target)
+    assert classes == ("car", "pedestrian", "bike", "truck")  # nobody labels trees
+    assert counts.tolist() == [[sum(CLASS.get(t) == c for t in types) for c in classes] for types in frames]
+    out = Counter(type for types in frames for type in types if type in OTHERS)
+    assert all(f"{number} {type}" in notes[-1] for type, number in out.items())
+    assert any("Cyclist as bike" in note for note in notes) == any("Cyclist" in types for types in frames)
+
+
+def test_low_objects_are_counted_only_where_not_said_otherwise(tmp_path):
+    (tmp_path / "a.txt").write_text("\n".join(line("Car", height) for height in (10, 24.9, 25, 60)))
+    (tmp_path / "b.txt").write_text(line("DontCare", 3) + "\r\n\n")
+    target = images("x", ["a.png", "b.png"])
+    assert read_kitti(tmp_path, STREET, target)[0][:, 0].tolist() == [4, 0]
+    counts, _, notes = read_kitti(tmp_path, STREET, target, min_height=25)
+    assert counts[:, 0].tolist() == [2, 0] and "2 objects of less than 25 pixels" in notes[-1]
+
+
+def test_names_of_the_model_go_first(tmp_path):
+    (tmp_path / "a.txt").write_text("\n".join(map(line, ("Pedestrian", "Person_sitting", "Person_sitting"))))
+    model = SimpleNamespace(name="m", classes=("person", "Person_Sitting"))
+    assert read_kitti(tmp_path, model, images("x", ["a.png"]))[0].tolist() == [[1, 2]]
+
+
+def test_images_without_a_file_are_left_out_only_where_some_are_labelled(tmp_path):
+    (tmp_path / "b.txt").write_text(line("Car"))
+    target = images("x", ["a.png", "b.png", "c.png"])
+    with pytest.raises(DataError, match="actual none named a.txt and 1 more"):
+        read_kitti(tmp_path, STREET, target)
+    assert read_kitti(tmp_path, STREET, target, some=True)[0].tolist() == [[1, 0, 0, 0]]
+    (tmp_path / "b.txt").unlink()
+    with pytest.raises(DataError, match="actual none named a.txt and 2 more"):
+        read_kitti(tmp_path, STREET, target, some=True)
+
+
+FAULTS = {
+    "fourteen columns": (line("Car").rsplit(" ", 1)[0], "15 columns", "actual 14"),
+    "a score": (line("Car") + " 0.93", "15 columns", "actual 16"),
+    "two words": (line("Person sitting"), "15 columns", "actual 16"),
+    "a word": (line("Car").replace("12.00", "far"), "a number for z", "'far'"),
+    "not a number": (line("Car").replace("130.00", "nan"), "a number for bottom", "'nan'"),
+    "without end": (line("Car").replace("1.60", "inf"), "a number for width", "'inf'"),
+    "a box that is turned": (line("Car", -3), "top to bottom", "10.00 100.00 50.00 97.00"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_wrong_lines_are_named(fault, tmp_path):
+    wrong, *parts = FAULTS[fault]
+    (tmp_path / "000007.txt").write_text("\n".join([line("Car"), "", wrong, line("Van")]))
+    with pytest.raises(DataError, match=r"^Expected .* in line 3 of .*000007\.txt") as error:
+        read_kitti(tmp_path, STREET, images("x", ["000007.png"]))
+    assert all(part in str(error.value) for part in parts) and "\n" not in str(error.value)
+
+
+def test_what_is_no_text_or_has_no_class(tmp_path):
+    (tmp_path / "a.txt").write_bytes(b"Car \xff")
+    with pytest.raises(DataError, match="UTF-8"):
+        read_kitti(tmp_path, STREET, images("x", ["a.png"]))
+    (tmp_path / "a.txt").write_text(line("Car"))
+    model = SimpleNamespace(name="digits", classes=("0", "1"))
+    with pytest.raises(DataError, match=r"'digits' has classes for \(0, 1\), actual Car"):
+        read_kitti(tmp_path, model, images("x", ["a.png"]))
+
+
+def test_a_written_dataset_is_read_back(tmp_path):
+    model = load_model(str(Path(__file__).with_name("plates.py")))
+    generate_scenes(model, model.prior, 40, tmp_path / "out", seed=1, format="kitti,coco")
+    dataset = COCO(tmp_path / "out" / "annotations.json")
+    seen = [Counter(dataset.cats[a["category_id"]]["name"] for a in dataset.imgToAnns[i]) for i in range(40)]
+    target = ImageFolder(tmp_path / "out" / "images", model.canvas, model.channels)
+    read = read_labels(tmp_path / "out" / "Kitti" / "raw" / "training" / "label_2", model, target)
+    assert read.classes == model.classes and not read.notes
+    assert read.structures.counts.tolist() == [[found[name] for name in model.classes] for found in seen]
+
+
+@pytest.fixture
+def labelled(target, tmp_path):
+    """The target's labels as KITTI writes them, with types in capitals, one object of each image 8 pixels high."""
+    (tmp_path / "label_2").mkdir()
+    names = sorted(path.stem for path in target.images.iterdir())
+    for name, row in zip(names, target.counts, strict=True):
+        types = ["Red"] * row[0] + ["BLUE"] * row[1]
+        lines = [line(type, 8 if k == 0 else 40) for k, type in enumerate(types)] + [line("DontCare")]
+        (tmp_path / "label_2" / f"{name}.txt").write_text("\n".join(lines))
+    return tmp_path / "label_2"
+
+
+def test_the_commands_take_the_folder(call, fitted, target, labelled, tmp_path):
+    words = ["--target", target.images, "--labels", labelled, "--num", 100, "--json", tmp_path / "e.json"]
+    for command, more in (("evaluate", ["--scenes", 0]), ("compare", ["--out", tmp_path / "c.png"])):
+        done = call(command, fitted, *words, *more)
+        assert done.code == 0, done.err
+        record = json.loads((tmp_path / "e.json").read_text())
+        assert record["sources"]["truth"]["mean_number"] == target.counts.sum() / 40
+        assert "40 DontCare" in record["notes"][-1] and "40 DontCare" in done.out
+        done = call(command, fitted, *words, *more, "--min-height", 9)
+        assert done.code == 0, done.err
+        record = json.loads((tmp_path / "e.json").read_text())
+        assert record["sources"]["truth"]["mean_number"] == np.maximum(target.counts.sum(1) - 1, 0).mean()
+    refused = call("evaluate", fitted, *words[:2], "--labels", target.labels, "--min-height", 9)
+    assert refused.code == 2 and "least height" in refused.err and str(target.labels) in refused.err
+    (labelled / "000003.txt").write_text("Car 1 2\n")
+    refused = call("evaluate", fitted, *words)
+    assert refused.code == 2 and "line 1 of" in refused.err.splitlines()[-1] and "000003.txt" in refused.err
+
+
+def test_the_benchmarks_own_labels(data_dir, tmp_path):
+    folder = data_dir / "kitti"
+    if not (folder / "label_2").is_dir():
+        pytest.skip(f"no KITTI labels in {folder}")
+    with open(folder / "counts_7481.csv", encoding="utf-8") as file:
+        known = {row["frame"]: row for row in csv.DictReader(file)}
+    frames = sorted(path.stem for path in (folder / "label_2").iterdir())
+    model = SimpleNamespace(name="kitti", classes=("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist"))
+    counts, classes, _ = read_kitti(folder / "label_2", model, images("x", [f"{frame}.jpg" for frame in frames]))
+    assert counts.tolist() == [[int(known[frame][name]) for name in classes] for frame in frames]
+    (tmp_path / "Kitti" / "raw").mkdir(parents=True)
+    (tmp_path / "Kitti" / "raw" / "training").symlink_to(folder)
+    dataset = torchvision.datasets.Kitti(tmp_path)
+    for k in range(0, len(frames), 9):
+        image, read = dataset[k]
+        image.close()
+        own = read_objects(folder / "label_2" / f"{Path(dataset.images[k]).stem}.txt")
+        assert [(one["type"], *one["bbox"]) for one in read] == [tuple(one) for one in own]
