@@ -1,7 +1,9 @@
 """COCO: the labels of a dataset in the format of cocodataset.org, written one annotation at a time.
 
 Beyond the format's own keys an annotation has ``visible_fraction``, visible pixels over those of the whole silhouette,
-and ``amodal_bbox``, the box of the whole silhouette, which others may cover and the canvas may cut.
+and ``amodal_bbox``, the box of the whole silhouette, which others may cover and the canvas may cut. Of a 3D scene it
+also has ``truncated``, the share of that box beyond the canvas, and ``box_3d``: height, width, length, x, y, z and
+rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within the canvas.
 """
 
 import json
@@ -52,6 +54,7 @@ def annotations(model: SceneModel, batch: RenderBatch, first: int) -> list[dict[
                     "iscrowd": 0,
                     "visible_fraction": round(float(batch.visible[i, node]), 6),
                     "amodal_bbox": _corner_and_size(batch.amodal_box[i, node]),
+                    **_in_space(batch, i, node),
                 }
             )
     return found
@@ -92,6 +95,18 @@ def _masks(instance: Tensor, nodes: Tensor) -> list[dict[str, Any]]:
     masks = columns == (nodes + 1).view(-1, 1, 1).to(columns.dtype)
     encoded = rle.encode(masks.numpy().view("uint8").transpose(2, 1, 0))
     return [{"size": mask["size"], "counts": mask["counts"].decode("ascii")} for mask in encoded]
+
+
+def _in_space(batch: RenderBatch, i: int, node: int) -> dict[str, Any]:
+    """What an annotation has beside the rest in 3D, where a silhouette's ends are between pixels."""
+    if batch.space is None:
+        return {}
+    x0, y0, x1, y1 = batch.amodal_box[i, node].tolist()
+    return {
+        "amodal_bbox": [round(v, 3) for v in (x0, y0, x1 - x0, y1 - y0)],
+        "truncated": round(float(batch.space.truncated[i, node]), 6),
+        "box_3d": [round(v, 5) for v in batch.space.box[i, node].tolist()],
+    }
 
 
 def _corner_and_size(box: Tensor) -> list[int]:

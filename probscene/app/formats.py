@@ -2,7 +2,7 @@
 
     coco        annotations.json
     yolo        labels/000000.txt ... and data.yaml
-    kitti       Kitti/raw/training/ with image_2, label_2 and instance
+    kitti       Kitti/raw/training/ with image_2, label_2 and instance, and calib of 3D scenes
     webdataset  shard-000000.tar ..., images and labels together
     images      no labels
 

@@ -185,6 +185,9 @@ class Job:
             masks = kitti.instances(self.model, batch, first)
             files |= {kitti.file_name("label_2", i): kitti.label(self.model, of_image[i]).encode() for i in of_image}
             files |= {kitti.file_name("instance", i): mask for i, mask in zip(of_image, masks, strict=True)}
+            if batch.space is not None:
+                calibs = map(kitti.calib, batch.space.intrinsics)
+                files |= {kitti.file_name("calib", i): text.encode() for i, text in zip(of_image, calibs, strict=True)}
             links |= {kitti.file_name("image_2", i): self.parts.image(i) for i in of_image}
         return files, links
 
