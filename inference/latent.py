@@ -34,6 +34,10 @@ class Guide(nn.Module, Policy):
         with pyro.plate("scenes", num_scenes, dim=-2):
             return derive(self.grammar, self, num_scenes, self.max_steps)
 
+    def strata(self, derivation: Derivation) -> Tensor:
+        """``(N,)`` int64: scenes whose costs have a baseline together; all, unless there is a guide a scenario."""
+        return torch.zeros(len(derivation), dtype=torch.int64)
+
 
 class LatentGuide(Guide):
     """A guide with a buffer ``latents (Z, size)``; subclasses register it and give ``logits`` for each."""

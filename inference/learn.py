@@ -101,12 +101,12 @@ class Learner:
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
-        average = self.objective.average
-        average = math.nan if average is None else average
-        return training_state(self.guide, {"adam": self.optimiser}, average=average, done=self.done)
+        averages = {f"average-{stratum}": value for stratum, value in self.objective.averages.items()}
+        return training_state(self.guide, {"adam": self.optimiser}, done=self.done, **averages)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
         numbers = restore_training(self.guide, {"adam": self.optimiser}, tensors)
-        self.objective.average = None if math.isnan(numbers["average"]) else numbers["average"]
         self.done = int(numbers["done"])
+        averages = {key: value for key, value in numbers.items() if key.startswith("average-")}
+        self.objective.averages = {int(key.removeprefix("average-")): value for key, value in averages.items()}

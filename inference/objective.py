@@ -70,6 +70,8 @@ class ScoreFunction:
         clip: the importance ratio of those steps stays within ``1 +- clip``.
         scale: of the whole cost; under Adam it changes nothing but the weight of the rejections.
         reject_weight, reject_threshold: lambda and epsilon of section 3.3.
+        strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
+            several guides learn together; all have one where None.
 
     Attributes:
         batch: the last ``Batch``, for logging.
@@ -89,6 +91,7 @@ class ScoreFunction:
         scale: float = 1.0,
         reject_weight: float = 1e-2,
         reject_threshold: float = 1.0,
+        strata: Callable[[Derivation], Tensor] | None = None,
     ):
         if baseline not in BASELINES:
             raise ProbsceneError(f"Expected a baseline among {', '.join(BASELINES)}, actual {baseline!r}.")
@@ -99,7 +102,8 @@ class ScoreFunction:
         self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
         self.updates, self.clip, self.scale = updates, clip, scale
         self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
-        self.average: float | None = None
+        self.strata = strata
+        self.averages: dict[int, float] = {}  # moving, by stratum
         self.batch: Batch | None = None
         self._used = 0
         self._drawn_with: Tensor | None = None  # log q(T) under the guide that drew the batch
@@ -126,15 +130,25 @@ class ScoreFunction:
             features = self.observe(realise(model, derivation, failures=failures))
             cost = self.divergence(features, real)
             cost = cost + self.reject_weight * (failures > self.reject_threshold)
-            advantage = self.scale * (cost - self._baseline(cost))
+            strata = torch.zeros(len(cost), dtype=torch.int64) if self.strata is None else self.strata(derivation)
+            advantage = self.scale * (cost - self._baseline(cost, strata))
             return Batch(derivation, features, cost, advantage, failures.float().mean().item())
 
-    def _baseline(self, cost: Tensor) -> Tensor | float:
-        if self.baseline == "leave_one_out":
-            return (cost.sum() - cost) / (len(cost) - 1)
+    def _baseline(self, cost: Tensor, strata: Tensor) -> Tensor:
+        baseline = torch.zeros_like(cost)
         if self.baseline == "none":
-            return 0.0
-        new = cost.mean().item()
+            return baseline
+        for stratum in strata.unique().tolist():
+            own = strata == stratum
+            if self.baseline == "moving_average":
+                baseline[own] = self._average(stratum, cost[own].mean().item())
+            else:
+                others = cost[own] if own.sum() > 1 else cost  # a scene alone in its stratum has none
+                baseline[own] = (others.sum() - cost[own]) / (len(others) - 1)
+        return baseline
+
+    def _average(self, stratum: int, new: float) -> float:
         # The paper leaves the first value open. From 0, every scene of the first batches would seem bad, or good.
-        self.average = new if self.average is None else self.decay * new + (1 - self.decay) * self.average
-        return self.average
+        before = self.averages.get(stratum)
+        self.averages[stratum] = new if before is None else self.decay * new + (1 - self.decay) * before
+        return self.averages[stratum]

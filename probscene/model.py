@@ -55,6 +55,7 @@ class SceneModel:
         groups: by what objects are counted; over the whole image where None.
         pretraining: the policy whose derivations a guide is pretrained on, the prior where None. A guide learns only
             from what it draws: give it now and then longer lists than the prior has, where the target may have them.
+        scenarios: the models that this one is joined of, by name, see ``scenarios.join``.
         target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
 
     Raises:
@@ -74,6 +75,7 @@ class SceneModel:
     groups: Groups | None = None
     pretraining: Policy | None = None
     target: Callable[[int], "SceneModel"] | None = None
+    scenarios: tuple[tuple[str, "SceneModel"], ...] = ()
 
     def __post_init__(self):
         unknown = [c for c in self.classes if c not in self.grammar.kinds]

@@ -89,6 +89,22 @@ class StructurePrior(Policy):
         table[V, :, :, 0] = 1.0
         self.table = table.log().float()
 
+    @staticmethod
+    def joined(grammar: Grammar, priors: list["StructurePrior"], weights: list[float]) -> "StructurePrior":
+        """The prior of a ``JointGrammar``: a scenario by its weight, then that scenario's own table."""
+        V, K = len(grammar.nonterminals), len(grammar.rules)
+        P, C = (max(prior.table.shape[i] for prior in priors) for i in (1, 2))
+        table = torch.full((V + 1, P, C, K), -torch.inf)
+        table[0, :, :, : len(priors)] = _normalised(tuple(weights), len(priors), "weights of scenarios").log().float()
+        table[V, :, :, 0] = 0.0
+        for prior, v, k in zip(priors, grammar.first_symbol, grammar.first_rule, strict=True):
+            own = prior.table[:-1]
+            own = own[:, torch.arange(P).clamp(max=own.shape[1] - 1)][:, :, torch.arange(C).clamp(max=own.shape[2] - 1)]
+            table[v : v + own.shape[0], :, :, k : k + own.shape[3]] = own
+        joint = StructurePrior.__new__(StructurePrior)
+        joint.grammar, joint.table = grammar, table
+        return joint
+
     def step(self, memory: None, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, None]:
         """Log-probabilities ``(N, K)``; there is no memory."""
         return self._look_up(frontier), None

@@ -138,6 +138,10 @@ def fit(
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same result; 0 if not given.")] = None,
     skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = None,
     threads: Annotated[int | None, typer.Option(help="All cores if not given.")] = None,
+    scenarios: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="Of a model that has several; a guide learns each. All if not given."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Learn which structures occur in a folder of unlabelled images."""
@@ -149,6 +153,10 @@ def fit(
     if threads is not None and threads < 1:
         raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
     chosen = _preset(preset, objective, guide, features, settings or [])
+    if scenarios is not None:
+        if model is None:
+            raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")
+        model = f"{model}:{scenarios}"
     with Display() as show:
         if resume:
             given = chosen if preset or objective or guide or features or settings else None

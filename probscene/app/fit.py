@@ -218,7 +218,12 @@ def _learn(
     seed_everything(batch_seed(seed, 2))
     guide = run.new_guide()
     objective = ScoreFunction(
-        observe, preset.divergence(), baseline=preset.baseline, updates=preset.updates, scale=preset.scale
+        observe,
+        preset.divergence(),
+        baseline=preset.baseline,
+        updates=preset.updates,
+        scale=preset.scale,
+        strata=guide.strata,
     )
     learner = Learner(
         model,

@@ -1,4 +1,8 @@
-"""MODEL on the command line: a built-in name, or the path of a Python file that exports a ``SceneModel``."""
+"""MODEL on the command line: a built-in name, or the path of a Python file that exports a ``SceneModel``.
+
+A file may export several models by name, ``SCENARIOS = {"city": ..., "rural": ...}``: ``streets.py`` is then all of
+them joined into one (``scenarios.join``), ``streets.py:city,rural`` is these two, and ``streets.py:city`` is one model.
+"""
 
 import hashlib
 import importlib
@@ -10,6 +14,7 @@ from pathlib import Path
 from probscene.errors import ModelError, ProbsceneError
 from probscene.model import SceneModel
 from probscene.renderers.sprites import SpriteRenderer
+from probscene.scenarios import join
 
 BUILT_IN = {"multi_mnist": "probscene.models.multi_mnist", "aerial2d": "probscene.models.aerial2d"}
 
@@ -18,17 +23,19 @@ def load_model(reference: str) -> SceneModel:
     """The scene model that a name or a file gives.
 
     Raises:
-        ModelError: no such name or file, a file that does not import, or one that exports none or several models.
+        ModelError: no such name or file, a file that does not import, one that exports none or several models, or a
+            scenario that it lacks.
     """
-    if reference in BUILT_IN:
-        return _exported(vars(importlib.import_module(BUILT_IN[reference])), reference)
-    path = Path(reference)
+    base, scenarios = split_reference(reference)
+    if base in BUILT_IN:
+        return _exported(vars(importlib.import_module(BUILT_IN[base])), base, scenarios)
+    path = Path(base)
     if path.suffix != ".py":
         raise ModelError(
             f"Expected a built-in model ({', '.join(BUILT_IN)}) or a path to a .py file, actual {reference!r}."
         )
     if not path.is_file():
-        raise ModelError(f"Expected a model file, actual {reference!r}, which is not there.")
+        raise ModelError(f"Expected a model file, actual {base!r}, which is not there.")
     name = "probscene_model_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
@@ -40,10 +47,26 @@ def load_model(reference: str) -> SceneModel:
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         raise ModelError(
-            f"Model file {reference} does not import: {type(error).__name__}: {error} "
-            f"({Path(where.filename).name}, line {where.lineno}). Try 'python {reference}'."
+            f"Model file {base} does not import: {type(error).__name__}: {error} "
+            f"({Path(where.filename).name}, line {where.lineno}). Try 'python {base}'."
         ) from error
-    return _exported(vars(module), reference)
+    return _exported(vars(module), base, scenarios)
+
+
+def split_reference(reference: str) -> tuple[str, tuple[str, ...]]:
+    """The name or file of a reference, and the scenarios that it names, if any."""
+    base, colon, names = str(reference).rpartition(":")
+    if colon and (base in BUILT_IN or base.endswith(".py")):
+        return base, tuple(name.strip() for name in names.split(","))
+    return str(reference), ()
+
+
+def lasting_reference(reference: str) -> str:
+    """A reference that means the same from every folder."""
+    base, scenarios = split_reference(reference)
+    if base not in BUILT_IN:
+        base = str(Path(base).resolve())
+    return f"{base}:{','.join(scenarios)}" if scenarios else base
 
 
 def renderer_for(model: SceneModel, threads: int | None = None) -> SpriteRenderer:
@@ -51,7 +74,10 @@ def renderer_for(model: SceneModel, threads: int | None = None) -> SpriteRendere
     return SpriteRenderer(model.canvas, threads)
 
 
-def _exported(names: dict, reference: str) -> SceneModel:
+def _exported(names: dict, reference: str, wanted: tuple[str, ...] = ()) -> SceneModel:
+    scenarios = names.get("SCENARIOS", {})
+    if wanted or (scenarios and "MODEL" not in names):
+        return _joined(scenarios, reference, wanted)
     found = {name: value for name, value in names.items() if isinstance(value, SceneModel)}
     if "MODEL" in found:
         return found["MODEL"]
@@ -60,3 +86,17 @@ def _exported(names: dict, reference: str) -> SceneModel:
             f"Expected {reference} to export one SceneModel, or one named MODEL, actual {sorted(found) or 'none'}."
         )
     return next(iter(found.values()))
+
+
+def _joined(scenarios: dict[str, SceneModel], reference: str, wanted: tuple[str, ...]) -> SceneModel:
+    if not scenarios:
+        raise ModelError(f"Expected SCENARIOS in {reference}, from which {','.join(wanted)} are chosen, actual none.")
+    unknown = [name for name in wanted if name not in scenarios]
+    if unknown or len(set(wanted)) < len(wanted):
+        raise ModelError(
+            f"Expected scenarios of {reference} among {', '.join(scenarios)}, each once, actual {', '.join(wanted)}."
+        )
+    chosen = {name: scenarios[name] for name in wanted or scenarios}
+    if len(chosen) == 1:
+        return next(iter(chosen.values()))
+    return join("-".join([Path(reference).stem, *wanted]), chosen)

@@ -20,10 +20,11 @@ import safetensors.torch
 from torch import Tensor
 
 from probscene.app.files import make_folder, write_json, write_whole
-from probscene.app.loading import BUILT_IN, load_model
+from probscene.app.loading import BUILT_IN, lasting_reference, load_model, split_reference
 from probscene.errors import DataError, ModelError, RunError
 from probscene.inference.guide import make_guide
 from probscene.inference.latent import Guide
+from probscene.inference.scenario_guide import ScenarioGuide
 from probscene.model import SceneModel
 
 FORMAT = 1  # of the run folder; another number is not read
@@ -54,15 +55,12 @@ class Run:
         Run.check_free(path)
         assets = load_model(model).assets
         make_folder(path)
-        reference = model
-        digest = None
-        if model not in BUILT_IN:
-            reference = str(Path(model).resolve())
-            digest = _sha256(Path(model))
+        reference, file = lasting_reference(model), split_reference(model)[0]
+        digest = None if file in BUILT_IN else _sha256(Path(file))
         run = Run(path, {**record, "format": FORMAT, "model": reference, "model_sha256": digest, "assets": assets})
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
         if digest is not None:
-            write_whole(path / "model.py", lambda temporary: shutil.copyfile(model, temporary))
+            write_whole(path / "model.py", lambda temporary: shutil.copyfile(file, temporary))
         return run
 
     @staticmethod
@@ -115,9 +113,10 @@ class Run:
         """
         if self._model is None:
             reference, digest = self.record["model"], self.record["model_sha256"]
-            if digest is not None and (not Path(reference).is_file() or _sha256(Path(reference)) != digest):
+            file = Path(split_reference(reference)[0])
+            if digest is not None and (not file.is_file() or _sha256(file) != digest):
                 raise RunError(
-                    f"Expected the model file {reference} as it was when {self.path} was fitted, actual a missing or "
+                    f"Expected the model file {file} as it was when {self.path} was fitted, actual a missing or "
                     f"changed file. A copy is in {self.path / 'model.py'}: put it back, or fit again."
                 )
             model = load_model(reference)
@@ -132,7 +131,8 @@ class Run:
     def new_guide(self) -> Guide:
         """An untrained guide of the kind and size that the run was begun with; one that names no kind has an LSTM."""
         settings = {"kind": "lstm", **self.record["guide"]}
-        return make_guide(grammar=self.model.grammar, max_steps=self.model.max_steps, **settings)
+        made = ScenarioGuide if self.model.scenarios else make_guide
+        return made(grammar=self.model.grammar, max_steps=self.model.max_steps, **settings)
 
     def guide(self) -> Guide:
         """The learnt guide.

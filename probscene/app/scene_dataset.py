@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from probscene.app.coco import labelled
-from probscene.app.loading import BUILT_IN, load_model, renderer_for
+from probscene.app.loading import lasting_reference, load_model, renderer_for, split_reference
 from probscene.app.provenance import CHUNK, as_written, draw_chunk
 from probscene.app.run import Run, is_run
 from probscene.batch import RenderBatch
@@ -198,4 +198,4 @@ class SceneDataset(IterableDataset):
 def _resolved(source: Run | Path | str) -> str:
     """A folder or a file that another process finds, whatever its working folder."""
     path = str(source.path if isinstance(source, Run) else source)
-    return str(Path(path).resolve()) if Path(path).exists() and path not in BUILT_IN else path
+    return lasting_reference(path) if Path(split_reference(path)[0]).exists() else path

@@ -11,7 +11,7 @@ from typing import Any
 from probscene.app import fit
 from probscene.app.display import Display
 from probscene.app.files import write_json
-from probscene.app.loading import BUILT_IN, load_model
+from probscene.app.loading import lasting_reference, load_model
 from probscene.app.run import Run
 from probscene.checks import check
 from probscene.dataset import ImageFolder
@@ -70,9 +70,11 @@ def resume(
         DataError: see ``ImageFolder``.
     """
     run = Run.open(out)
-    given = {"model": model, "target": None if target is None else str(target.resolve()), **settings}
-    if model is not None and model not in BUILT_IN:
-        given["model"] = str(Path(model).resolve())
+    given = {
+        "model": None if model is None else lasting_reference(model),
+        "target": None if target is None else str(target.resolve()),
+        **settings,
+    }
     given = {key: value for key, value in given.items() if value is not None}
     before = {key: run.record.get(key) for key in given}
     if preset is not None:  # field by field, so that the message names the one that differs

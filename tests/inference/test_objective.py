@@ -136,7 +136,7 @@ def test_moving_average_is_the_papers(small):
         loss(small.program, guide, 20, real=None)
         new = loss.batch.cost.mean().item()
         expected = new if expected is None else 0.05 * new + 0.95 * expected
-        assert loss.average == pytest.approx(expected)
+        assert loss.averages == {0: pytest.approx(expected)}
         assert torch.allclose(loss.batch.advantage, loss.batch.cost - expected)
 
 

@@ -1,0 +1,96 @@
+"""One drawing out of those of several programs, each of which drew some of the scenes.
+
+Axis letters: N scenes, M nodes, S strips of ground.
+"""
+
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from probscene.drawing import Drawing, Layer
+from probscene.errors import ModelError
+from probscene.world import Ground, MeshLayer, World
+
+
+def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor, Drawing | World]]) -> Drawing | World:
+    """The drawing whose scene i comes from the drawing that owns it.
+
+    Args:
+        kind: ``(N, M)`` of the joint scenes, index into ``kinds``.
+        drawn: pairs of ``own (N,)`` bool, disjoint and together all scenes, and a drawing of N scenes.
+
+    Raises:
+        ModelError: drawings in 2D and worlds in 3D, or backgrounds that differ.
+    """
+    if all(isinstance(drawing, Drawing) for _, drawing in drawn):
+        backgrounds = {tuple(drawing.background) for _, drawing in drawn}
+        if len(backgrounds) > 1:
+            raise ModelError(
+                f"Expected scenarios with one background, actual {sorted(backgrounds)}; draw it as a layer."
+            )
+        return Drawing(kind, kinds, _layers(kind, drawn), backgrounds.pop())
+    if not all(isinstance(drawing, World) for _, drawing in drawn):
+        raise ModelError(
+            "Expected scenarios that all draw sprites, or all build worlds, actual both; join those alike."
+        )
+    parts = {name: _chosen([(own, getattr(w, name)) for own, w in drawn]) for name in ("camera", "light", "photo")}
+    return World(kind, kinds, _layers(kind, drawn), ground=_ground([(own, w.ground) for own, w in drawn]), **parts)
+
+
+def _layers(kind: Tensor, drawn: list[tuple[Tensor, Drawing | World]]) -> tuple[Layer | MeshLayer, ...]:
+    """All layers, each present only in its own scenes; those of nodes as wide as the joint nodes."""
+    found = []
+    for own, drawing in drawn:
+        M = drawing.kind.shape[1]
+        for layer in drawing.layers:
+            present = layer.present & own.unsqueeze(1)
+            of_nodes = layer.labelled or layer.present.shape[1] == M
+            values = {key: value for key, value in vars(layer).items() if isinstance(value, Tensor)}
+            values["present"] = present
+            if of_nodes:
+                values = {key: _as_wide(value, kind.shape[1]) for key, value in values.items()}
+            found.append(replace(layer, **values))
+    return tuple(found)
+
+
+def _as_wide(value: Tensor, M: int) -> Tensor:
+    """``(N, m, ...)`` with M columns: cut, or padded with zeros. An own scene's nodes are never cut."""
+    value = value[:, :M]
+    return pad(value, (0, 0) * (value.ndim - 2) + (0, M - value.shape[1])).contiguous()
+
+
+def _chosen(parts: list[tuple[Tensor, object]]):
+    """Every tensor of a dataclass, scene by scene from the part that owns it."""
+    names = [field.name for field in fields(parts[0][1])]
+    return type(parts[0][1])(**{name: _rows([(own, getattr(part, name)) for own, part in parts]) for name in names})
+
+
+def _ground(parts: list[tuple[Tensor, Ground | None]]) -> Ground | None:
+    """Grounds with as many strips as the one that has most; strips are added that have no width."""
+    if all(ground is None for _, ground in parts):
+        return None
+    if any(ground is None for _, ground in parts):
+        raise ModelError("Expected scenarios that all have a ground, or none, actual both; give every scenario one.")
+    strips = max(ground.surface.shape[1] for _, ground in parts)
+    surfaces, wide = (), []
+    for own, ground in parts:
+        more = strips - ground.surface.shape[1]
+        surface = torch.cat([ground.surface, ground.surface[:, -1:].expand(-1, more)], 1) + len(surfaces)
+        last = ground.edges[:, -1:] if ground.edges.shape[1] else torch.zeros(len(own), 1)
+        edges = torch.cat([ground.edges, last.expand(-1, more)], 1)
+        wide.append((own, replace(ground, surfaces=(), edges=edges, surface=surface)))
+        surfaces += ground.surfaces
+    edges, surface, offset = (
+        _rows([(own, getattr(g, key)) for own, g in wide]) for key in ("edges", "surface", "offset")
+    )
+    return Ground(surfaces, edges, surface, offset)
+
+
+def _rows(values: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Tensors of one shape, scene by scene from the one that owns it."""
+    _, whole = values[0]
+    for own, value in values[1:]:
+        whole = torch.where(own.view(-1, *[1] * (value.ndim - 1)), value, whole)
+    return whole

@@ -1,0 +1,237 @@
+"""Several models as one: a scenario is drawn, then a scene of that scenario's own model (Meta-Sim2, supplement).
+
+The joint grammar has a first production for every scenario, ``Scenario -> Scene-city | Scene-rural``, and below it each
+scenario's own productions, their nonterminals marked with its name. Objects of one name are one kind. The program runs
+every scenario's own program on its own part of the derivations, its sites named ``city/car.x``, and joins what they
+draw; a scene of another scenario counts nowhere in it. Whatever works on a model works on several, then: previews,
+features, datasets, provenance, reports. Axis letters: N scenes, T steps, K rules, S scenarios.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+
+import pyro
+import torch
+from pyro import poutine
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from probscene.derivation import Derivation, Frontier, expand
+from probscene.derive import derive
+from probscene.drawing import Drawing
+from probscene.enumeration import shortest_lengths
+from probscene.errors import ModelError
+from probscene.grammar import Grammar, Node, Rule, is_nonterminal
+from probscene.joining import join_drawings
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.structure import StructurePrior
+from probscene.world import World
+
+START = "Scenario"
+
+
+class JointGrammar(Grammar):
+    """One grammar out of several, and the way between a joint derivation and its part.
+
+    Args:
+        parts: the scenarios' own grammars, by name.
+
+    Attributes:
+        parts: as given.
+        first_rule: ``(S,)`` the joint number of each part's first rule; they follow in its own order.
+        first_symbol: ``(S,)`` likewise of its nonterminals.
+    """
+
+    def __init__(self, parts: Mapping[str, Grammar]):
+        self.parts = dict(parts)
+        rules = [Rule(START, f"{part.nonterminals[0]}-{name}") for name, part in self.parts.items()]
+        for name, part in self.parts.items():
+            rules += [
+                Rule(f"{rule.lhs}-{name}", *(_marked(symbol, name) for symbol in rule.rhs)) for rule in part.rules
+            ]
+        super().__init__(rules)
+        rules_before, symbols_before = len(self.parts), 1
+        self.first_rule, self.first_symbol = [], []
+        for part in self.parts.values():
+            self.first_rule.append(rules_before)
+            self.first_symbol.append(symbols_before)
+            rules_before, symbols_before = rules_before + len(part.rules), symbols_before + len(part.nonterminals)
+
+    def scenario(self, derivation: Derivation) -> Tensor:
+        """``(N,)`` int64, which scenario each scene is of; 0 where nothing is derived yet."""
+        return derivation.rules[:, 0].clamp(min=0)
+
+    def own(self, derivation: Derivation, number: int) -> Derivation:
+        """Derivations that are all of scenario ``number``, as ones of its own grammar."""
+        own = list(self.parts.values())[number]
+        rules = derivation.rules[:, 1:]
+        rules = (rules - self.first_rule[number]).masked_fill(rules < 0, -1)
+        frontier, _ = self.part_frontier(Frontier(*(x[:, 1:] for x in derivation.frontier)), number)
+        kinds = torch.tensor([own.kinds.index(kind) if kind in own.kinds else -1 for kind in self.kinds] + [-1])
+        return Derivation(rules, derivation.complete, kinds[derivation.kind], derivation.parent, frontier)
+
+    def sites(self, derivation: Derivation, number: int) -> dict[str, Tensor]:
+        """The values ``(N, 1)`` of the sites ``rule_t`` of scenario ``number``'s own program: of its own scenes, and of
+        a shortest derivation in all others."""
+        own, rules = self.scenario(derivation) == number, derivation.rules[:, 1:]
+        shortest = _shortest(list(self.parts.values())[number])
+        padded = torch.zeros(len(rules), max(rules.shape[1], len(shortest)), dtype=torch.int64)
+        padded[:, : rules.shape[1]] = (rules - self.first_rule[number]).masked_fill(rules < 0, 0)
+        padded[~own] = 0
+        padded[~own, : len(shortest)] = shortest
+        return {f"rule_{t}": padded[:, t : t + 1] for t in range(padded.shape[1])}
+
+    def part_frontier(self, frontier: Frontier, number: int) -> tuple[Frontier, Tensor]:
+        """What scenario ``number``'s own policy sees of a joint frontier, and in which scenes ``(N,)``; elsewhere, and
+        before the scenario is drawn, its derivation seems finished."""
+        grammar = list(self.parts.values())[number]
+        symbol = frontier.symbol - self.first_symbol[number]
+        own = (symbol >= 0) & (symbol < len(grammar.nonterminals))
+        return frontier._replace(symbol=symbol.where(own, len(grammar.nonterminals))), own
+
+
+class Within(Messenger):
+    """Names sites ``name/site``, so that several programs can run in one."""
+
+    def __init__(self, name: str):
+        super().__init__()
+        self.name = name
+
+    def _pyro_sample(self, msg):
+        msg["name"] = f"{self.name}/{msg['name']}"
+
+
+class Mixture(Policy):
+    """A scenario by its weight, then its own policy.
+
+    Args:
+        grammar: the joint grammar.
+        policies: one of each scenario's own grammar, in the joint order.
+        weights: of the scenarios; equal if None.
+    """
+
+    def __init__(self, grammar: JointGrammar, policies: list[Policy], weights: list[float] | None = None):
+        self.grammar, self.policies = grammar, policies
+        share = torch.tensor([1.0] * len(policies) if weights is None else weights)
+        self.log_weights = (share / share.sum()).log()
+
+    def start(self, num_scenes: int) -> list:
+        """The memories of all policies."""
+        memory = []
+        for name, policy in zip(self.grammar.parts, self.policies, strict=True):
+            with Within(name):
+                memory.append(policy.start(num_scenes))
+        return memory
+
+    def step(self, memory: list, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, list]:
+        """Logits ``(N, K)``: all policies take the step, and each scene's own counts. They begin when the scenario is
+        drawn, which is every scene's first step."""
+        logits = torch.zeros(len(frontier.symbol), len(self.grammar.rules))
+        logits[:, : len(self.policies)] = self.log_weights
+        if (frontier.symbol == 0).any():
+            return logits, memory
+        following = []
+        for number, policy in enumerate(self.policies):
+            first, size = self.grammar.first_rule[number], len(policy.grammar.rules)
+            own_frontier, own = self.grammar.part_frontier(frontier, number)
+            previous = (previous_rule - first).where(own & (previous_rule >= first), -1)
+            step, after = policy.step(memory[number], own_frontier, previous)
+            logits[:, first : first + size] = step
+            following.append(after)
+        return logits, following
+
+    def log_prob(self, derivation: Derivation) -> Tensor:
+        """``log q(T)``, ``(N,)``: the scenario's log weight and its own policy's log-probability."""
+        scenario = self.grammar.scenario(derivation)
+        total = self.log_weights[scenario]
+        for number, policy in enumerate(self.policies):
+            rows = (scenario == number).nonzero().flatten()
+            if len(rows):
+                own = policy.log_prob(self.grammar.own(derivation[rows], number))
+                total = total.index_add(0, rows, own.to(total.dtype))
+        return total
+
+
+def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | None = None) -> SceneModel:
+    """One model that draws a scenario, equally often each unless weighted, and then a scene of it.
+
+    Args:
+        name: of the joint model.
+        models: by scenario.
+
+    Raises:
+        ModelError: no models, or models that differ in canvas or channels.
+    """
+    if not models:
+        raise ModelError("Expected at least one scenario, actual none.")
+    each = list(models.values())
+    for what in ("canvas", "channels"):
+        found = {key: getattr(model, what) for key, model in models.items()}
+        if len(set(found.values())) > 1:
+            raise ModelError(f"Expected scenarios of one {what}, actual {found}.")
+    grammar = JointGrammar({key: model.grammar for key, model in models.items()})
+    groups = {model.groups for model in each}
+    targets = [model.target for model in each]
+    pretraining = None
+    if any(model.pretraining is not None for model in each):
+        pretraining = mixture(grammar, [model.pretraining_policy for model in each], weights)
+
+    def target(seed: int) -> SceneModel:
+        """The scenarios' own targets, joined."""
+        return join(f"{name}_target", {key: model.target(seed) for key, model in models.items()}, weights)
+
+    return SceneModel(
+        name,
+        grammar,
+        mixture(grammar, [model.prior for model in each], weights),
+        partial(_program, grammar, dict(models)),
+        each[0].canvas,
+        1 + max(model.max_steps for model in each),
+        tuple(dict.fromkeys(c for model in each for c in model.classes)),
+        channels=each[0].channels,
+        assets="; ".join(dict.fromkeys(model.assets for model in each if model.assets)),
+        groups=groups.pop() if len(groups) == 1 else None,
+        pretraining=pretraining,
+        target=target if all(targets) else None,
+        scenarios=tuple(models.items()),
+    )
+
+
+def mixture(grammar: JointGrammar, policies: list[Policy], weights: list[float] | None = None) -> Policy:
+    """``Mixture``; of tables it is one table, about which more can be proved."""
+    if all(type(policy) is StructurePrior for policy in policies):
+        return StructurePrior.joined(grammar, policies, [1.0] * len(policies) if weights is None else weights)
+    return Mixture(grammar, policies, weights)
+
+
+def _program(
+    grammar: JointGrammar, models: dict[str, SceneModel], num_scenes: int, structure: Policy
+) -> Drawing | World:
+    max_steps = 1 + max(model.max_steps for model in models.values())
+    with pyro.plate("scenes", num_scenes, dim=-2):
+        derivation = derive(grammar, structure, num_scenes, max_steps)
+    scenario = grammar.scenario(derivation)
+    drawn = []
+    for number, (name, model) in enumerate(models.items()):
+        own = scenario == number
+        sites = grammar.sites(derivation, number)
+        with Within(name), poutine.mask(mask=own.unsqueeze(1)), poutine.block(hide=list(sites)):
+            drawn.append((own, poutine.condition(model, data=sites)(num_scenes)))
+    return join_drawings(derivation.kind, grammar.kinds, drawn)
+
+
+def _marked(symbol: str | Node, name: str) -> str | Node:
+    """A symbol of a part in the joint grammar: nonterminals carry the part's name."""
+    if isinstance(symbol, Node):
+        return Node(symbol.name, tuple(_marked(child, name) for child in symbol.children))
+    return f"{symbol}-{name}" if is_nonterminal(symbol) else symbol
+
+
+def _shortest(grammar: Grammar) -> Tensor:
+    """The rules ``(T,)`` of a derivation with the fewest rules."""
+    lengths = torch.tensor(shortest_lengths(grammar), dtype=torch.float64)
+    needed = 1 + (lengths[grammar.children.clamp(min=0)] * (grammar.children >= 0)).sum(1)
+    best = needed.where(grammar.legal[:-1], torch.inf).argmin(1)
+    steps = int(lengths[0])
+    return expand(grammar, lambda t, frontier, previous: best[frontier.symbol], 1, steps).rules[0]
