@@ -10,6 +10,8 @@ from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELo
 from probscene.inference.guide import GUIDES
 
 TRAINED = ("count", "presence")  # on the prior's renders
+PRETRAINED = {"efficientnet": "efficientnet-lite0", "inception": "inception-v3", "resnet50": "resnet-50"}
+CHOICES = "efficientnet, inception, inception=FILE, resnet50 or resnet50=FILE"
 OBJECTIVES = ("kde", "js", "witness", "mmd")
 
 
@@ -18,8 +20,8 @@ class Preset:
     """A fit's configuration; it is recorded with the run.
 
     Args:
-        features: ``"count"`` for the count network, ``"presence"`` for the paper's; ``"efficientnet"`` or
-            ``"inception=FILE"`` for a pretrained one, projected (``projection``).
+        features: ``"count"`` for the count network, ``"presence"`` for the paper's; one of ``CHOICES`` for a pretrained
+            one, projected (``projection``).
         count: the count network's schedule.
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
@@ -98,12 +100,8 @@ class Preset:
         """
         if features in TRAINED:
             return replace(self, features=features)
-        name, _, file = features.partition("=")
-        if features != "efficientnet" and not (name == "inception" and file):
-            raise ProbsceneError(
-                f"Expected features among {', '.join(TRAINED)}, efficientnet or inception=FILE, actual {features!r}."
-            )
-        features = f"inception={Path(file).resolve()}" if file else features
+        name, file = known(features, TRAINED), features.partition("=")[2]
+        features = f"{name}={Path(file).resolve()}" if file else features
         few = {"batches": 40, "num_scenes": 150, "candidates": 1, "learning_rate": min(self.learning_rate, 5e-3)}
         return replace(self, features=features, marginal_variance=None, **few)
 
@@ -154,6 +152,21 @@ PAPER = Preset(
     index=False,
 )
 PRESETS = {"quick": QUICK, "default": DEFAULT, "paper": PAPER}
+
+
+def known(choice: str, others: tuple[str, ...] = ()) -> str:
+    """The name in a choice of a pretrained network, which is one of ``CHOICES``.
+
+    Args:
+        others: further choices there are, for the message.
+
+    Raises:
+        ProbsceneError: another word, or a file where there is none to give.
+    """
+    name, equals, file = choice.partition("=")
+    if name not in PRETRAINED or (equals and (not file or name == "efficientnet")):
+        raise ProbsceneError(f"Expected features among {', '.join([*others, CHOICES])}, actual {choice!r}.")
+    return name
 
 
 def preset(name: str) -> Preset:

@@ -130,7 +130,7 @@ def fit(
     guide: Annotated[GuideName | None, typer.Option(help="What learns the rules; 'lstm' if not given.")] = None,
     features: Annotated[
         str | None,
-        typer.Option(metavar="NET", help="What sees images: count, presence, efficientnet or inception=FILE."),
+        typer.Option(metavar="NET", help="count, presence, efficientnet, inception[=FILE] or resnet50[=FILE]."),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
@@ -212,7 +212,7 @@ def evaluate(
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
     features: Annotated[
         list[str] | None,
-        typer.Option(metavar="NET", help="FID and KID by: run, efficientnet or inception=FILE; repeatable."),
+        typer.Option(metavar="NET", help="FID and KID by run, efficientnet, inception[=FILE], resnet50[=FILE]; many."),
     ] = None,
     num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,

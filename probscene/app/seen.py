@@ -15,15 +15,14 @@ from probscene.app.provenance import CHUNK, as_written, draw_chunk
 from probscene.app.run import Run
 from probscene.app.view import RENDERED_AT_ONCE, feature_net
 from probscene.dataset import ImageFolder
-from probscene.errors import ProbsceneError, RunError
+from probscene.errors import RunError
 from probscene.inference.features import FeatureNet, embed_all
-from probscene.inference.presets import Preset
+from probscene.inference.presets import PRETRAINED, Preset, known
 from probscene.model import SceneModel
 from probscene.policy import Policy
 
 Each = Callable[[int], None]
 """Told how many more images are done."""
-CHOICES = "run, efficientnet or inception=FILE"
 
 
 def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Iterator[Tensor]:
@@ -74,21 +73,19 @@ def own_net(run: Run) -> FeatureNet:
 
 
 def network(choice: str, run: Run) -> tuple[str, FeatureNet]:
-    """A feature network and its name, from ``run``, ``efficientnet`` or ``inception=FILE``.
+    """A feature network and its name, from ``run`` or one of ``presets.CHOICES``.
 
     Raises:
         ProbsceneError: another word.
-        DataError: see ``Inception``.
+        DataError: see ``pretrained``.
         RunError: see ``own_net``.
     """
     if choice == "run":
         return "run", own_net(run)
-    name, _, file = choice.partition("=")
-    if choice == "efficientnet" or (name == "inception" and file):
-        from probscene.inference.pretrained import pretrained  # torchvision takes seconds to import
+    name = PRETRAINED[known(choice, ("run",))]
+    from probscene.inference.pretrained import pretrained  # torchvision takes seconds to import
 
-        return {"efficientnet": "efficientnet-lite0", "inception": "inception-v3"}[name], pretrained(choice)
-    raise ProbsceneError(f"Expected features among {CHOICES}, actual {choice!r}.")
+    return name, pretrained(choice)
 
 
 @contextmanager

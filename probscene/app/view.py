@@ -5,7 +5,6 @@ Axis letters: N scenes, M nodes, D features, C H W.
 
 import hashlib
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -91,14 +90,14 @@ def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet | P
     """The feature network of a preset, untrained, or pretrained with an empty projection.
 
     Raises:
-        DataError: see ``Inception``.
+        DataError: see ``pretrained``.
     """
     if preset.features == "presence":
         return PresenceNet(model.classes)
     if preset.features != "count":
-        from probscene.inference.pretrained import pretrained  # torchvision takes seconds to import
+        from probscene.inference.pretrained import pretrained, weights_file  # torchvision takes seconds to import
 
-        net, file = pretrained(preset.features), preset.features.partition("=")[2]
-        digest = hashlib.sha256(Path(file).read_bytes()).digest() if file else bytes(32)
+        net, file = pretrained(preset.features), weights_file(preset.features)
+        digest = bytes(32) if file is None else hashlib.sha256(file.read_bytes()).digest()
         return Projected(net, preset.directions, digest)
     return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)

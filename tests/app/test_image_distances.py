@@ -53,7 +53,7 @@ def test_faults_come_before_any_work(run, images, target, tmp_path):
         raise AssertionError
 
     assert image_distances(run, images, [], never) == {}
-    with pytest.raises(ProbsceneError, match="run, efficientnet or inception=FILE, actual 'vgg'"):
+    with pytest.raises(ProbsceneError, match="run, efficientnet, .* or resnet50=FILE, actual 'vgg'"):
         image_distances(run, images, ["run", "vgg"], never)
     with pytest.raises(ProbsceneError, match="at least 2 images to compare, actual 1"):
         image_distances(run, images, ["run"], never, 1)

