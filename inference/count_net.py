@@ -31,7 +31,7 @@ class CountNet(nn.Module):
     Args:
         classes: the kinds that are counted.
         channels: of the image, 1 or 3.
-        canvas: height and width of the images; they are reduced by 2, 4 or 8 to about 128.
+        canvas: height and width of the images; they are reduced by 2, 4 or 8 to about 128, unless ``fit_to`` says less.
         width: channels at strides 2, 4 and 8.
         blocks: residual blocks at strides 4 and 8.
         groups: by what objects are counted; over the whole image where None.
@@ -55,7 +55,8 @@ class CountNet(nn.Module):
             each = (f"{name} {number + 1}" for number in range(groups.most) for name in self.objects)
             self.names = (groups.kind, *each)
         self.channels = channels
-        self.reduce = min(8, 2 ** max(0, round(math.log2(max(canvas) / 128))))
+        reduction = min(8, 2 ** max(0, round(math.log2(max(canvas) / 128))))
+        self.register_buffer("reduction", torch.tensor(reduction))
         a, b, c = width
         self.body = nn.Sequential(
             *_conv(channels, a, 5, 2),
@@ -71,6 +72,16 @@ class CountNet(nn.Module):
             self.body[-1].bias.zero_()
             self.body[-1].bias[0] = 3.0
         self._fused: nn.Module | None = None
+
+    @property
+    def reduce(self) -> int:
+        """By how much images are reduced."""
+        return int(self.reduction)
+
+    def fit_to(self, size: float) -> None:
+        """Reduce images so much less that objects of ``size`` pixels keep 6: below that too many share a cell."""
+        while self.reduce > 1 and size / self.reduce < 6:
+            self.reduction //= 2
 
     def forward(self, x: Tensor) -> Tensor:
         """Logits of the cells ``(N, 1 + objects, h, w)`` of reduced images ``x (N, C, 8h, 8w)``.

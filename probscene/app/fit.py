@@ -128,6 +128,9 @@ def _project(run: Run, preset: Preset, view: View, net: Projected, progress: Pro
 
 def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, progress: Progress) -> None:
     seed = batch_seed(run.record["seed"], 1)
+    if isinstance(net, CountNet):
+        seed_everything(batch_seed(run.record["seed"], 4))
+        net.fit_to(view.object_size())
     if isinstance(net, PresenceNet):
         training = PresenceTraining(net, view.draw, preset.presence_images, preset.presence_epochs, seed=seed)
         steps = preset.presence_epochs

@@ -4,6 +4,7 @@ Axis letters: N scenes, M nodes, D features, C H W.
 """
 
 import hashlib
+import math
 from collections.abc import Callable
 
 import torch
@@ -44,6 +45,14 @@ class View:
             by = (group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind)), groups.along)
         drawn = examples(self.render(scenes.drawing), self.classes, *by)
         return drawn._replace(image=self._as_read(drawn.image))
+
+    def object_size(self, num: int = 64) -> float:
+        """How small objects are in the prior's renders, pixels: a tenth of those that can be seen have boxes of less
+        than the square of this; infinite where there are none."""
+        batch = self.render(sample(self.model, self.model.prior, num).drawing)
+        seen = (self.classes[batch.kind] >= 0) & (batch.pixels > 0)
+        size = (batch.amodal_box[..., 2:] - batch.amodal_box[..., :2]).prod(-1)[seen].sqrt()
+        return float(size.quantile(0.1)) if len(size) else math.inf
 
     def observe(self, net: FeatureNet, candidates: int = 1) -> Callable[[Scenes], Tensor]:
         """Render and embed, a few images at a time.

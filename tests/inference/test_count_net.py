@@ -154,3 +154,17 @@ def test_presence_net_stops_at_its_accuracy(dots, draw_dots):
     assert training.done == 0
     features = net.embed(draw_dots(3).image)
     assert features.shape == (3, len(net.names))
+
+
+def test_small_objects_are_reduced_less(dots):
+    net = CountNet(dots.classes, 3, (188, 621))
+    assert net.reduce == 4
+    for size, reduce in ((40.0, 4), (24.0, 4), (23.0, 2), (12.0, 2), (11.0, 1), (1.0, 1)):
+        net = CountNet(dots.classes, 3, (188, 621))
+        net.fit_to(size)
+        assert net.reduce == reduce
+        again = CountNet(dots.classes, 3, (188, 621))
+        again.load_state_dict(net.state_dict())
+        assert again.reduce == reduce
+        image = torch.zeros(1, 3, 188, 621, dtype=torch.uint8)
+        assert again.enter(image).shape[-1] >= 621 / reduce and again.eval().embed(image).shape == (1, len(net.names))
