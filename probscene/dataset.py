@@ -4,7 +4,6 @@ Axis letters: L images of the folder, B images of a batch, C H W.
 """
 
 import hashlib
-import io
 import os
 import warnings
 from collections import Counter
@@ -13,18 +12,14 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-import numpy as np
 import torch
-from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from probscene.ahead import ahead
+from probscene.decoding import Fault, Window, decoded, read, window
 from probscene.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
-_LAST_CHUNK = b"IEND\xaeB`\x82"  # of a PNG; neither Pillow nor OpenCV misses it
-_ORIENTATION = 0x0112  # EXIF tag; values from 5 on swap width and height
 
 
 class ImageFolder:
@@ -33,8 +28,9 @@ class ImageFolder:
     Every file is decoded once when the folder is opened, so that nothing fails later; no image is kept. A truncated
     file is always found, altered bytes are in a PNG but not always in a JPEG, which has no checksum. Photos are
     turned upright by their EXIF tag, transparent pixels lie on black, 16-bit channels keep their upper byte, palettes
-    and CMYK become RGB. An image of another size is stretched to the canvas, by area where it shrinks and linearly
-    where it grows.
+    and CMYK become RGB. An image of another size is resized to the canvas, by area where it shrinks and linearly where
+    it grows: one whose shape is the canvas's to within 2 % is stretched to it, of any other the middle is taken,
+    as much as has the canvas's shape (``window``).
 
     Args:
         path: the folder.
@@ -45,12 +41,14 @@ class ImageFolder:
 
     Attributes:
         paths: the L files.
+        windows: of each of them, what is seen of it, see ``window``; None where that is all.
         resized: how many of them are of another size.
+        cropped: how many of them are of another shape.
         distinct: how many of them are left without those that equal another one in every pixel.
         bad: the files left out, each with the fault.
         notes: what a person should know, one sentence each.
-        fingerprint: SHA-256, hexadecimal, of the names, the bytes of the files, the canvas and the channels: equal
-            fingerprints mean equal tensors.
+        fingerprint: SHA-256, hexadecimal, of the names, the bytes of the files, the canvas, the channels, and of what
+            is seen where that is not all: equal fingerprints mean equal tensors.
 
     Raises:
         DataError: no such folder, one without images, or files that do not decode, each named with its fault.
@@ -68,25 +66,31 @@ class ImageFolder:
         files, others = _listed(self.path)
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths: list[Path] = []
+        self.windows: list[Window | None] = []
         self.bad: dict[Path, str] = {}
-        sizes, pictures = Counter(), set()
+        sizes, cut, pictures = Counter(), Counter(), set()
         with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
             for i, (file, found) in enumerate(zip(files, checked, strict=True)):
-                if isinstance(found, _Bad):
+                if isinstance(found, Fault):
                     self.bad[file] = str(found)
                 else:
                     self.paths.append(file)
                     digest.update(hashlib.sha256(os.fsencode(file.name)).digest() + found.data)
                     sizes[found.size] += 1
                     pictures.add(found.picture)
+                    seen = window(found.size, self.canvas)
+                    self.windows.append(seen)
+                    if seen is not None:
+                        digest.update(repr(tuple(seen)).encode())
+                        cut[found.size] += 1
                 if progress is not None:
                     progress(i + 1, len(files))
         self._judge(skip_bad)
         self.fingerprint = digest.hexdigest()
         self.distinct = len(pictures)
         sizes.pop(self.canvas, None)
-        self.resized = sizes.total()
-        self.notes = self._notes(sizes, others)
+        self.resized, self.cropped = sizes.total(), cut.total()
+        self.notes = self._notes(sizes, cut, others)
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -99,8 +103,8 @@ class ImageFolder:
         """
         try:
             with _quiet():
-                image, _ = _decoded(_read(self.paths[i]), self.canvas, self.channels)
-        except _Bad as fault:
+                image, _ = decoded(read(self.paths[i]), self.canvas, self.channels)
+        except Fault as fault:
             raise DataError(f"Expected the image {self.paths[i]} as it was, actual a file that {fault}.") from fault
         return torch.from_numpy(image)
 
@@ -116,11 +120,11 @@ class ImageFolder:
         for start in range(0, len(self), size):
             yield torch.stack([self.load(i) for i in range(start, min(start + size, len(self)))])
 
-    def _checked(self, file: Path) -> "_Checked | _Bad":
+    def _checked(self, file: Path) -> "_Checked | Fault":
         try:
-            data = _read(file)
-            picture, size = _decoded(data, self.canvas, self.channels)
-        except _Bad as fault:
+            data = read(file)
+            picture, size = decoded(data, self.canvas, self.channels)
+        except Fault as fault:
             return fault
         return _Checked(size, hashlib.sha256(data).digest(), hashlib.blake2b(picture, digest_size=16).digest())
 
@@ -134,13 +138,20 @@ class ImageFolder:
                 f"{' with --skip-bad' if self.paths else ''}."
             )
 
-    def _notes(self, sizes: Counter, others: list[str]) -> tuple[str, ...]:
+    def _notes(self, sizes: Counter, cut: Counter, others: list[str]) -> tuple[str, ...]:
         notes = []
         if self.resized:
             height, width = sizes.most_common(1)[0][0]
             notes.append(
                 f"{self.resized} of {len(self)} images in {self.path} have another size, most often {width}x{height}; "
                 f"they are resized to {self.canvas[1]}x{self.canvas[0]}."
+            )
+        if self.cropped:
+            height, width = size = cut.most_common(1)[0][0]
+            _, _, rows, columns = window(size, self.canvas)
+            notes.append(
+                f"{self.cropped} of {len(self)} images in {self.path} have another shape, of which only the middle is "
+                f"seen, mostly {columns}x{rows} of {width}x{height}; cut them before where it should be another part."
             )
         if self.bad:
             faults = _first(f"{file.name} {fault}" for file, fault in self.bad.items())
@@ -160,10 +171,6 @@ def grey(image: Tensor) -> Tensor:
         return red.contiguous()
     red, green, blue = (channel.to(torch.int32) for channel in (red, green, blue))
     return ((19595 * red + 38470 * green + 7471 * blue + 32768) >> 16).to(torch.uint8)
-
-
-class _Bad(Exception):
-    """A file that does not decode; the text completes 'a file that ...'."""
 
 
 class _Checked(NamedTuple):
@@ -201,59 +208,6 @@ def _listed(folder: Path) -> tuple[list[Path], list[str]]:
         remedy = "; images in subfolders are not read, name the subfolder" if folders else ""
         raise DataError(f"Expected PNG or JPEG images in {folder}, actual {there}{remedy}.")
     return images, others
-
-
-def _read(file: Path) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise _Bad(f"cannot be read ({error.strerror})") from error
-
-
-def _decoded(data: bytes, canvas: tuple[int, int], channels: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """The image ``(C, H, W)`` uint8 at the canvas's size, and the height and width that it had."""
-    if not data:
-        raise _Bad("is empty")
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-            if image.format == "PNG":
-                if _LAST_CHUNK not in data:
-                    raise _Bad("is truncated")
-                with Image.open(io.BytesIO(data)) as again:
-                    again.verify()  # decoding alone does not compare the checksums
-            turned = image.getexif().get(_ORIENTATION, 1) >= 5
-            size = image.size if turned else image.size[::-1]
-            image.draft(None, (max(canvas), max(canvas)))  # a large JPEG is decoded at a half, a fourth, an eighth
-            pixels = np.array(_eight_bit(ImageOps.exif_transpose(image)).convert("L" if channels == 1 else "RGB"))
-    except _Bad:
-        raise
-    except UnidentifiedImageError as error:
-        raise _Bad("is not a PNG or JPEG image") from error
-    except Exception as error:  # what Pillow raises on bad bytes: OSError, SyntaxError, ValueError, struct.error, ...
-        truncated = "truncated" in str(error).lower()
-        raise _Bad("is truncated" if truncated else f"does not decode ({error})") from error
-    pixels = _resized(pixels, canvas)
-    return np.ascontiguousarray(pixels[None] if channels == 1 else pixels.transpose(2, 0, 1)), size
-
-
-def _eight_bit(image: Image.Image) -> Image.Image:
-    """An opaque image of at most 8 bits a channel."""
-    if image.mode.startswith("I"):
-        return Image.fromarray((np.asarray(image).astype(np.uint16) >> 8).astype(np.uint8))
-    if image.has_transparency_data:
-        image = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image).convert("RGB")
-    return image if image.mode == "L" else image.convert("RGB")
-
-
-def _resized(pixels: np.ndarray, canvas: tuple[int, int]) -> np.ndarray:
-    """``(h, w)`` or ``(h, w, 3)`` to the canvas's height and width."""
-    height, width = canvas
-    shrunk = (min(height, pixels.shape[0]), min(width, pixels.shape[1]))
-    for (h, w), how in ((shrunk, cv2.INTER_AREA), ((height, width), cv2.INTER_LINEAR)):
-        if pixels.shape[:2] != (h, w):
-            pixels = cv2.resize(pixels, (w, h), interpolation=how)
-    return pixels
 
 
 def _first(names, number: int = 5) -> str:

@@ -4,7 +4,8 @@
 
 Boxes are in 0-based pixels of the image as it is in its file. A type counts as the class of the model that has its
 name, whatever the case, else by ``TYPES``; types that the model has no class for, and DontCare, are left out, which the
-notes say. Labelled are the classes that one of KITTI's own types counts as, and those that occur.
+notes say. So are objects whose middle lies where the target's image is cut, see ``ImageFolder``. Labelled are the
+classes that one of KITTI's own types counts as, and those that occur.
 """
 
 import math
@@ -16,6 +17,7 @@ import numpy as np
 
 from probscene.app.structures import Counts
 from probscene.dataset import ImageFolder
+from probscene.decoding import Window
 from probscene.errors import DataError
 from probscene.model import SceneModel
 
@@ -44,6 +46,11 @@ class Object(NamedTuple):
     top: float
     right: float
     bottom: float
+
+    def within(self, seen: Window) -> bool:
+        """Whether its middle is in a part of the image."""
+        x, y = (self.left + self.right + 1) / 2 - seen.left, (self.top + self.bottom + 1) / 2 - seen.top
+        return 0 <= x < seen.width and 0 <= y < seen.height
 
 
 def read_objects(file: Path) -> list[Object]:
@@ -95,15 +102,22 @@ def read_kitti(
             f"Expected types in {folder} that model {model.name!r} has classes for ({', '.join(model.classes)}), "
             f"actual {', '.join(occurring) or 'no object'}."
         )
-    counts, small = np.zeros((len(found), len(classes)), np.int64), 0
-    for row, objects in zip(counts, found.values(), strict=True):
+    counts, small, cut = np.zeros((len(found), len(classes)), np.int64), 0, 0
+    windows = dict(zip(target.paths, target.windows, strict=True))
+    for row, (path, objects) in zip(counts, found.items(), strict=True):
         for one in objects:
             name = of_type[one.type]
-            if name is not None and one.bottom - one.top < min_height:
+            if name is None:
+                continue
+            if windows[path] is not None and not one.within(windows[path]):
+                cut += 1
+            elif one.bottom - one.top < min_height:
                 small += 1
-            elif name is not None:
+            else:
                 row[classes.index(name)] += 1
     notes = [*_notes(occurring, of_type)]
+    if cut:
+        notes.append(f"{cut} objects that lie where images are cut are not counted.")
     if small:
         notes.append(f"{small} objects of less than {min_height:g} pixels' height are not counted.")
     return counts, classes, tuple(notes)
@@ -137,7 +151,9 @@ def _class(type: str, classes: tuple[str, ...]) -> str | None:
 
 def _notes(occurring: Counter, of_type: dict[str, str | None]) -> list[str]:
     """Which types count as something of another name, and which not at all."""
-    renamed = [f"{name} as {of_type[name]}" for name in occurring if of_type[name] not in (None, name)]
+    renamed = [
+        f"{name} as {own}" for name in occurring if (own := of_type[name]) and own.casefold() != name.casefold()
+    ]
     out = [f"{number} {name}" for name, number in occurring.most_common() if of_type[name] is None]
     notes = [f"Counted are {', '.join(sorted(renamed))}."] if renamed else []
     return notes + ([f"Not counted, since the model has no such class: {', '.join(out)}."] if out else [])

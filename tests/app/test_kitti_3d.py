@@ -15,6 +15,7 @@ from PIL import Image
 from probscene.app import coco, kitti
 from probscene.app.kitti_labels import read_kitti
 from probscene.batch import RenderBatch, Space
+from probscene.dataset import ImageFolder
 
 HEIGHT, WIDTH = 94, 310
 KINDS = ("tree", "car", "pedestrian", "bike")
@@ -172,7 +173,7 @@ def test_torchvision_reads_the_same(tmp_path):
         assert (one["truncated"], one["occluded"]) == (other["truncated"], other["occluded"])
     assert [one["occluded"] for one in read] == [0, 1, 2] and read[2]["truncated"] > 0.1 > read[0]["truncated"]
     folder = tmp_path / "Kitti/raw/training/label_2"
-    target = SimpleNamespace(path=tmp_path, paths=[tmp_path / "000000.png"])
+    target = ImageFolder(tmp_path / "Kitti/raw/training/image_2", (HEIGHT, WIDTH), 3)
     counts, classes, _ = read_kitti(folder, MODEL, target)
     assert dict(zip(classes, counts[0].tolist(), strict=True)) == {"car": 2, "pedestrian": 1, "bike": 0}
 

@@ -11,6 +11,7 @@ import pytest
 import torchvision
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from pycocotools.coco import COCO
 
 from probscene.app.generate import generate_scenes
@@ -31,8 +32,9 @@ def line(type, height=30.0, left=10.0) -> str:
 
 
 def images(folder, names) -> SimpleNamespace:
-    """Of an ``ImageFolder``, the paths."""
-    return SimpleNamespace(path=Path(folder), paths=[Path(folder, name) for name in names], bad={})
+    """Of an ``ImageFolder``, the paths, and that nothing is cut."""
+    paths = [Path(folder, name) for name in names]
+    return SimpleNamespace(path=Path(folder), paths=paths, windows=[None] * len(names))
 
 
 @given(st.lists(st.lists(st.sampled_from([*CLASS, *OTHERS])), min_size=1, max_size=9))
@@ -56,6 +58,17 @@ def test_low_objects_are_counted_only_where_not_said_otherwise(tmp_path):
     assert read_kitti(tmp_path, STREET, target)[0][:, 0].tolist() == [4, 0]
     counts, _, notes = read_kitti(tmp_path, STREET, target, min_height=25)
     assert counts[:, 0].tolist() == [2, 0] and "2 objects of less than 25 pixels" in notes[-1]
+
+
+def test_objects_whose_middle_is_cut_away_are_not_counted(tmp_path):
+    Image.fromarray(np.zeros((300, 400, 3), np.uint8)).save(tmp_path / "a.png")
+    target = ImageFolder(tmp_path, (50, 100), 3)
+    assert tuple(target.windows[0]) == (50, 0, 200, 400)
+    middles = (48, 49.4, 49.5, 150, 249.4, 249.5, 260)  # the upper row's own is 0
+    (tmp_path / "a.txt").write_text("\n".join(f"Car 0 0 0 10 {y - 4} 50 {y + 4} {REST}" for y in middles))
+    counts, _, notes = read_kitti(tmp_path, STREET, target)
+    assert counts[0, 0] == 3
+    assert notes == ("4 objects that lie where images are cut are not counted.",)
 
 
 def test_names_of_the_model_go_first(tmp_path):

@@ -14,6 +14,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from probscene.dataset import ImageFolder, grey
+from probscene.decoding import window
 from probscene.errors import DataError
 
 
@@ -107,19 +108,61 @@ def test_photos_stand_upright(tmp_path, smooth):
 
 
 @given(st.tuples(*[st.integers(1, 90)] * 4), st.sampled_from(["PNG", "JPEG"]))
-def test_another_size_is_stretched_to_the_canvas(tmp_path_factory, sizes, kind):
+def test_of_another_size_the_middle_fills_the_canvas(tmp_path_factory, sizes, kind):
     height, width, h, w = sizes
     ramp = np.broadcast_to(np.linspace(0, 255, w)[None, :, None], (h, w, 3)).astype(np.uint8)
     folder = tmp_path_factory.mktemp("images") / "x"
     got = read(folder, encoded(ramp, kind), (height, width), name="a.jpg")
     assert got.shape == (height, width, 3)
     assert abs(got.mean() - ramp.mean()) < 255 / min(w, 8)
-    assert ImageFolder(folder, (height, width), 3).resized == ((h, w) != (height, width))
+    images = ImageFolder(folder, (height, width), 3)
+    assert images.resized == ((h, w) != (height, width))
+    assert images.cropped == (images.windows[0] is not None)
+    assert len(images.notes) == images.resized + images.cropped
+
+
+@given(st.tuples(*[st.integers(1, 3000)] * 4))
+def test_what_is_seen_is_the_most_in_the_middle_that_has_the_canvas_shape(sizes):
+    height, width, h, w = sizes
+    seen, turned = window((h, w), (height, width)), window((w, h), (width, height))
+    if seen is None:
+        assert turned is None
+        one, other = w * height, h * width
+        assert max(one, other) <= 1.02 * min(one, other) or abs(one - other) <= max(height, width)
+        return
+    assert (turned.left, turned.top, turned.width, turned.height) == seen
+    assert min(seen.height, seen.width) >= 1 and min(seen.top, seen.left) >= 0
+    assert (seen.height == h) != (seen.width == w)
+    assert h - seen.height - 2 * seen.top in (0, 1) and w - seen.width - 2 * seen.left in (0, 1)
+    exact = (h, h * width / height) if w * height > h * width else (w * height / width, w)
+    assert abs(seen.height - exact[0]) <= 0.5 or exact[0] < 1
+    assert abs(seen.width - exact[1]) <= 0.5 or exact[1] < 1
+
+
+def test_kittis_sizes_are_seen_whole_and_a_flat_screens_are_not():
+    for size in ((375, 1242), (370, 1224), (374, 1238), (376, 1241)):
+        assert window(size, (375, 1242)) is window(size, (188, 621)) is None
+    assert window((360, 480), (188, 621)) == (107, 0, 145, 480)
+
+
+def test_the_middle_is_cut_before_it_is_resized(tmp_path, noise):
+    got = read(tmp_path / "images", encoded(noise), (40, 10))  # columns 10 to 20 of 30
+    assert (got == noise[:, 10:20]).all()
+    got = read(tmp_path / "images", encoded(np.repeat(noise[:, :, :1], 3, 2)[::2, :18].copy()), (5, 9), 1)
+    assert (got[..., 0] == cv2.resize(noise[::2, :18, 0][5:15], (9, 5), interpolation=cv2.INTER_AREA)).all()
+
+
+def test_a_large_jpeg_is_cut_where_a_small_one_is(tmp_path):
+    y, x = np.mgrid[:1200, :900]
+    whole = np.stack([y // 5, x // 4, (x + y) // 9], -1).astype(np.uint8)
+    got = read(tmp_path / "images", encoded(whole, "JPEG", quality=98), (60, 90), name="a.jpg")  # decoded at an eighth
+    expected = whole[300:900].reshape(60, 10, 90, 10, 3).mean((1, 3))
+    assert abs(got - expected).max() <= 3
 
 
 def test_area_interpolation_where_it_shrinks(tmp_path, noise):
     got = read(tmp_path / "images", encoded(noise), (10, 10))
-    blocks = noise.reshape(10, 4, 10, 3, 3).mean((1, 3))
+    blocks = noise[5:35].reshape(10, 3, 10, 3, 3).mean((1, 3))
     assert abs(got - blocks).max() <= 1
 
 
@@ -131,8 +174,9 @@ def test_names_are_sorted_and_the_rest_is_left_out(tmp_path, noise):
     images = ImageFolder(tmp_path, (20, 30), 1)
     assert [path.name for path in images.paths] == ["a.jpg", "b.PNG", "c.jpeg"] and len(images) == 3
     assert images.resized == 3
-    resized, others = images.notes
+    resized, cropped, others = images.notes
     assert "3 of 3 images" in resized and "most often 30x40" in resized and "resized to 30x20" in resized
+    assert "3 of 3 images" in cropped and "30x20 of 30x40" in cropped and images.cropped == 3
     assert "1 files" in others and "labels.csv" in others
 
 
