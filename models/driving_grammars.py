@@ -1,17 +1,18 @@
 """The three grammars of driving scenes and their structure priors (Meta-Sim2, section 4.3 and supplement).
 
-City, suburban and rural streets are the paper's, with decisions D2 (``X -> x X | ε``) and D3 (rural shoulders hold what
-sidewalks hold). Containers are objects of the scene graph, so that what stands in them is their child, and whether there
-is a median is a choice of its own. The paper's order of ``Cars`` and ``Median`` is the order from the left: what is left
-of the median comes toward us, whether one stands there or not. Camera, sun and weather are nodes too. ``cyclist`` is the
-paper's ``bike``.
+City, suburban and rural streets are the paper's, with decisions D2 (``X -> x X | ε``) and D3 (rural shoulders hold
+what sidewalks hold). Containers are objects of the scene graph, so that what stands in them is their child, and whether
+there is a median is a choice of its own. The paper's order of ``Cars`` and ``Median`` is the order from the left: what
+is left of the median comes toward us, whether one stands there or not. Of a city's two collections of buildings, one
+lines the street and one stands behind. Camera, sun and weather are nodes too. ``cyclist`` is the paper's ``bike``.
 
 Both priors draw n ~ U{fewest..most} for every list, the kinds of what stands in it with equal probability, one to four
 lanes with equal probability (two to four where the paper's rural street has no fewer), and a median with probability
 0.5. The simple prior has 0 to 2 everywhere; the tuned numbers are ours, the paper prints none.
 """
 
-from functools import cache
+from collections.abc import Sequence
+from functools import cache, reduce
 from types import MappingProxyType
 
 import numpy as np
@@ -41,6 +42,7 @@ BOUNDS = MappingProxyType({
 SIMPLE = (0, 2)
 LONGEST = MappingProxyType({"Cars": 12, "Walk": 10, "Planting": 8, "Buildings": 9, "Foliage": 16})
 TAIL = 0.1  # share of the lists of pretraining that are longer than the prior's
+FAR = 0.4  # total variation
 SHARES = MappingProxyType({"car": 0.86, "van": 0.1, "truck": 0.04})  # among vehicles
 
 
@@ -86,13 +88,37 @@ def pretraining(scenario: str, name: str = "tuned", vehicles: tuple[str, ...] = 
 def target(scenario: str, seed: int, vehicles: tuple[str, ...] = VEHICLES) -> StructurePrior:
     """A truth to be found: random probabilities of every list's lengths, of the streets and of what stands in a list.
 
-    Lists are no longer than those of pretraining. The probabilities are Dirichlet draws of ``seed``.
+    Lists are no longer than those of pretraining. The probabilities are Dirichlet draws of ``seed``, those of vehicles
+    and streets drawn again until the number of vehicles differs from either prior's by ``FAR``.
     """
     rng = np.random.default_rng([seed, *scenario.encode()])
-    lists = {key: rng.dirichlet(np.full(most + 3, 0.5)) for key, (_, most) in bounds(scenario, "tuned").items()}
+    limits = bounds(scenario, "tuned")
+    lists = {key: rng.dirichlet(np.full(most + 2, 0.5)) for key, (_, most) in limits.items()}
     kinds = {"Walk": rng.dirichlet(np.ones(len(WALK))), "Planting": rng.dirichlet(np.ones(len(PLANTS)))}
-    streets = rng.dirichlet(np.ones(len(_streets(scenario))))
-    return _policy(scenario, vehicles, lists, kinds, streets)
+    known = [
+        vehicle_numbers(scenario, _uniform(*bounds(scenario, name)["Cars"]), _lane_weights(scenario))
+        for name in ("tuned", "simple")
+    ]
+    while True:
+        lists["Cars"] = rng.dirichlet(np.full(limits["Cars"][1] + 2, 0.5))
+        streets = rng.dirichlet(np.ones(len(_streets(scenario))))
+        numbers = vehicle_numbers(scenario, lists["Cars"], streets)
+        if min(np.abs(numbers - other).sum() / 2 for other in known) >= FAR:
+            return _policy(scenario, vehicles, lists, kinds, streets)
+
+
+def vehicle_numbers(scenario: str, lengths: Sequence[float], streets: Sequence[float]) -> np.ndarray:
+    """``(49,)``, how probable each number of vehicles in a scene is.
+
+    Args:
+        lengths: probabilities of a lane's number, at most 12; ``streets`` of the productions; up to a factor.
+    """
+    each = np.asarray(lengths) / np.sum(lengths)
+    total = np.zeros(4 * LONGEST["Cars"] + 1)
+    for symbols, share in zip(_streets(scenario), np.asarray(streets) / np.sum(streets), strict=True):
+        number = reduce(np.convolve, [each] * STREETS[symbols])
+        total[: len(number)] += share * number
+    return total
 
 
 def bounds(scenario: str, name: str) -> dict[str, tuple[int, int]]:
@@ -102,9 +128,7 @@ def bounds(scenario: str, name: str) -> dict[str, tuple[int, int]]:
 
 def _policy(scenario, vehicles, lists, kinds=MappingProxyType({}), streets=None) -> StructurePrior:
     """``lists``: probabilities of lengths; ``kinds``: of what stands in a list; ``streets``: of the productions."""
-    if streets is None:
-        lanes = [STREETS[symbols] for symbols in _streets(scenario)]
-        streets = [1 / lanes.count(number) for number in lanes]
+    streets = _lane_weights(scenario) if streets is None else streets
     kinds = {"Cars": [SHARES[name] for name in vehicles], **kinds}
 
     def counted(key) -> Counts:
@@ -115,6 +139,12 @@ def _policy(scenario, vehicles, lists, kinds=MappingProxyType({}), streets=None)
 
 def _streets(scenario: str) -> list[str]:
     return [symbols for symbols in STREETS if scenario != "rural" or symbols.startswith("Oncoming")]
+
+
+def _lane_weights(scenario: str) -> list[float]:
+    """Of the productions, so that every number of lanes is as probable."""
+    lanes = [STREETS[symbols] for symbols in _streets(scenario)]
+    return [1 / lanes.count(number) for number in lanes]
 
 
 def _uniform(fewest: int, most: int) -> list[float]:
