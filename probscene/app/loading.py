@@ -9,12 +9,17 @@ import importlib
 import importlib.util
 import sys
 import traceback
+from functools import cached_property
 from pathlib import Path
 
+from probscene.batch import RenderBatch, Renderer
+from probscene.drawing import Drawing
 from probscene.errors import ModelError, ProbsceneError
 from probscene.model import SceneModel
+from probscene.renderers.meshes import MeshRenderer
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.scenarios import join
+from probscene.world import World
 
 BUILT_IN = {"multi_mnist": "probscene.models.multi_mnist", "aerial2d": "probscene.models.aerial2d"}
 
@@ -69,13 +74,33 @@ def lasting_reference(reference: str) -> str:
     return f"{base}:{','.join(scenarios)}" if scenarios else base
 
 
-def renderer_for(model: SceneModel, threads: int | None = None) -> SpriteRenderer:
-    """The renderer that reads the model's drawings; one thread for every core where no number is given."""
-    return SpriteRenderer(model.canvas, threads)
+class _AnyRenderer:
+    """Sprites for a drawing, meshes for a world; each renderer is made when it is first needed."""
+
+    def __init__(self, canvas: tuple[int, int], threads: int | None):
+        self._options = canvas, threads
+
+    def __call__(self, drawing: Drawing | World) -> RenderBatch:
+        return (self._meshes if isinstance(drawing, World) else self._sprites)(drawing)
+
+    @cached_property
+    def _sprites(self) -> SpriteRenderer:
+        return SpriteRenderer(*self._options)
+
+    @cached_property
+    def _meshes(self) -> MeshRenderer:
+        return MeshRenderer(*self._options)
+
+
+def renderer_for(model: SceneModel, threads: int | None = None) -> Renderer:
+    """The renderer that reads what the model returns; one thread for every core where no number is given."""
+    return _AnyRenderer(model.canvas, threads)
 
 
 def _exported(names: dict, reference: str, wanted: tuple[str, ...] = ()) -> SceneModel:
-    scenarios = names.get("SCENARIOS", {})
+    scenarios = names.get("SCENARIOS")
+    if not isinstance(scenarios, dict) or not all(isinstance(model, SceneModel) for model in scenarios.values()):
+        scenarios = {}
     if wanted or (scenarios and "MODEL" not in names):
         return _joined(scenarios, reference, wanted)
     found = {name: value for name, value in names.items() if isinstance(value, SceneModel)}

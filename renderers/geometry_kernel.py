@@ -1,0 +1,241 @@
+"""Meshes to the visibility buffer and to the shadow map: vertices, clipping, facing, planes over the image.
+
+With vertices p = (u z, v z, z), whatever is linear over a triangle, 1 and attributes, is linear over the image once
+divided by z, whether or not the triangle reaches behind the camera: the attribute's plane is the sum of its values
+times the cross products of the other two vertices, over the triple product (Olano and Greer 1997). So planes need no
+clipping, only outlines do.
+"""
+
+from probscene.renderers import mesh_atlas as atlas
+from probscene.renderers import mesh_tables as tables
+from probscene.renderers import shading_kernel as shading
+from probscene.renderers.engine import ti
+from probscene.renderers.raster_kernel import fill, fill_map, up
+
+CORNER = 5  # floats a vertex in the scratch: u z, v z, z, u, v; on the map column, row, metres towards the sun
+SLACK, STEEPEST = 0.02, 1.0  # metres by which a shadow keeps off what casts it: always, and at most for the slope
+
+i32, f32, f64 = ti.i32, ti.f32, ti.f64
+
+
+@ti.func
+def transform(k: i32, matrix: i32, divide: i32, base: i32, whole: ti.template(), real: ti.template(),
+              positions: ti.template(), corners: ti.template()):  # fmt: skip
+    """An instance's vertices into the scratch."""
+    m, source = k * tables.REALS + matrix, ti.cast(whole[k * tables.INTEGERS + tables.VERTEX], i32) * 3
+    a = ti.Vector([real[m + i] for i in range(12)], dt=f64)
+    for i in range(ti.cast(whole[k * tables.INTEGERS + tables.VERTICES], i32)):
+        x, y = ti.cast(positions[source + 3 * i], f64), ti.cast(positions[source + 3 * i + 1], f64)
+        z, to = ti.cast(positions[source + 3 * i + 2], f64), base + i * CORNER
+        u, v, depth = (a[0] * x + a[1] * y + a[2] * z + a[3], a[4] * x + a[5] * y + a[6] * z + a[7],
+                       a[8] * x + a[9] * y + a[10] * z + a[11])  # fmt: skip
+        corners[to], corners[to + 1], corners[to + 2] = u, v, depth
+        if divide != 0 and depth >= tables.NEAR:
+            corners[to + 3], corners[to + 4] = u / depth, v / depth
+
+
+@ti.func
+def vertex(at: i32, corners: ti.template()):
+    return ti.Vector([corners[at], corners[at + 1], corners[at + 2]], dt=f64)
+
+
+@ti.func
+def at_near(inside, outside):
+    """Where an edge meets the near plane; from the inside, so that both triangles find the same."""
+    share = (tables.NEAR - inside[2]) / (outside[2] - inside[2])
+    u, v = inside[0] + (outside[0] - inside[0]) * share, inside[1] + (outside[1] - inside[1]) * share
+    return u / tables.NEAR, v / tables.NEAR
+
+
+@ti.func
+def cosines(n: i32, m: i32, real: ti.template(), faces: ti.template()):
+    """A normal's cosines towards the sun and upward, in an instance that is turned and scaled."""
+    x, y, z = ti.cast(faces[n], f64), ti.cast(faces[n + 1], f64), ti.cast(faces[n + 2], f64)
+    a, b, c = x * real[m + tables.UNSCALE], y * real[m + tables.UNSCALE + 1], z * real[m + tables.UNSCALE + 2]
+    length = ti.max(ti.sqrt(a * a + b * b + c * c), f64(1e-12))
+    sun = x * real[m + tables.TO_SUN] + y * real[m + tables.TO_SUN + 1] + z * real[m + tables.TO_SUN + 2]
+    return sun / length, c / length
+
+
+@ti.func
+def put_plane(at: i32, plane, u: f64, v: f64, records: ti.template()):
+    """A plane with columns' and rows' steps and a constant, as its value at (u, v) and the steps."""
+    records[at] = ti.cast(plane[0] * u + plane[1] * v + plane[2], f32)
+    records[at + 1], records[at + 2] = ti.cast(plane[0], f32), ti.cast(plane[1], f32)
+
+
+@ti.func
+def record_triangle(
+    k: i32, face: i32, r: i32, m: i32, from_u: f64, from_v: f64, p, q, o,
+    whole: ti.template(), real: ti.template(), faces: ti.template(), records: ti.template(), marks: ti.template(),
+):  # fmt: skip
+    """What shading needs of a triangle; ``p, q, o`` are the planes of its corners' shares, over depth."""
+    s, w, texture = k * tables.REALS, p + q + o, ti.cast(whole[k * tables.INTEGERS + tables.TEXTURE], i32)
+    records[r + shading.FROM_U], records[r + shading.FROM_V] = ti.cast(from_u, f32), ti.cast(from_v, f32)
+    records[r + shading.W_U], records[r + shading.W_V] = ti.cast(w[0], f32), ti.cast(w[1], f32)
+    sun0, up0 = cosines(face + atlas.NORMAL, s, real, faces)
+    varies = faces[face + atlas.SMOOTH] != 0
+    if varies:
+        sun1, up1 = cosines(face + atlas.NORMAL + 3, s, real, faces)
+        sun2, up2 = cosines(face + atlas.NORMAL + 6, s, real, faces)
+        put_plane(r + shading.PLANE_SUN, p * sun0 + q * sun1 + o * sun2, from_u, from_v, records)
+        put_plane(r + shading.PLANE_UP, p * up0 + q * up1 + o * up2, from_u, from_v, records)
+    else:
+        records[r + shading.PLANE_SUN], records[r + shading.PLANE_UP] = ti.cast(sun0, f32), ti.cast(up0, f32)
+    if texture >= 0:
+        for axis in ti.static(range(2)):
+            f = face + atlas.UV + axis
+            plane = p * ti.cast(faces[f], f64) + q * ti.cast(faces[f + 2], f64) + o * ti.cast(faces[f + 4], f64)
+            put_plane(r + shading.PLANE_S + 3 * axis, plane, from_u, from_v, records)
+    for channel in ti.static(range(3)):
+        colour = faces[face + atlas.COLOUR + channel]
+        if faces[face + atlas.TINTED] != 0:
+            colour *= ti.cast(real[s + tables.TINT + channel], f32)
+        records[r + shading.RGB + channel] = colour
+    marks[m + shading.LABEL] = ti.cast(whole[k * tables.INTEGERS + tables.NODE], i32) + 1
+    marks[m + shading.CLASS] = ti.cast(whole[k * tables.INTEGERS + tables.SEMANTIC], i32)
+    marks[m + shading.IMAGE], marks[m + shading.VARIES] = texture, ti.cast(varies, i32)
+
+
+@ti.func
+def draw_instance(
+    k: i32, mark: i32, count: i32, node: i32, height: i32, width: i32, zooms: i32, base: i32, stamp_base: i32,
+    corner_base: i32, record_base: i32, mark_base: i32,
+    whole: ti.template(), real: ti.template(), positions: ti.template(), triangles: ti.template(),
+    faces: ti.template(), seen: ti.template(), stamp: ti.template(), corners: ti.template(), records: ti.template(),
+    marks: ti.template(), extent: ti.template(),
+):  # fmt: skip
+    """Draw what faces the camera with records from ``count + 1`` on.
+
+    ``zooms`` is 2 where there is a second buffer behind the first, of twice as many columns and rows. Returns the last
+    record, and how many pixels have got the mark.
+    """
+    transform(k, tables.TO_IMAGE, 1, corner_base, whole, real, positions, corners)
+    first, last, area = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32), count, i32(0)
+    in_sight = whole[k * tables.INTEGERS + tables.SEEN] != 0
+    low_u, low_v, high_u, high_v = f64(1e300), f64(1e300), f64(-1e300), f64(-1e300)
+    for t in range(first, first + ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLES], i32)):
+        at0, at1 = corner_base + triangles[3 * t] * CORNER, corner_base + triangles[3 * t + 1] * CORNER
+        at2 = corner_base + triangles[3 * t + 2] * CORNER
+        z0, z1, z2 = corners[at0 + 2], corners[at1 + 2], corners[at2 + 2]
+        behind = ti.cast(z0 < tables.NEAR, i32) + ti.cast(z1 < tables.NEAR, i32) + ti.cast(z2 < tables.NEAR, i32)
+        u0, v0, u1, v1, u2, v2, u3, v3 = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
+        front = False
+        if behind == 0:
+            u0, v0, u1, v1 = corners[at0 + 3], corners[at0 + 4], corners[at1 + 3], corners[at1 + 4]
+            u2, v2 = corners[at2 + 3], corners[at2 + 4]
+            front = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0) < 0
+        elif behind < 3:
+            a, b, c = vertex(at0, corners), vertex(at1, corners), vertex(at2, corners)
+            front = a.dot(b.cross(c)) < 0
+            if front:
+                odd_1 = (z1 < tables.NEAR) == (behind == 1)  # which corner is alone on its side of the plane
+                odd_2 = (z2 < tables.NEAR) == (behind == 1)
+                if odd_1:
+                    a, b, c = b, c, a
+                elif odd_2:
+                    a, b, c = c, a, b
+                if behind == 1:
+                    u0, v0 = at_near(b, a)
+                    u1, v1, u2, v2 = b[0] / b[2], b[1] / b[2], c[0] / c[2], c[1] / c[2]
+                    u3, v3 = at_near(c, a)
+                else:
+                    u0, v0 = a[0] / a[2], a[1] / a[2]
+                    u1, v1 = at_near(a, b)
+                    u2, v2 = at_near(a, c)
+        if front:
+            least_u, largest_u = ti.min(u0, ti.min(u1, u2)), ti.max(u0, ti.max(u1, u2))
+            least_v, largest_v = ti.min(v0, ti.min(v1, v2)), ti.max(v0, ti.max(v1, v2))
+            if behind == 1:
+                least_u, largest_u = ti.min(least_u, u3), ti.max(largest_u, u3)
+                least_v, largest_v = ti.min(least_v, v3), ti.max(largest_v, v3)
+            low_u, high_u = ti.min(low_u, least_u), ti.max(high_u, largest_u)
+            low_v, high_v = ti.min(low_v, least_v), ti.max(high_v, largest_v)
+            column, row = up(least_u, width), up(least_v, height)
+            covers = column < up(largest_u, width) and row < up(largest_v, height)
+            if zooms == 2 and not covers:
+                across = up(2 * least_u + 0.5, 2 * width) < up(2 * largest_u + 0.5, 2 * width)
+                covers = across and up(2 * least_v + 0.5, 2 * height) < up(2 * largest_v + 0.5, 2 * height)
+            if in_sight and covers:
+                a, b, c = vertex(at0, corners), vertex(at1, corners), vertex(at2, corners)
+                p, q, o = b.cross(c), c.cross(a), a.cross(b)
+                scale = f64(1.0) / a.dot(p)
+                p, q, o = p * scale, q * scale, o * scale
+                w = p + q + o
+                last += 1
+                record_triangle(
+                    k, t * atlas.FACE, record_base + last * shading.RECORD, mark_base + last * shading.MARKS,
+                    ti.cast(ti.min(column, width - 1), f64), ti.cast(ti.min(row, height - 1), f64), p, q, o,
+                    whole, real, faces, records, marks,
+                )  # fmt: skip
+                for piece in range(ti.select(behind == 1, 2, 1)):
+                    if piece == 1:
+                        u1, v1, u2, v2 = u2, v2, u3, v3
+                    for zoom in range(1, zooms + 1):
+                        by, shift = ti.cast(zoom, f64), 0.5 * ti.cast(zoom - 1, f64)
+                        stamped = ti.select(zoom == 1, mark, 0)
+                        area += fill(
+                            u0 * by + shift, v0 * by + shift, u1 * by + shift, v1 * by + shift, u2 * by + shift,
+                            v2 * by + shift, w[2] - (w[0] + w[1]) * shift / by, w[0] / by, w[1] / by, last, stamped,
+                            height * zoom, width * zoom, base + (zoom - 1) * height * width, stamp_base, seen, stamp,
+                        )  # fmt: skip
+    if node >= 0 and low_u <= high_u:
+        e = node * tables.EXTENT
+        extent[e], extent[e + 1] = ti.min(extent[e], low_u + 0.5), ti.min(extent[e + 1], low_v + 0.5)
+        extent[e + 2], extent[e + 3] = ti.max(extent[e + 2], high_u + 0.5), ti.max(extent[e + 3], high_v + 0.5)
+    return last, area
+
+
+@ti.func
+def cast_shadow(
+    k: i32, size: i32, base: i32, corner_base: i32, whole: ti.template(), real: ti.template(),
+    positions: ti.template(), triangles: ti.template(), shadow: ti.template(), corners: ti.template(),
+):  # fmt: skip
+    """Draw an instance on the shadow map, both sides of its triangles, each pushed away from the sun by its slope."""
+    transform(k, tables.TO_MAP, 0, corner_base, whole, real, positions, corners)
+    first = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32)
+    for t in range(first, first + ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLES], i32)):
+        a = vertex(corner_base + triangles[3 * t] * CORNER, corners)
+        b = vertex(corner_base + triangles[3 * t + 1] * CORNER, corners)
+        c = vertex(corner_base + triangles[3 * t + 2] * CORNER, corners)
+        across = up(ti.min(a[0], ti.min(b[0], c[0])), size) < up(ti.max(a[0], ti.max(b[0], c[0])), size)
+        if across and up(ti.min(a[1], ti.min(b[1], c[1])), size) < up(ti.max(a[1], ti.max(b[1], c[1])), size):
+            one, other = b - a, c - a
+            normal = one.cross(other)
+            if normal[2] != 0:
+                d_u, d_v = -normal[0] / normal[2], -normal[1] / normal[2]
+                start = a[2] - d_u * a[0] - d_v * a[1]
+                start -= SLACK + ti.min(ti.abs(d_u) + ti.abs(d_v), STEEPEST)
+                fill_map(a[0], a[1], b[0], b[1], c[0], c[1], start, d_u, d_v, size, base, shadow)
+
+
+@ti.func
+def ray(at: i32, scenes: ti.template()):
+    """An axis of the world along a pixel's ray, as a plane."""
+    return ti.Vector([scenes[at + 1], scenes[at + 2], scenes[at]], dt=f64)
+
+
+@ti.func
+def lay_ground(
+    scene: i32, strips: i32, record_base: i32, mark_base: i32, middle_u: f64, middle_v: f64, scenes: ti.template(),
+    strip: ti.template(), tiles: ti.template(), records: ti.template(), marks: ti.template(),
+):  # fmt: skip
+    """The records of the strips, 1 to ``strips``: planes like any triangle's."""
+    s = scene * tables.SCENE
+    x, y = ray(s + tables.RAY, scenes), ray(s + tables.RAY + 3, scenes)
+    w = ray(s + tables.RAY + 6, scenes) / -scenes[s + tables.EYE + 2]
+    across = w * scenes[s + tables.EYE + 1] + y
+    along = w * (scenes[s + tables.EYE] - scenes[s + tables.OFFSET]) + x
+    for i in range(strips):
+        r, m = record_base + (i + 1) * shading.RECORD, mark_base + (i + 1) * shading.MARKS
+        at = 2 * (scene * strips + i)
+        records[r + shading.FROM_U], records[r + shading.FROM_V] = ti.cast(middle_u, f32), ti.cast(middle_v, f32)
+        records[r + shading.W_U], records[r + shading.W_V] = ti.cast(w[0], f32), ti.cast(w[1], f32)
+        put_plane(r + shading.PLANE_S, across / -tiles[at + 1], middle_u, middle_v, records)
+        put_plane(r + shading.PLANE_T, along / tiles[at], middle_u, middle_v, records)
+        records[r + shading.PLANE_SUN] = ti.cast(scenes[s + tables.SUN_UP], f32)
+        records[r + shading.PLANE_UP] = f32(1.0)
+        for channel in ti.static(range(3)):
+            records[r + shading.RGB + channel] = f32(1.0)
+        marks[m + shading.LABEL], marks[m + shading.CLASS] = 0, strip[at + 1]
+        marks[m + shading.IMAGE], marks[m + shading.VARIES] = strip[at], 0

@@ -1,0 +1,203 @@
+"""The mesh kernel: worlds to images and labels, one worker a scene.
+
+A scene is drawn in four steps, each over scratch that stays in the cache: the ground clears the visibility buffer,
+instances are drawn into it, their shadows into the shadow map, and then the rows are labelled, shaded and packed.
+"""
+
+from probscene.renderers import mesh_tables as tables
+from probscene.renderers import shading_kernel as shading
+from probscene.renderers.engine import ti
+from probscene.renderers.geometry_kernel import cast_shadow, draw_instance, lay_ground
+from probscene.renderers.raster_kernel import fill_ground
+
+NOTHING = -1e30
+
+i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
+
+
+@ti.func
+def record_of(word: u64):
+    return ti.cast(ti.cast(word, u32), i32)
+
+
+@ti.func
+def run_end(x: i32, width: i32, line: i32, record: i32, seen: ti.template()):
+    """The first column after ``x`` of another record."""
+    end = x + 1
+    while end < width and record_of(seen[line + end]) == record:
+        end += 1
+    return end
+
+
+@ti.func
+def even(x: i32, line: i32, fine: i32, width: i32, record: i32, seen: ti.template()):
+    """Whether a pixel and its four samples are of one record."""
+    at = fine + 2 * x
+    same = record_of(seen[line + x]) == record and record_of(seen[at]) == record
+    same = same and record_of(seen[at + 1]) == record and record_of(seen[at + 2 * width]) == record
+    return same and record_of(seen[at + 2 * width + 1]) == record
+
+
+@ti.func
+def label_row(
+    scene: i32, row: i32, nodes: i32, height: i32, width: i32, line: i32, mark_base: i32,
+    seen: ti.template(), marks: ti.template(), instance: ti.template(), semantic: ti.template(), depth: ti.template(),
+    result: ti.template(),
+):  # fmt: skip
+    """Ids, classes and depth of a row, and each node's extent and count."""
+    x, out = i32(0), (scene * height + row) * width
+    while x < width:
+        record = record_of(seen[line + x])
+        end = run_end(x, width, line, record, seen)
+        label, kind = i32(0), i32(0)
+        if record > 0:
+            label, kind = marks[mark_base + record * shading.MARKS], marks[mark_base + record * shading.MARKS + 1]
+        id16, kind8 = ti.cast(label, ti.i16), ti.cast(kind, ti.u8)
+        for i in range(x, end):
+            instance[out + i] = id16
+        for i in range(x, end):
+            semantic[out + i] = kind8
+        for i in range(x, end):
+            depth[out + i] = f32(1.0) / shading.depth_of(seen[line + i])  # infinity in the sky
+        if label > 0:
+            t = (scene * nodes + label - 1) * tables.RESULTS
+            result[t + tables.BOX] = ti.min(result[t + tables.BOX], x)
+            result[t + tables.BOX + 1] = ti.min(result[t + tables.BOX + 1], row)
+            result[t + tables.BOX + 2] = ti.max(result[t + tables.BOX + 2], end)
+            result[t + tables.BOX + 3] = row + 1
+            result[t + tables.PIXELS] = result[t + tables.PIXELS] + end - x
+        x = end
+
+
+@ti.kernel
+def render(
+    fine: ti.template(),
+    workers: ti.i32,
+    scenes: ti.i32,
+    height: ti.i32,
+    width: ti.i32,
+    nodes: ti.i32,
+    strips: ti.i32,
+    map_size: ti.i32,
+    most_vertices: ti.i32,
+    most_records: ti.i32,
+    queue: ti.types.ndarray(ti.i32, 1),
+    first: ti.types.ndarray(ti.i32, 1),
+    whole: ti.types.ndarray(ti.i64, 1),
+    real: ti.types.ndarray(ti.f64, 1),
+    scene_table: ti.types.ndarray(ti.f64, 1),
+    seeds: ti.types.ndarray(ti.i64, 1),
+    edges: ti.types.ndarray(ti.f64, 1),
+    strip: ti.types.ndarray(ti.i32, 1),
+    tiles: ti.types.ndarray(ti.f64, 1),
+    positions: ti.types.ndarray(ti.f32, 1),
+    triangles: ti.types.ndarray(ti.i32, 1),
+    faces: ti.types.ndarray(ti.f32, 1),
+    textures: ti.types.ndarray(ti.i32, 1),
+    texels: ti.types.ndarray(ti.u64, 1),
+    seen: ti.types.ndarray(ti.u64, 1),
+    stamp: ti.types.ndarray(ti.i32, 1),
+    shadow: ti.types.ndarray(ti.f32, 1),
+    corners: ti.types.ndarray(ti.f64, 1),
+    records: ti.types.ndarray(ti.f32, 1),
+    marks: ti.types.ndarray(ti.i32, 1),
+    line: ti.types.ndarray(ti.f32, 1),
+    packed: ti.types.ndarray(ti.u32, 1),
+    image: ti.types.ndarray(ti.u8, 1),
+    words: ti.types.ndarray(ti.u32, 1),
+    instance: ti.types.ndarray(ti.i16, 1),
+    semantic: ti.types.ndarray(ti.u8, 1),
+    depth: ti.types.ndarray(ti.f32, 1),
+    result: ti.types.ndarray(ti.i32, 1),
+    extent: ti.types.ndarray(ti.f64, 1),
+):
+    """Render every scene.
+
+    ``fine`` is whether there are four samples a pixel, kept behind the visibility buffer's first part. ``first (scenes
+    + 1)`` says where the instances of each scene begin; ``words`` is ``image`` as 32-bit words; ``seen`` to ``packed``
+    are scratch, as much for each worker, of which ``stamp`` and ``line`` hold zeros; ``queue`` holds zeros; ``result``
+    and ``extent`` hold empty extents.
+    """
+    for j in range(workers * ti.i32(512)):
+        if j % 512 == 0:
+            worker = ti.cast(j // 512, i32)
+            pixels = height * width
+            base, stamp_base = worker * pixels * ti.static(5 if fine else 1), worker * pixels
+            map_base, corner_base = worker * map_size * map_size, worker * most_vertices * 5
+            record_base, mark_base = worker * most_records * shading.RECORD, worker * most_records * shading.MARKS
+            line_base, row_base = worker * width * 3, worker * width
+            scene = ti.atomic_add(queue[0], 1)
+            while scene < scenes:
+                laid = ti.select(scene_table[scene * tables.SCENE + tables.GROUNDED] != 0, strips, 0)
+                lay_ground(
+                    scene, laid, record_base, mark_base, 0.5 * ti.cast(width, f64), 0.5 * ti.cast(height, f64),
+                    scene_table, strip, tiles, records, marks,
+                )  # fmt: skip
+                for zoom in range(1, ti.static(3 if fine else 2)):
+                    fill_ground(
+                        scene, laid, height * zoom, width * zoom, base + (zoom - 1) * pixels,
+                        1 / ti.cast(zoom, f64), -0.25 * ti.cast(zoom - 1, f64), scene_table, edges, seen,
+                    )  # fmt: skip
+                last, mark, marked = laid, i32(0), i32(-1)
+                for k in range(first[scene], first[scene + 1]):
+                    node = ti.cast(whole[k * tables.INTEGERS + tables.NODE], i32)
+                    if node < 0:
+                        mark = 0
+                    elif node != marked:
+                        mark, marked = k + 1, node
+                    if node >= 0 or whole[k * tables.INTEGERS + tables.SEEN] != 0:
+                        target = ti.select(node < 0, -1, scene * nodes + node)
+                        last, area = draw_instance(
+                            k, mark, last, target, height, width, ti.static(2 if fine else 1), base, stamp_base,
+                            corner_base, record_base, mark_base, whole, real, positions, triangles, faces, seen,
+                            stamp, corners, records, marks, extent,
+                        )  # fmt: skip
+                        if node >= 0:
+                            total = target * tables.RESULTS + tables.WHOLE
+                            result[total] = result[total] + area
+                if scene_table[scene * tables.SCENE + tables.SHADOWED] != 0:
+                    for i in range(map_base, map_base + map_size * map_size):
+                        shadow[i] = f32(NOTHING)
+                    for k in range(first[scene], first[scene + 1]):
+                        if whole[k * tables.INTEGERS + tables.CASTS] != 0:
+                            cast_shadow(
+                                k, map_size, map_base, corner_base, whole, real, positions, triangles, shadow, corners
+                            )
+                light = shading.lights(scene, scene_table)
+                for row in range(height):
+                    line_at, fine_at = base + row * width, base + pixels + row * 4 * width
+                    label_row(
+                        scene, row, nodes, height, width, line_at, mark_base, seen, marks, instance, semantic, depth,
+                        result,
+                    )  # fmt: skip
+                    x, tap = i32(0), i32(0)
+                    while x < width:
+                        record, end, at = record_of(seen[line_at + x]), i32(0), line_at + x
+                        u, v, share = ti.cast(x, f32), ti.cast(row, f32), f32(1.0)
+                        if ti.static(fine):
+                            end = x
+                            while tap == 0 and end < width and even(end, line_at, fine_at, width, record, seen):
+                                end += 1
+                            if end == x:  # its four samples, one after another
+                                across, down = tap & 1, tap >> 1
+                                at = fine_at + 2 * x + across + down * 2 * width
+                                record, share = record_of(seen[at]), f32(0.25)
+                                u += f32(0.5) * ti.cast(across, f32) - f32(0.25)
+                                v += f32(0.5) * ti.cast(down, f32) - f32(0.25)
+                                tap = (tap + 1) & 3
+                                end = x + ti.cast(tap == 0, i32)
+                        else:
+                            end = run_end(x, width, line_at, record, seen)
+                        count = ti.max(end - x, 1)
+                        if record == 0:
+                            shading.shade_sky(scene, x, count, u, v, share, light, line_base, scene_table, line)
+                        else:
+                            shading.shade(
+                                record, at, x, count, u, v, share, light, map_size, map_base, record_base, mark_base,
+                                line_base, seen, shadow, records, marks, textures, texels, line,
+                            )  # fmt: skip
+                        x = end
+                    shading.develop(
+                        scene, row, height, width, line_base, row_base, scene_table, seeds, line, packed, image, words
+                    )
+                scene = ti.atomic_add(queue[0], 1)

@@ -1,0 +1,155 @@
+"""Rows and columns of a triangle or a strip of ground, and what is written there.
+
+A sample belongs to a triangle if it lies between its edges, on the left or the upper one included, so that triangles
+that share an edge share no sample and leave none out: the edge is the same arithmetic on the same two numbers for both.
+The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above the record; of equals the later record.
+"""
+
+from probscene.renderers import mesh_tables as tables
+from probscene.renderers.engine import ti
+
+FAR = 1 << 29
+
+i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
+
+
+@ti.func
+def up(value: f64, most: i32):
+    """The first whole number not below the value, within 0..most."""
+    bounded = ti.min(ti.max(value, 0.0), ti.cast(most, f64))
+    return FAR - ti.cast(FAR - bounded, i32)  # ceil by truncation: the real one is a call
+
+
+@ti.func
+def key(w: f32, record: i32):
+    return (ti.cast(ti.bit_cast(w, u32), u64) << 32) | ti.cast(record, u64)
+
+
+@ti.func
+def by_height(u0: f64, v0: f64, u1: f64, v1: f64, u2: f64, v2: f64):
+    """The same corners from the top to the bottom."""
+    if v1 < v0:
+        u0, v0, u1, v1 = u1, v1, u0, v0
+    if v2 < v1:
+        u1, v1, u2, v2 = u2, v2, u1, v1
+    if v1 < v0:
+        u0, v0, u1, v1 = u1, v1, u0, v0
+    return u0, v0, u1, v1, u2, v2
+
+
+@ti.func
+def columns(y: f64, u0: f64, v0: f64, v1: f64, u1: f64, whole: f64, upper: f64, lower: f64, width: i32):
+    """First and last column, exclusive, of a triangle's row; slopes of the whole side, of the upper and the lower."""
+    one, other = u0 + (y - v0) * whole, u0 + (y - v0) * upper
+    if y >= v1:
+        other = u1 + (y - v1) * lower
+    return up(ti.min(one, other), width), up(ti.max(one, other), width)
+
+
+@ti.func
+def fill(
+    a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, w: f64, w_u: f64, w_v: f64, record: i32, mark: i32,
+    height: i32, width: i32, base: i32, stamp_base: i32, seen: ti.template(), stamp: ti.template(),
+):  # fmt: skip
+    """Draw a triangle with corners (a, b) of columns and rows; 1/z is ``w`` at the first sample and linear.
+
+    Where ``mark`` is not 0 it is stamped, and the samples that did not have it are counted.
+    """
+    u0, v0, u1, v1, u2, v2 = by_height(a0, b0, a1, b1, a2, b2)
+    whole, upper, lower = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
+    slope, area = ti.cast(w_u, f32), i32(0)
+    for row in range(up(v0, height), up(v2, height)):
+        y = ti.cast(row, f64)
+        first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, width)
+        start = ti.cast(w + w_v * y + w_u * ti.cast(first, f64), f32)
+        line = base + row * width
+        for column in range(first, last):
+            word = key(start + slope * ti.cast(column - first, f32), record)
+            if word > seen[line + column]:
+                seen[line + column] = word
+        if mark != 0:
+            stamps = stamp_base + row * width
+            for column in range(first, last):
+                if stamp[stamps + column] != mark:
+                    stamp[stamps + column] = mark
+                    area += 1
+    return area
+
+
+@ti.func
+def fill_map(
+    a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, d: f64, d_u: f64, d_v: f64,
+    size: i32, base: i32, shadow: ti.template(),
+):  # fmt: skip
+    """Keep what is nearest to the sun; its distance is ``d`` at the first texel and linear."""
+    u0, v0, u1, v1, u2, v2 = by_height(a0, b0, a1, b1, a2, b2)
+    whole, upper, lower = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
+    slope = ti.cast(d_u, f32)
+    for row in range(up(v0, size), up(v2, size)):
+        y = ti.cast(row, f64)
+        first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, size)
+        start = ti.cast(d + d_v * y + d_u * ti.cast(first, f64), f32)
+        line = base + row * size
+        for column in range(first, last):
+            near = start + slope * ti.cast(column - first, f32)
+            if near > shadow[line + column]:
+                shadow[line + column] = near
+
+
+@ti.func
+def beyond(low: i32, high: i32, constant: f64, slope: f64):
+    """The columns of ``low..high`` at which ``constant + slope * column`` is positive: a part at one of its ends."""
+    first, last = low, high
+    if slope == 0:
+        if constant <= 0:
+            last = first
+    else:
+        at = ti.max(up(-constant / slope, high), low)
+        if slope > 0:
+            first = at
+        else:
+            last = at
+    return first, last
+
+
+@ti.func
+def fill_ground(
+    scene: i32, strips: i32, height: i32, width: i32, base: i32, zoom: f64, origin: f64,
+    scenes: ti.template(), edges: ti.template(), seen: ti.template(),
+):  # fmt: skip
+    """Clear the buffer, and draw the strips with records 1 to ``strips``; samples are at ``origin + zoom * column``.
+
+    A column is in the strip above an edge where the ray's y is; that and 1/z are linear along a row.
+    """
+    s = scene * tables.SCENE
+    eye_y, eye_z = scenes[s + tables.EYE + 1], scenes[s + tables.EYE + 2]
+    y_u, z_u = scenes[s + tables.RAY + 4] * zoom, scenes[s + tables.RAY + 7] * zoom
+    for row in range(height):
+        v = origin + zoom * ti.cast(row, f64)
+        ray_y = scenes[s + tables.RAY + 3] + scenes[s + tables.RAY + 4] * origin + scenes[s + tables.RAY + 5] * v
+        ray_z = scenes[s + tables.RAY + 6] + scenes[s + tables.RAY + 7] * origin + scenes[s + tables.RAY + 8] * v
+        line = base + row * width
+        first, last = i32(0), i32(0)
+        if strips > 0:
+            first, last = beyond(0, width, -ray_z, -z_u)
+            first, last = beyond(first, last, eye_z / tables.NEAR + ray_z, z_u)
+        for column in range(0, first):
+            seen[line + column] = u64(0)
+        for column in range(ti.max(last, first), width):
+            seen[line + column] = u64(0)
+        low, high = first, last
+        for strip in range(strips):
+            a, b = low, high  # what lies above the edges so far
+            if strip < strips - 1:
+                gap = eye_y - edges[scene * (strips - 1) + strip]
+                constant, slope = gap * ray_z - eye_z * ray_y, gap * z_u - eye_z * y_u
+                a, b = beyond(low, high, constant, slope)
+                if a > low:
+                    high = a
+                else:
+                    low = b
+            else:
+                low = high
+            w, w_u = ti.cast(-ray_z / eye_z, f32), ti.cast(-z_u / eye_z, f32)
+            for column in range(a, b):
+                seen[line + column] = key(w + w_u * ti.cast(column, f32), strip + 1)

@@ -1,0 +1,84 @@
+"""Textures as the kernels read them: repeating, filtered for width and height apart, one word a texel.
+
+A texture that is seen at a slant is small along one axis only, so it is kept at every pair of levels, each half as
+wide or half as high as the one before. A level has a frame of one texel, copied from its other side.
+"""
+
+import numpy as np
+
+from probscene.errors import ModelError
+
+LEVELS = 12
+# Columns of the table, one row a texture: its size, how many levels it has in width and in height, and where the texels
+# of level (x, y) begin: at AT + y * LEVELS + x.
+WIDTH, HEIGHT, LEVELS_X, LEVELS_Y, AT = range(5)
+COLUMNS = AT + LEVELS * LEVELS
+
+_MOST = (1 << 31) - 1  # the kernel's indices are 32-bit
+_LANES = np.array([0, 16, 32], np.uint64)
+
+
+class TextureAtlas:
+    """Textures in the order in which they are added.
+
+    Attributes:
+        texels: uint64, red, green and blue in 16-bit lanes.
+        table: int32, ``COLUMNS`` for each texture.
+        count: how many there are.
+    """
+
+    def __init__(self):
+        self.texels, self.table = np.zeros(1, np.uint64), np.zeros(COLUMNS, np.int32)  # Taichi takes no empty array
+        self.count = 0
+
+    def add(self, textures: list[np.ndarray]) -> list[int]:
+        """The numbers of new textures, ``(h, w, 3)`` uint8 each.
+
+        Raises:
+            ModelError: more texels than 31 bits can count.
+        """
+        if not textures:
+            return []
+        words, rows, used = [self.texels], [self.table[: self.count * COLUMNS]], self.texels.size
+        for texture in textures:
+            row = np.zeros(COLUMNS, np.int64)
+            across = _halvings(texture.astype(np.float64), 1)
+            row[[WIDTH, HEIGHT, LEVELS_X]] = texture.shape[1], texture.shape[0], len(across)
+            for x, narrow in enumerate(across):
+                both = _halvings(narrow, 0)
+                row[LEVELS_Y] = len(both)
+                for y, level in enumerate(both):
+                    row[AT + y * LEVELS + x] = used
+                    framed = np.pad(np.rint(level).astype(np.uint64), ((1, 1), (1, 1), (0, 0)), mode="wrap")
+                    words.append((framed << _LANES).sum(-1, dtype=np.uint64).ravel())
+                    used += words[-1].size
+            if used > _MOST:
+                raise ModelError(f"Expected textures of at most {_MOST} texels in all, actual more; make them smaller.")
+            rows.append(row.astype(np.int32))
+        self.texels, self.table = np.concatenate(words), np.concatenate(rows)
+        first, self.count = self.count, self.count + len(textures)
+        return list(range(first, self.count))
+
+
+def _halvings(texture: np.ndarray, axis: int) -> list[np.ndarray]:
+    """The texture, and what is left of it each time that ``axis`` is halved, down to one texel."""
+    levels = [texture]
+    while levels[-1].shape[axis] > 1 and len(levels) < LEVELS:
+        levels.append(_halved(levels[-1], axis))
+    return levels
+
+
+def _halved(texture: np.ndarray, axis: int) -> np.ndarray:
+    """Means over as many cells of equal width as there are pairs of texels; an odd texel is shared among the cells."""
+    texels = np.moveaxis(texture, axis, 0)
+    size = len(texels)
+    if size % 2 == 0:
+        halved = (texels[0::2] + texels[1::2]) / 2
+    else:
+        cells = size // 2
+        edge = np.arange(cells + 1) * (size / cells)
+        first, last = edge[:-1, None], edge[1:, None]
+        texel = np.arange(size)
+        weight = np.clip(np.minimum(last, texel + 1) - np.maximum(first, texel), 0, None) * (cells / size)
+        halved = np.tensordot(weight, texels, 1)
+    return np.moveaxis(halved, 0, axis)
