@@ -120,6 +120,20 @@ def preview(
 
 
 @app.command()
+def view(
+    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a finished run.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="scene.rrd for Rerun's viewer, or scene.glb (glTF, 3D).")],
+    num: Annotated[int, typer.Option(help="How many scenes, one after the other; a .glb holds one.")] = 1,
+    seed: Seed = 0,
+) -> None:
+    """Write scenes that one can turn: of a model's prior, or of what a run has learnt."""
+    from probscene.app.turnable import view
+
+    view(model_or_run, out, num, _seed(seed))
+    print(f"{num} {'scene' if num == 1 else 'scenes'} in {out}")
+
+
+@app.command()
 def fit(
     ctx: typer.Context,
     out: Annotated[Path, typer.Option(metavar="RUN", help="The run folder to write.")],

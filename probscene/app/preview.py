@@ -38,18 +38,26 @@ def preview(model_or_run: str, out: Path, num: int = 16, seed: int = 0, boxes: b
     out = Path(out)
     if out.is_dir():
         raise DataError(f"Expected a file to write the picture to, actual the folder {out}; name a file in it.")
-    if is_run(model_or_run):
-        run = Run.open(Path(model_or_run))
-        model, policy = run.model, run.guide()
-    else:
-        model = load_model(model_or_run)
-        policy = model.prior
+    model, policy = opened(model_or_run)
     batch = scenes(model, policy, num, seed)
     images = pixels(batch.image)
     if boxes:
         images = [labelled(image, batch, i, model) for i, image in enumerate(images)]
     make_folder(out.parent)
     write_picture(out, grid(images))
+
+
+def opened(model_or_run: str) -> tuple[SceneModel, Policy]:
+    """A model and its prior, or a run's model and what the run has learnt.
+
+    Raises:
+        ProbsceneError: see ``load_model`` and ``Run.guide``.
+    """
+    if is_run(model_or_run):
+        run = Run.open(Path(model_or_run))
+        return run.model, run.guide()
+    model = load_model(model_or_run)
+    return model, model.prior
 
 
 def scenes(model: SceneModel, policy: Policy, num: int, seed: int) -> RenderBatch:

@@ -1,0 +1,123 @@
+"""Scenes that one can turn: read back by Rerun's own reader and by trimesh."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from probscene.app.loading import load_model
+from probscene.app.pieces import camera_matrix, intrinsics, pieces
+from probscene.app.provenance import chunk_randomness
+from probscene.sampling import sample
+
+LOTS = Path(__file__).with_name("lots.py")
+
+
+@pytest.fixture(scope="module")
+def lots():
+    return load_model(str(LOTS))
+
+
+def scenes_of(model, num, seed):
+    with chunk_randomness(seed, 0):
+        return sample(model, model.prior, num)
+
+
+def entities(file: Path) -> set[str]:
+    """The paths that a recording holds, by Rerun's command line."""
+    subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", file], check=True, capture_output=True)
+    text = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "print", file], check=True, capture_output=True, text=True
+    )
+    return {line.split(" - ")[1] for line in text.stdout.splitlines() if line.startswith("Chunk(")}
+
+
+def test_a_recording_of_a_3d_scene_holds_all_of_it(tmp_path, call, lots):
+    done = call("view", LOTS, "--out", tmp_path / "scene.rrd", "--num", 2, "--seed", 3)
+    assert done.code == 0, done.err
+    found = entities(tmp_path / "scene.rrd")
+    world = scenes_of(lots, 2, 3).drawing
+    nodes = {
+        f"/world/{lots.grammar.kinds[k]}/{m}/0" for row in world.kind.tolist() for m, k in enumerate(row) if k >= 0
+    }
+    assert nodes <= found
+    camera = {
+        f"/world/camera{path}" for path in ("", "/boxes", "/image", "/image/colour", "/image/classes", "/image/depth")
+    }
+    assert camera | {"/graph", "/world/ground/1/0"} <= found
+
+
+def test_a_recording_of_a_2d_scene_holds_image_masks_and_boxes(tmp_path, call, discs):
+    assert call("view", discs.file, "--out", tmp_path / "scene.rrd").code == 0
+    assert {"/image/colour", "/image/classes", "/image/boxes", "/graph"} <= entities(tmp_path / "scene.rrd")
+
+
+def test_a_gltf_file_holds_every_object_where_it_stands(tmp_path, call, lots):
+    done = call("view", LOTS, "--out", tmp_path / "scene.glb", "--seed", 5)
+    assert done.code == 0, done.err
+    world = scenes_of(lots, 1, 5).drawing
+    whole = trimesh.load_scene(tmp_path / "scene.glb")
+    back = np.linalg.inv(np.array([[0.0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]))
+    for m, k in enumerate(world.kind[0].tolist()):
+        if k < 0:
+            continue
+        name = f"{lots.grammar.kinds[k]} {m}"
+        parts = [n for n in whole.graph.nodes_geometry if n == name or n.startswith(f"{name} part")]
+        corners = []
+        for part in parts:
+            matrix, geometry = whole.graph[part]
+            corners.append(trimesh.transform_points(whole.geometry[geometry].vertices, back @ matrix))
+        corners = np.concatenate(corners)
+        layer = next(layer for layer in world.layers if layer.present[0, m])
+        mesh = layer.meshes[int(layer.mesh[0, m])]
+        c, s = torch.cos(layer.yaw[0, m]).item(), torch.sin(layer.yaw[0, m]).item()
+        x, y = mesh.positions[:, 0], mesh.positions[:, 1]
+        expected = np.c_[
+            c * x - s * y + layer.x[0, m].item(),
+            s * x + c * y + layer.y[0, m].item(),
+            mesh.positions[:, 2] + layer.z[0, m].item(),
+        ]
+        assert np.allclose(np.unique(corners.round(3), axis=0), np.unique(expected.round(3), axis=0), atol=2e-3)
+    ground = [n for n in whole.graph.nodes_geometry if n.startswith("ground")]
+    assert len(ground) == 3 and whole.has_camera
+
+
+def test_what_is_projected_from_pieces_is_what_is_rendered(lots):
+    """The amodal box of every box and lid, from corners that OpenCV projects."""
+    from probscene.app.loading import renderer_for
+
+    scenes = scenes_of(lots, 12, 1)
+    world, batch = scenes.drawing, renderer_for(lots)(scenes.drawing)
+    for scene in range(12):
+        to_camera = np.linalg.inv(camera_matrix(world, scene))
+        corners: dict[str, list] = {}
+        for piece in pieces(world, scene):
+            corners.setdefault(piece.name, []).append(
+                trimesh.transform_points(piece.positions, to_camera @ piece.matrix)
+            )
+        rotation, shift = cv2.Rodrigues(np.eye(3))[0], np.zeros(3)
+        for m, k in enumerate(world.kind[scene].tolist()):
+            if k < 0:
+                continue
+            points = np.concatenate(corners[f"{lots.grammar.kinds[k]} {m}"]).astype(np.float64)
+            if points[:, 2].min() < 0.5:
+                continue
+            seen = cv2.projectPoints(points, rotation, shift, intrinsics(world, scene), None)[0][:, 0] + 0.5
+            box = np.r_[seen.min(0), seen.max(0)]
+            assert np.allclose(batch.amodal_box[scene, m].numpy(), box, atol=0.05), (scene, m)
+
+
+def test_views_that_cannot_be(tmp_path, call, discs):
+    for words, message in (
+        (("--out", tmp_path / "scene.ply"), "suffix .rrd or .glb"),
+        (("--out", tmp_path / "scene.glb"), "a model in 3D"),
+        (("--out", tmp_path / "scene.glb", "--num", 2), "one in a .glb, actual 2"),
+        (("--out", tmp_path / "scene.rrd", "--num", 0), "positive number of scenes"),
+    ):
+        done = call("view", discs.file, *words)
+        assert done.code == 2 and message in done.err and not list(tmp_path.iterdir())
