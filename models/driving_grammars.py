@@ -3,8 +3,8 @@
 City, suburban and rural streets are the paper's, with decisions D2 (``X -> x X | ε``) and D3 (rural shoulders hold
 what sidewalks hold). Containers are objects of the scene graph, so that what stands in them is their child, and whether
 there is a median is a choice of its own. The paper's order of ``Cars`` and ``Median`` is the order from the left: what
-is left of the median comes toward us, whether one stands there or not. Of a city's two collections of buildings, one
-lines the street and one stands behind. Camera, sun and weather are nodes too. ``cyclist`` is the paper's ``bike``.
+is left of the median comes toward us, whether one stands there or not. Of a city's two collections of buildings, the
+second goes on where the first ends. Camera, sun and weather are nodes too. ``cyclist`` is the paper's ``bike``.
 
 Both priors draw n ~ U{fewest..most} for every list, the kinds of what stands in it with equal probability, one to four
 lanes with equal probability (two to four where the paper's rural street has no fewer), and a median with probability
@@ -35,12 +35,12 @@ WALK = ("pole", "sign", "pedestrian", "object", "cyclist")
 PLANTS = ("bush", "object", "tree")
 # Fewest and most in each list: of the tuned prior, and of what a guide is pretrained on beside it.
 BOUNDS = MappingProxyType({
-    "city": {"Cars": (0, 4), "Walk": (2, 8), "Planting": (0, 6), "Buildings": (3, 7), "Foliage": (0, 3)},
+    "city": {"Cars": (0, 4), "Walk": (2, 8), "Planting": (0, 6), "Buildings": (2, 4), "Foliage": (0, 3)},
     "suburban": {"Cars": (0, 3), "Walk": (1, 5), "Planting": (0, 6), "Buildings": (2, 5), "Foliage": (2, 6)},
-    "rural": {"Cars": (0, 2), "Walk": (0, 3), "Foliage": (6, 14)},
+    "rural": {"Cars": (0, 2), "Walk": (0, 3), "Foliage": (8, 18)},
 })  # fmt: skip
 SIMPLE = (0, 2)
-LONGEST = MappingProxyType({"Cars": 12, "Walk": 10, "Planting": 8, "Buildings": 9, "Foliage": 16})
+LONGEST = MappingProxyType({"Cars": 12, "Walk": 10, "Planting": 8, "Buildings": 9, "Foliage": 22})
 TAIL = 0.1  # share of the lists of pretraining that are longer than the prior's
 FAR = 0.4  # total variation
 SHARES = MappingProxyType({"car": 0.86, "van": 0.1, "truck": 0.04})  # among vehicles

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from probscene.world import Camera, Light, Photo
 
-CLEAR = ((0.27, 0.47, 0.82), (0.80, 0.88, 0.96))  # zenith and horizon
-OVERCAST = ((0.80, 0.82, 0.85), (0.92, 0.92, 0.92))
+# Zenith and horizon. A camera that exposes for the road shows a sky that is nearly white.
+CLEAR = ((0.42, 0.62, 0.94), (0.93, 0.97, 1.0))
+OVERCAST = ((0.94, 0.95, 0.97), (1.0, 1.0, 1.0))
 GRAINS = 2**31 - 1
 
 Value = Callable[[str, str], Tensor]
@@ -28,7 +29,7 @@ def light(value: Value) -> Light:
         azimuth=value("sun", "azimuth"),
         elevation=value("sun", "elevation"),
         sun=1.0 - 0.9 * cloud,
-        ambient=0.28 + 0.4 * cloud,
+        ambient=0.40 + 0.32 * cloud,
         zenith=zenith,
         horizon=horizon,
         haze=value("weather", "haze"),

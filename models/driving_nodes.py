@@ -71,9 +71,16 @@ class Nodes:
 
     def largest_child(self, value: Tensor) -> Tensor:
         """``(N, M)``, the largest of the children's non-negative values, 0 where there are none."""
+        return self._of_children(value, "amax")
+
+    def sum_of_children(self, value: Tensor) -> Tensor:
+        """``(N, M)``, 0 where there are none."""
+        return self._of_children(value, "sum")
+
+    def _of_children(self, value: Tensor, how: str) -> Tensor:
         N, M = value.shape
         above = self.graph.parent.where(self.graph.parent >= 0, M)
-        return torch.zeros(N, M + 1).scatter_reduce(1, above, value, "amax")[:, :M]
+        return torch.zeros(N, M + 1).scatter_reduce(1, above, value, how)[:, :M]
 
     def together(self, mask: Tensor, line: Tensor) -> Tensor:
         """``(N, M, M)`` bool, which nodes in the mask have the same parent and the same line."""

@@ -18,7 +18,7 @@ AHEAD, BESIDE = 7.0, 2.5  # metres: free before the camera in its own lane; of a
 HIDDEN = 3.0  # metres of a building that may be out of sight beside the camera
 STOP = MappingProxyType({"lane": 75.0, "median": 65.0, "walk": 60.0, "city": 75.0, "suburban": 80.0, "rural": 95.0})
 RAISED = MappingProxyType({"city": 0.14, "suburban": 0.12, "rural": 0.0})  # metres, height of kerbs
-LINES = MappingProxyType({"city": 1, "suburban": 1, "rural": 3})  # of trees beside one another on a verge
+LINES = MappingProxyType({"city": 1, "suburban": 1, "rural": 2})  # of trees beside one another on a verge
 SETBACK = MappingProxyType({"city": 0.5, "suburban": 3.0})  # metres by which fronts are out of line
 CLEARANCE = 0.2  # metres between what stands on a median and the lanes
 MARGIN = 0.4  # metres of a verge in which only a fence stands
@@ -41,11 +41,12 @@ class Strip(NamedTuple):
     lines: Tensor | float = 1.0
 
 
-def strips(nodes: Nodes, breadth: Tensor) -> tuple[Street, Strip]:
+def strips(nodes: Nodes, length: Tensor, breadth: Tensor) -> tuple[Street, Strip]:
     """The cross-section, and every container's strip.
 
     Args:
-        breadth: ``(N, M)`` of every thing across the road, metres; 0 at other nodes.
+        length, breadth: ``(N, M)`` of every thing along the road, with what is free around it, and across, metres; 0
+            at other nodes.
     """
     graph, widest = nodes.graph, nodes.largest_child(breadth)
     lanes, oncoming = (graph.mask(kind).sum(1, keepdim=True) for kind in ("lane", "oncoming"))
@@ -64,7 +65,7 @@ def strips(nodes: Nodes, breadth: Tensor) -> tuple[Street, Strip]:
     )
     road = street(lanes, oncoming, lane, median, walks, verges, own)
     found = [_lanes(nodes, road, lane, own), _median(nodes, road)]
-    found += [strip for side in ("left", "right") for strip in _outer(nodes, road, side, width, widest)]
+    found += [strip for side in ("left", "right") for strip in _outer(nodes, road, side, width, widest, length)]
     fields = [torch.zeros(graph.kind.shape) for _ in Strip._fields]
     for mask, strip in found:
         fields = [torch.where(mask, torch.as_tensor(new), old) for new, old in zip(strip, fields, strict=True)]
@@ -92,8 +93,10 @@ def _median(nodes: Nodes, road: Street) -> tuple[Tensor, Strip]:
     return nodes.graph.mask("median"), strip
 
 
-def _outer(nodes: Nodes, road: Street, side: str, width: dict, widest: Tensor) -> list[tuple[Tensor, Strip]]:
-    """Walk, verge and rows of one side."""
+def _outer(
+    nodes: Nodes, road: Street, side: str, width: dict, widest: Tensor, length: Tensor
+) -> list[tuple[Tensor, Strip]]:
+    """Walk, verge and rows of one side; a second row goes on where the first ends."""
     graph, scenario, here = nodes.graph, nodes.scenario, nodes.below(side)
     sign, inner, outer = (1.0, road.right, road.left) if side == "left" else (-1.0, road.left, road.right)
     raised = RAISED[scenario]
@@ -106,10 +109,9 @@ def _outer(nodes: Nodes, road: Street, side: str, width: dict, widest: Tensor) -
     found = [(graph.mask(nodes.walk) & here, walk), (graph.mask("verge") & here, verge)]
     if nodes.has("row"):
         rows = graph.mask("row") & here
-        depth = widest + SETBACK[scenario]
-        before = nodes.together(rows, torch.zeros_like(depth)).tril(-1).float()
-        behind = before @ ((depth + nodes.of("row", "gap")) * rows).unsqueeze(-1)
+        before = nodes.together(rows, torch.zeros_like(length)).tril(-1).float()
+        reach = torch.maximum(nodes.of("row", "length"), nodes.sum_of_children(length))
         near = outer(f"verge_{side}")
-        start = VIEW * near.abs() - HIDDEN
-        found.append((rows, Strip(near + sign * behind.squeeze(-1), depth, start, nodes.of("row", "stop"), 0.0, sign)))
+        start = VIEW * near.abs() - HIDDEN + (before @ (reach * rows).unsqueeze(-1)).squeeze(-1)
+        found.append((rows, Strip(near, widest + SETBACK[scenario], start, start + reach, 0.0, sign)))
     return found
