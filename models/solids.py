@@ -66,21 +66,22 @@ def corner_normals(positions: np.ndarray, triangles: np.ndarray, crease: float) 
     """``(F, 3, 3)`` unit normals: at each corner the mean, by area, of the faces there that are within ``crease``."""
     across = _across(positions, triangles)
     unit = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
-    faces, corners = np.repeat(np.arange(len(triangles)), 3), triangles.reshape(-1)
-    order = np.argsort(corners, kind="stable")
-    count = np.bincount(corners, minlength=len(positions))
-    start = np.concatenate([[0], np.cumsum(count)])
-    normals = np.empty((len(corners), 3))
-    for corner, face in enumerate(faces):
-        there = faces[order[start[corners[corner]] : start[corners[corner] + 1]]]
-        near = there[unit[there] @ unit[face] > math.cos(crease) - 1e-9]
-        normals[corner] = across[near].sum(0)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    order = np.argsort(triangles.reshape(-1), kind="stable")  # corners by their vertex
+    face = order // 3
+    many = np.bincount(triangles.reshape(-1), minlength=len(positions))
+    start = np.cumsum(many) - many
+    vertex = triangles.reshape(-1)[order]
+    one = np.repeat(np.arange(len(order)), many[vertex])  # every pair of corners at the same vertex
+    other = np.arange(len(one)) - np.repeat(np.cumsum(many[vertex]) - many[vertex], many[vertex]) + start[vertex[one]]
+    near = np.einsum("ij,ij->i", unit[face[one]], unit[face[other]]) > math.cos(crease) - 1e-9
+    sums = np.stack([np.bincount(one[near], across[face[other[near]], k], len(order)) for k in range(3)], 1)
+    normals = np.empty_like(sums)
+    normals[order] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
     return normals.reshape(-1, 3, 3)
 
 
 def loft(rings, colour, tinted=False, crease: float = SHARP, ends=None) -> Solid:
-    """Rings joined one to the next, the first and last closed by a fan from their middle.
+    """Rings joined one to the next, the first and last, which are convex, filled.
 
     Args:
         rings: ``(S, R, 3)``.
@@ -97,14 +98,24 @@ def loft(rings, colour, tinted=False, crease: float = SHARP, ends=None) -> Solid
     triangles = [np.stack([a, b, b + R], 1), np.stack([a, b + R, a + R], 1)]
     colours, tints = [colour.reshape(-1, 3)] * 2, [tinted.reshape(-1)] * 2
     for end, flip in ((0, True), (S - 1, False)):
-        fan = np.array([[0, k, k + 1] for k in range(1, R - 1)]) + end * R
-        triangles.append(fan[:, ::-1] if flip else fan)
+        flat = _zigzag(R) + end * R
+        triangles.append(flat[:, ::-1] if flip else flat)
         row = min(end, S - 2)
         paint = colour[row, 1:-1] if ends is None else np.broadcast_to(np.asarray(ends, float), (R - 2, 3))
         colours.append(paint)
         tints.append(tinted[row, 1:-1] if ends is None else np.zeros(R - 2, bool))
     triangles, colours, tints = (np.concatenate(x) for x in (triangles, colours, tints))
     return solid(rings.reshape(-1, 3), triangles, colours, tints, crease)
+
+
+def _zigzag(R: int) -> np.ndarray:
+    """``(R - 2, 3)`` triangles across a ring: those of points in line with their neighbours have an area, too."""
+    faces = []
+    for k in range((R - 1) // 2):
+        faces.append((k, k + 1, R - 1 - k))
+        if R - 2 - k > k + 1:
+            faces.append((k + 1, R - 2 - k, R - 1 - k))
+    return np.array(faces)
 
 
 def box(size, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinted=False) -> Solid:

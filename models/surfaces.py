@@ -60,11 +60,11 @@ def _asphalt(seed: int, colour, size: int = 512) -> np.ndarray:
 
 
 def _marking(seed: int, colour, strength: float, paint: np.ndarray, dash: float, rows: int = 512) -> np.ndarray:
-    """Worn paint on asphalt, along the rows, for the first ``dash`` of them."""
+    """Worn paint on asphalt, along the rows, on the middle ``dash`` of them."""
     rng = np.random.default_rng(100 + seed)
     asphalt = painted(colour, 6 * noise(rng, rows, 16, 0.5) + 4 * noise(rng, rows, 16, 20.0)).astype(float)
     worn = np.clip(strength + 0.09 * noise(rng, rows, 16, 1.0) + 0.05 * noise(rng, rows, 16, 12.0), 0, 1)
-    worn[round(dash * rows) :] = 0
+    worn[np.abs(np.arange(rows) + 0.5 - rows / 2) > dash * rows / 2] = 0
     mixed = asphalt + worn[..., None] * (paint + 5 * noise(rng, rows, 16, 2.0)[..., None] - asphalt)
     return painted(mixed, np.zeros((rows, 16)))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 
 def noise(rng: np.random.Generator, height: int, width: int, *lengths: float | tuple[float, float]) -> np.ndarray:
-    """Seamless noise ``(height, width)`` of standard deviation 1: a sum of layers of these lengths in texels.
+    """Seamless noise ``(height, width)`` of mean 0 and standard deviation 1, layers of these lengths in texels.
 
     A pair is a length along the rows' axis and one along the columns'.
     """
@@ -21,7 +21,7 @@ def noise(rng: np.random.Generator, height: int, width: int, *lengths: float | t
         tall, wide = length if isinstance(length, tuple) else (length, length)
         low = np.exp(-2 * (math.pi**2) * ((down * tall) ** 2 + (along * wide) ** 2))
         layer = np.fft.ifft2(np.fft.fft2(rng.normal(size=(height, width))) * low).real
-        total += layer / max(layer.std(), 1e-9)
+        total += (layer - layer.mean()) / max(layer.std(), 1e-9)
     return total / max(total.std(), 1e-9)
 
 
