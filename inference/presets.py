@@ -26,6 +26,13 @@ class Preset:
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
         pairs, directions: of a pretrained network's projection: structures that are drawn twice, and features.
+        views: of each real image in the density of their features, the image itself and parts of it
+            (``ImageFolder.load``). Among few images they take some noise out: of 81 KITTI frames under EfficientNet's
+            projected features, 4 views lower the standard deviation between the log densities that two halves of the
+            frames give at the model's scenes from 0.50 to 0.45, and raise that of held-out frames by 0.02 nats; a view
+            lies 0.6 kernels from its image, their mean 0.1. More views change nothing, a bandwidth chosen for the few
+            (``projection``) does the rest. There are no flips: they did not help (-0.006 nats), and traffic keeps to a
+            side.
         guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``.
         objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
             value for each scene; ``"mmd"``, MMD as a reward that all scenes share.
@@ -45,6 +52,7 @@ class Preset:
     presence_epochs: int = 10
     pairs: int = 500
     directions: int = 8
+    views: int = 1
     guide: str = "lstm"
     objective: str = "kde"
     variance: float | None = 1.0

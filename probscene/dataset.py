@@ -12,14 +12,16 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from probscene.ahead import ahead
-from probscene.decoding import Fault, Window, decoded, read, window
+from probscene.decoding import Fault, Part, Window, decoded, read, window
 from probscene.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+LEAST_PART = 0.75  # of either side of an image, in its further views
 
 
 class ImageFolder:
@@ -95,22 +97,29 @@ class ImageFolder:
     def __len__(self) -> int:
         return len(self.paths)
 
-    def load(self, i: int) -> Tensor:
+    def load(self, i: int, view: int = 0) -> Tensor:
         """Image number ``i``, ``(C, H, W)`` uint8.
+
+        Args:
+            view: 0 for the image as it is. Any other number is a part of it, at least ``LEAST_PART`` of either side and
+                anywhere in it, resized to the canvas: which one depends on ``i`` and the number alone.
 
         Raises:
             DataError: the file has gone bad since the folder was opened.
         """
         try:
             with _quiet():
-                image, _ = decoded(read(self.paths[i]), self.canvas, self.channels)
+                image, _ = decoded(read(self.paths[i]), self.canvas, self.channels, _part(i, view) if view else None)
         except Fault as fault:
             raise DataError(f"Expected the image {self.paths[i]} as it was, actual a file that {fault}.") from fault
         return torch.from_numpy(image)
 
-    def batches(self, size: int) -> Iterator[Tensor]:
+    def batches(self, size: int, view: int = 0) -> Iterator[Tensor]:
         """All images in order, ``(B, C, H, W)`` uint8 with B = ``size``, fewer in the last batch; one is in memory at
         a time.
+
+        Args:
+            view: of each image, see ``load``.
 
         Raises:
             DataError: see ``load``; a size that is not positive.
@@ -118,7 +127,7 @@ class ImageFolder:
         if size < 1:
             raise DataError(f"Expected a positive batch size, actual {size}.")
         for start in range(0, len(self), size):
-            yield torch.stack([self.load(i) for i in range(start, min(start + size, len(self)))])
+            yield torch.stack([self.load(i, view) for i in range(start, min(start + size, len(self)))])
 
     def _checked(self, file: Path) -> "_Checked | Fault":
         try:
@@ -208,6 +217,11 @@ def _listed(folder: Path) -> tuple[list[Path], list[str]]:
         remedy = "; images in subfolders are not read, name the subfolder" if folders else ""
         raise DataError(f"Expected PNG or JPEG images in {folder}, actual {there}{remedy}.")
     return images, others
+
+
+def _part(i: int, view: int) -> Part:
+    share, down, along = np.random.default_rng([view, i]).random(3).tolist()
+    return Part(LEAST_PART + (1 - LEAST_PART) * share, down, along)
 
 
 def _first(names, number: int = 5) -> str:

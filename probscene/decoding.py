@@ -41,6 +41,14 @@ def window(size: tuple[int, int], canvas: tuple[int, int]) -> Window | None:
     return None if (height, width) == (h, w) else Window((h - height) // 2, (w - width) // 2, height, width)
 
 
+class Part(NamedTuple):
+    """A part of what is seen: its share of either side, and where it lies, 0 at the top and left, 1 at the ends."""
+
+    share: float
+    down: float
+    along: float
+
+
 def read(file: Path) -> bytes:
     """A file's bytes.
 
@@ -53,8 +61,13 @@ def read(file: Path) -> bytes:
         raise Fault(f"cannot be read ({error.strerror})") from error
 
 
-def decoded(data: bytes, canvas: tuple[int, int], channels: int) -> tuple[np.ndarray, tuple[int, int]]:
+def decoded(
+    data: bytes, canvas: tuple[int, int], channels: int, part: Part | None = None
+) -> tuple[np.ndarray, tuple[int, int]]:
     """The image ``(C, H, W)`` uint8 at the canvas's size, and the height and width that it had.
+
+    Args:
+        part: of it that is shown, as large as the canvas; all of it where None.
 
     Raises:
         Fault: what does not decode.
@@ -79,7 +92,12 @@ def decoded(data: bytes, canvas: tuple[int, int], channels: int) -> tuple[np.nda
     except Exception as error:  # what Pillow raises on bad bytes: OSError, SyntaxError, ValueError, struct.error, ...
         truncated = "truncated" in str(error).lower()
         raise Fault("is truncated" if truncated else f"does not decode ({error})") from error
-    pixels = _resized(_seen(pixels, size, canvas), canvas)
+    pixels = _seen(pixels, size, canvas)
+    if part is not None:
+        h, w = (max(round(part.share * side), 1) for side in pixels.shape[:2])
+        top, left = round(part.down * (pixels.shape[0] - h)), round(part.along * (pixels.shape[1] - w))
+        pixels = pixels[top : top + h, left : left + w]
+    pixels = _resized(pixels, canvas)
     return np.ascontiguousarray(pixels[None] if channels == 1 else pixels.transpose(2, 0, 1)), size
 
 

@@ -155,6 +155,7 @@ def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, pr
 def _real_features(
     run: Run, net: FeatureNet, model: SceneModel, progress: Progress, target: ImageFolder | None
 ) -> Tensor:
+    """Of every image, ``(L, D)``, then of the preset's further views, kept apart: a verdict is about L images."""
     if target is None:
         target = open_target(run, progress)
     cached = run.load("real")
@@ -164,20 +165,21 @@ def _real_features(
                 f"Expected the target images in {target.path} as they were when the run began, actual others; put them "
                 "back, or begin a new run."
             )
-        return cached["features"]
-    done = 0
+        return torch.cat([cached["features"], *([cached["views"]] if "views" in cached else [])])
+    views, done = Preset.of(run.record["preset"]).views, 0
 
     def each(images):
         nonlocal done
         done += images
-        progress("target", done, len(target), "")
+        progress("target", done, views * len(target), "")
 
     check_target(target)
-    features = embed_all(net, target.batches(RENDERED_AT_ONCE), each)
+    features, *others = (embed_all(net, target.batches(RENDERED_AT_ONCE, view), each) for view in range(views))
     check_features(features)
     fingerprint = torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
-    run.save("real", {"features": features, "fingerprint": fingerprint})
-    return features
+    kept = {"features": features, "fingerprint": fingerprint}
+    run.save("real", kept | ({"views": torch.cat(others)} if others else {}))
+    return torch.cat([features, *others])
 
 
 def check_target(target: ImageFolder) -> None:

@@ -12,6 +12,7 @@ from probscene.app.seen import own_net
 from probscene.app.view import feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import RunError
+from probscene.inference.features import embed_all
 from probscene.inference.presets import QUICK, preset
 from probscene.inference.projection import SHARE
 
@@ -81,6 +82,23 @@ def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
     assert found["trust"] is not None
     assert "estimate" not in found["sources"] and "truth" in found["sources"]  # a direction is no count
     assert call("report", run.path, "--num", 200, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
+
+
+def test_further_views_of_the_target_are_learnt_from_and_not_judged(run, call, target, tmp_path):
+    run, words = run
+    again = tmp_path / "again"
+    assert call(*[again if word == run.path else word for word in words], "--set", "views=3").code == 0
+    one, other = run.load("real"), Run.open(again).load("real")
+    assert torch.equal(one["features"], other["features"]) and other["views"].shape == (80, 3) and "views" not in one
+    net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
+    assert torch.allclose(embed_all(net, images.batches(64, 2)), other["views"][40:], atol=1e-4)
+    guide = (again / "guide.safetensors").read_bytes()
+    assert guide != (run.path / "guide.safetensors").read_bytes()
+    (again / "guide.safetensors").unlink()
+    done = call("fit", "--out", again, "--resume")  # with the features that are kept
+    assert done.code == 0 and (again / "guide.safetensors").read_bytes() == guide
+    done = call("evaluate", again, "--target", target.images, "--num", 50, "--scenes", 40)
+    assert done.code == 0, done.err
 
 
 @pytest.mark.parametrize(

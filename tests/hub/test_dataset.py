@@ -180,6 +180,36 @@ def test_names_are_sorted_and_the_rest_is_left_out(tmp_path, noise):
     assert "1 files" in others and "labels.csv" in others
 
 
+@given(st.integers(0, 5), st.integers(1, 9))
+def test_a_view_is_a_part_of_the_image(tmp_path_factory, i, view):
+    folder = tmp_path_factory.mktemp("images")
+    y, x = np.mgrid[:60, :80]
+    ramp = encoded(np.stack([4 * y, 3 * x, 0 * x], -1).astype(np.uint8))
+    for k in range(6):
+        (folder / f"{k}.png").write_bytes(ramp)
+    images = ImageFolder(folder, (30, 40), 3)
+    part = images.load(i, view).numpy().astype(float)
+    assert torch.equal(images.load(i, view), ImageFolder(folder, (30, 40), 3).load(i, view))
+    assert part.shape == (3, 30, 40) and part.dtype == float
+    for channel, axis, step, size in ((0, 0, 4, 60), (1, 1, 3, 80)):
+        line = part[channel].mean(1 - axis) / step  # where in the image each row or column comes from
+        share = (line[-1] - line[0]) / (len(line) - 1) * len(line) / size
+        assert 0.75 - 2 / size <= share <= 1 + 2 / size
+        assert np.allclose(np.diff(line), share * size / len(line), atol=0.6)
+        assert -0.5 <= line[0] and line[-1] <= size - 0.5
+
+
+def test_views_differ_and_the_first_is_the_image(tmp_path, noise):
+    for k in range(5):
+        (tmp_path / f"{k}.png").write_bytes(encoded(noise))
+    images = ImageFolder(tmp_path, (40, 30), 3)
+    seen = {images.load(i, view).numpy().tobytes() for i in range(5) for view in range(1, 5)}
+    assert len(seen) >= 15 and (images.load(3).permute(1, 2, 0).numpy() == noise).all()
+    for view in (0, 2):
+        whole = torch.cat(list(images.batches(2, view)))
+        assert torch.equal(whole, torch.stack([images.load(i, view) for i in range(5)]))
+
+
 @given(st.integers(1, 9), st.integers(1, 12))
 def test_batches_are_the_images_in_order(tmp_path_factory, number, size):
     folder = tmp_path_factory.mktemp("images")
