@@ -1,0 +1,90 @@
+"""Whether a fit finds a hidden distribution of street structures from images alone.
+
+    python benchmarks/learn_driving.py --out FOLDER [--seeds 0 1 2] [--preset quick] [--model driving]
+
+Each seed's target is drawn by the driving models themselves with another, random distribution of structures
+(``SceneModel.target``); fits see its images. Printed for each seed is the total variation of the number of cars in a
+scene, 20,000 structures of the prior and of the learnt guide against 20,000 of the target's, and how long the fit took.
+A target's images are not chosen for what they hide, so that each structure is drawn once (``candidates=1``).
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from probscene.app.files import write_json
+from probscene.app.fit import create, fit
+from probscene.app.generate import generate_scenes
+from probscene.app.loading import load_model
+from probscene.app.run import Run
+from probscene.derive import derive_complete
+from probscene.inference.metrics import total_variation, wasserstein
+from probscene.inference.presets import preset
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import seed_everything
+
+
+def counted(model: SceneModel, policy: Policy, num: int = 20_000) -> np.ndarray:
+    """``(num, classes)``, objects of each class in derivations of a policy."""
+    seed_everything(99)
+    derivation, _ = derive_complete(model.grammar, policy, num, model.max_steps)
+    return derivation.counts(len(model.grammar.kinds))[:, [model.grammar.kind(name) for name in model.classes]].numpy()
+
+
+def histogram(counts: np.ndarray) -> np.ndarray:
+    """Shares of scenes with 0, 1, 2, ... objects."""
+    return np.bincount(counts) / len(counts)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
+    parser.add_argument("--model", default="driving")
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--images", type=int, default=3000)
+    parser.add_argument("--batches", type=int)
+    args = parser.parse_args()
+    model, rows = load_model(args.model), []
+    for seed in args.seeds:
+        target = model.target(seed)
+        folder = args.out / f"target-{seed}"
+        generate_scenes(target, target.prior, args.images, folder, seed=1000 + seed, format="images")
+        chosen = replace(preset(args.preset), candidates=1)
+        chosen = replace(chosen, batches=args.batches or chosen.batches)
+        path = args.out / f"run-{seed}"
+        began = path.exists()
+        run = Run.open(path) if began else create(args.model, folder / "images", path, chosen, seed)
+        start, took, last = time.monotonic(), {}, [None, 0.0]
+
+        def progress(stage, done, total, note, took=took, last=last):
+            if stage != last[0]:
+                last[:] = [stage, time.monotonic()]
+            took[stage] = round(time.monotonic() - last[1], 1)
+
+        guide = fit(run, progress)
+        truth = counted(model, target.prior)
+        row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": took, "resumed": began}
+        for name, policy in (("prior", model.prior), ("learnt", guide)):
+            found = counted(model, policy)
+            each = {
+                c: round(total_variation(histogram(found[:, i]), histogram(truth[:, i])), 4)
+                for i, c in enumerate(model.classes)
+            }
+            apart = wasserstein(histogram(found[:, 0]), histogram(truth[:, 0]))
+            row[name] = {"total_variation": each, "cars_wasserstein": round(float(apart), 3)}
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+        write_json(args.out / "results.json", rows)
+    for name in ("prior", "learnt"):
+        cars = [row[name]["total_variation"]["car"] for row in rows]
+        print(f"{name:8} cars, total variation: mean {np.mean(cars):.3f}, {min(cars):.3f} to {max(cars):.3f}")
+
+
+if __name__ == "__main__":
+    main()
