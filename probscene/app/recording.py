@@ -3,10 +3,10 @@
 ``pip install probscene[view]`` brings Rerun; its viewer opens the file: ``rerun scene.rrd``.
 """
 
-import math
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from probscene.app.files import write_whole
 from probscene.app.pieces import camera_matrix, intrinsics, pieces
@@ -39,13 +39,13 @@ def write_recording(path: Path, model: SceneModel, derivation: Derivation, drawi
 
     def write(temporary: Path) -> None:
         recording = rr.RecordingStream("probscene")
-        recording.save(temporary)
+        recording.save(temporary, default_blueprint=_blueprint(isinstance(drawing, World)))
         classes = [rr.AnnotationInfo(k, "" if k == 0 else kinds[k - 1], colours[k]) for k in range(len(colours))]
         recording.log("/", rr.AnnotationContext(classes), static=True)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for scene in range(len(drawing)):
             recording.set_time("scene", sequence=scene)
-            recording.log("world", rr.Clear(recursive=True))
+            recording.log("world/objects", rr.Clear(recursive=True))
             _log_graph(rr, recording, model, derivation, scene)
             if isinstance(drawing, World):
                 _log_world(rr, recording, drawing, batch, scene, colours)
@@ -57,6 +57,25 @@ def write_recording(path: Path, model: SceneModel, derivation: Derivation, drawi
         recording.disconnect()
 
     write_whole(path, write)
+
+
+def _blueprint(in_3d: bool):
+    """How the viewer lays a scene out: the world, the image with boxes, masks, depth, and the scene graph."""
+    import rerun.blueprint as rrb
+
+    image = "world/camera/image" if in_3d else "image"
+
+    def flat(name: str, *parts: str):
+        return rrb.Spatial2DView(origin=image, name=name, contents=[f"/{image}/{part}" for part in parts])
+
+    views = [flat("image", "colour", "boxes"), flat("classes", "classes")]
+    views += [flat("depth", "depth")] * in_3d
+    views.append(rrb.GraphView(origin="graph", name="scene graph"))
+    if not in_3d:
+        return rrb.Blueprint(rrb.Horizontal(*views), collapse_panels=True)
+    contents = ["+ /world/**", *(f"- /{image}/{part}" for part in ("boxes", "classes", "depth"))]
+    world = rrb.Spatial3DView(origin="world", name="world", contents=contents)
+    return rrb.Blueprint(rrb.Horizontal(world, rrb.Vertical(*views)), collapse_panels=True)
 
 
 def _log_graph(rr, recording, model: SceneModel, derivation: Derivation, scene: int) -> None:
@@ -81,10 +100,13 @@ def _log_world(rr, recording, world: World, batch: RenderBatch, scene: int, colo
             albedo_factor=[*np.rint(piece.colour).astype(int).tolist(), 255],
             **texture,
         )
-        recording.log(f"world/{piece.name.replace(' ', '/')}/{number}", mesh)
+        recording.log(f"world/objects/{piece.name.replace(' ', '/')}/{number}", mesh)
     to_world = camera_matrix(world, scene)
     height, width = batch.image.shape[-2:]
-    recording.log("world/camera", rr.Transform3D(translation=to_world[:3, 3], mat3x3=to_world[:3, :3]))
+    recording.log(
+        "world/camera",
+        rr.Transform3D(translation=to_world[:3, 3], quaternion=Rotation.from_matrix(to_world[:3, :3]).as_quat()),
+    )
     recording.log(
         "world/camera/image",
         rr.Pinhole(
@@ -94,13 +116,14 @@ def _log_world(rr, recording, world: World, batch: RenderBatch, scene: int, colo
     drawn = (batch.kind[scene] >= 0).nonzero().flatten().tolist()
     box = batch.space.box[scene][drawn].double().numpy()  # h w l x y z rotation_y
     middle = box[:, 3:6] - np.c_[np.zeros(len(box)), box[:, 0] / 2, np.zeros(len(box))]
+    turned = Rotation.from_matrix(to_world[:3, :3]) * Rotation.from_euler("y", box[:, 6:])
     kind = batch.kind[scene][drawn].tolist()
     recording.log(
-        "world/camera/boxes",
+        "world/boxes",
         rr.Boxes3D(
-            centers=middle,
+            centers=middle @ to_world[:3, :3].T + to_world[:3, 3],
             sizes=box[:, [2, 0, 1]],  # along the object's own x, down and z
-            quaternions=[[0, math.sin(a / 2), 0, math.cos(a / 2)] for a in box[:, 6]],
+            quaternions=turned.as_quat(),
             class_ids=[k + 1 for k in kind],
             labels=[world.kinds[k] for k in kind],
             colors=[colours[k + 1] for k in kind],

@@ -43,13 +43,14 @@ def test_a_recording_of_a_3d_scene_holds_all_of_it(tmp_path, call, lots):
     found = entities(tmp_path / "scene.rrd")
     world = scenes_of(lots, 2, 3).drawing
     nodes = {
-        f"/world/{lots.grammar.kinds[k]}/{m}/0" for row in world.kind.tolist() for m, k in enumerate(row) if k >= 0
+        f"/world/objects/{lots.grammar.kinds[k]}/{m}/0"
+        for row in world.kind.tolist()
+        for m, k in enumerate(row)
+        if k >= 0
     }
     assert nodes <= found
-    camera = {
-        f"/world/camera{path}" for path in ("", "/boxes", "/image", "/image/colour", "/image/classes", "/image/depth")
-    }
-    assert camera | {"/graph", "/world/ground/1/0"} <= found
+    camera = {f"/world/camera{path}" for path in ("", "/image", "/image/colour", "/image/classes", "/image/depth")}
+    assert camera | {"/graph", "/world/boxes", "/world/objects/ground/1/0"} <= found
 
 
 def test_a_recording_of_a_2d_scene_holds_image_masks_and_boxes(tmp_path, call, discs):
