@@ -17,7 +17,8 @@ may come out as 1, seldom as 2.
 
 Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``kitti_labels.TYPES``) is
 written as that type. The 2D box is the whole silhouette's, what others cover included, within the image: KITTI's own
-boxes of hidden cars are as near to their projected 3D boxes as those of free ones, half a pixel. Its pixels are P2's,
+boxes of hidden cars are as near to their projected 3D boxes as those of free ones, half a pixel. (So its boxes of cars
+are projections, a few pixels wider than a silhouette, which does not reach its 3D box's corners.) Its pixels are P2's,
 the middle of the upper left one is (0, 0): 0.5 less than from the canvas's corner, and no end is beyond the middle of
 the last pixel. ``occluded`` goes by the visible fraction, which is of the silhouette within the canvas. Location is the
 middle of the 3D box's bottom in the camera's axes, ``rotation_y`` turns about the camera's y axis, so that under a

@@ -2,9 +2,12 @@
 
 import json
 import math
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyro
 import pytest
 import torch
 import torchvision
@@ -13,7 +16,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from probscene.app import coco, kitti
+from probscene.app.generate import generate_scenes
 from probscene.app.kitti_labels import read_kitti
+from probscene.app.loading import load_model
+from probscene.app.provenance import CHUNK
 from probscene.batch import RenderBatch, Space
 from probscene.dataset import ImageFolder
 
@@ -187,3 +193,43 @@ def test_coco_has_the_space_beside_the_rest():
         assert found["truncated"] == pytest.approx(float(batch.space.truncated[0, k]), abs=1e-6)
     flat = batch._replace(space=None, amodal_box=batch.box)
     assert not any({"box_3d", "truncated"} & set(found) for found in coco.annotations(MODEL, flat, 0))
+
+
+@pytest.fixture(scope="module")
+def level():
+    """The model of boxes and lids under a camera that is not pitched, so that its y axis is the world's."""
+    model = load_model(str(Path(__file__).with_name("lots.py")))
+    return replace(model, program=pyro.condition(model.program, {"camera.pitch": torch.zeros(CHUNK, 1)}))
+
+
+def test_boxes_of_rendered_cuboids_are_their_projections(level, tmp_path):
+    generate_scenes(level, level.prior, 128, tmp_path, seed=3, format="kitti,coco")
+    training, dataset = tmp_path / "Kitti" / "raw" / "training", torchvision.datasets.Kitti(tmp_path)
+    height, width = level.canvas
+    whole = cut = 0
+    for k, name in enumerate(dataset.images):
+        file = training / "label_2" / f"{Path(name).stem}.txt"
+        P = matrices((training / "calib" / file.name).read_text())["P2"]
+        image, read = dataset[k]
+        image.close()
+        for one, other in zip(parsed(file.read_text()), read, strict=True):
+            assert one["box"] == other["dimensions"] + other["location"] + [other["rotation_y"]]
+            if corners(*one["box"])[:, 2].min() < 0.5:
+                continue  # it reaches behind the camera
+            box = projected(one["box"], P)
+            edges = np.clip(box, 0, [width - 1, height - 1] * 2)
+            assert one["bbox"] == pytest.approx(edges, abs=0.05)
+            inside = np.clip(box, -0.5, [width - 0.5, height - 0.5] * 2)
+            area = np.prod(inside[2:] - inside[:2]) / np.prod(box[2:] - box[:2])
+            assert one["truncated"] == pytest.approx(1 - area, abs=0.006)
+            whole, cut = whole + (area > 0.999), cut + (area < 0.95)
+    assert whole > 100 and cut > 3
+
+
+def test_a_dataset_in_space_is_the_same_whoever_makes_it(level, tmp_path):
+    for name, format in (("one", "kitti"), ("two", "webdataset,kitti,coco")):
+        generate_scenes(level, level.prior, 3, tmp_path / name, seed=1, format=format)
+    files = sorted((tmp_path / "one" / "Kitti").rglob("*.*"))
+    assert len(files) == 3 * 4 and {file.parent.name for file in files} == {"image_2", "label_2", "instance", "calib"}
+    for file in files:
+        assert file.read_bytes() == (tmp_path / "two" / file.relative_to(tmp_path / "one")).read_bytes()
