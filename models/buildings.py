@@ -12,7 +12,7 @@ from probscene.models.facades import BARE, ROOF, WALL, facade
 from probscene.models.solids import Solid, box, finish, join, loft, place, prism
 
 RED, BROWN, SLATE, GREY = (176, 92, 66), (128, 92, 74), (92, 94, 102), (150, 148, 144)
-WHITE, STONE = (236, 234, 228), (196, 190, 178)
+WHITE, STONE, BRICK, CLAY = (236, 234, 228), (196, 190, 178), (176, 116, 92), (190, 138, 112)
 HOUSES, TOWN, BLOCKS = range(0, 6), range(6, 11), range(11, 16)  # which of ``buildings()`` are what
 
 
@@ -30,17 +30,17 @@ def _houses() -> tuple[Mesh, ...]:
     gate = box((0.06, 2.6, 2.1), (2.15, 6.5, 0.02), (150, 146, 138))
     lid = box((5.8, 3.7, 0.18), (-0.6, 6.5, 2.6), GREY)
     return (
-        finish(_walls(8.0, 10.0, 5.4, 2.5, 4, WHITE), _gable(8.0, 10.0, 5.4, 3.0, RED), _chimney(-1.0, 2.6, 6.5, 8.9),
-               *map(_bare, (garage, gate, lid)), texture=two),
-        finish(_walls(9.0, 9.0, 5.6, 3.0, 3, (176, 116, 92)), _gable(9.0, 9.0, 5.6, 3.8, SLATE, turned=True),
+        finish(_walls(8.0, 10.0, 5.4, 2.5, 4, WHITE), _gable(8.0, 10.0, 5.4, 3.0, RED, WHITE),
+               _chimney(-1.0, 2.6, 6.5, 8.9), *map(_bare, (garage, gate, lid)), texture=two),
+        finish(_walls(9.0, 9.0, 5.6, 3.0, 3, BRICK), _gable(9.0, 9.0, 5.6, 3.8, SLATE, BRICK, turned=True),
                _chimney(1.5, -2.0, 6.5, 9.6), texture=bricked),
         finish(_walls(9.0, 12.0, 3.1, 3.0, 4, (232, 220, 192)), _hip(9.0, 12.0, 3.1, 2.9, BROWN),
                _chimney(-0.5, 2.0, 4.5, 6.6), texture=low),
-        finish(_walls(7.5, 9.0, 5.5, 3.0, 3, (206, 214, 216)), _gable(7.5, 9.0, 5.5, 3.2, GREY),
+        finish(_walls(7.5, 9.0, 5.5, 3.0, 3, (206, 214, 216)), _gable(7.5, 9.0, 5.5, 3.2, GREY, (206, 214, 216)),
                *_porch(3.75, 0.0), texture=boards),
         finish(_walls(10.0, 10.0, 5.6, 2.5, 4, (238, 226, 196)), _hip(10.0, 10.0, 5.6, 3.0, RED),
                _chimney(0.5, -2.5, 6.0, 9.0), *_porch(5.0, 1.25), texture=green),
-        finish(_walls(13.0, 9.0, 4.6, 3.0, 3, (190, 138, 112)), _gable(13.0, 9.0, 4.6, 3.9, BROWN, turned=True),
+        finish(_walls(13.0, 9.0, 4.6, 3.0, 3, CLAY), _gable(13.0, 9.0, 4.6, 3.9, BROWN, CLAY, turned=True),
                texture=bricked),  # a barn
     )  # fmt: skip
 
@@ -59,7 +59,10 @@ def _town() -> tuple[Mesh, ...]:
         (tall, 12.0, 10.4, 12.8, 2.6, 4, (222, 186, 150), RED),
         (four, 11.0, 12.0, 12.0, 3.0, 3, (186, 198, 186), BROWN),
     ):
-        parts = [_walls(depth, width, height, bay, bays, wall), _gable(depth, width, height, 3.2, roof, over=0.12)]
+        parts = [
+            _walls(depth, width, height, bay, bays, wall),
+            _gable(depth, width, height, 3.2, roof, wall, over=0.12),
+        ]
         parts.append(_bare(box((0.35, width + 0.02, 0.30), (depth / 2 + 0.05, 0, height - 0.35), STONE)))
         parts += [_dormer(depth, height, y, roof) for y in np.arange(-width / 2 + 2.2, width / 2 - 1.5, 3.0)]
         parts.append(_chimney(-0.5, width * 0.36, height + 2, height + 4.2))
@@ -125,13 +128,13 @@ def _roofed(part: Solid, colour, tile: float = 6.0) -> Solid:
     return part._replace(uv=uv, colour=paint, tinted=~slope.all(1) & part.tinted)
 
 
-def _gable(depth, width, height, rise, colour, turned=False, over: float = 0.45) -> Solid:
+def _gable(depth, width, height, rise, colour, wall, turned=False, over: float = 0.45) -> Solid:
     """A ridge along y, or along x where ``turned``; the gables are walls."""
     span, long = (width, depth) if turned else (depth, width)
     eave, drop = span / 2 + over, rise * over / (span / 2)
     outline = [(-eave, -drop), (-eave, 0.16 - drop), (0, rise + 0.16), (eave, 0.16 - drop), (eave, -drop)]
     rings = [[(x, y, height + z) for x, z in outline] for y in (-long / 2 - over, long / 2 + over)]
-    part = loft(rings, (222, 216, 206), True)
+    part = loft(rings, wall, True)
     return _roofed(place(part, yaw=math.pi / 2 if turned else 0.0), colour)
 
 

@@ -1,6 +1,6 @@
 """Pictures of walls with windows, one a building: rows of roof, of bare wall, and of storeys down to the ground.
 
-``(SIDE, SIDE, 3)`` uint8, light, to be multiplied by the colour of a wall; they repeat from left to right, every
+``(TALL, WIDE, 3)`` uint8, light, to be multiplied by the colour of a wall; they repeat from left to right, every
 ``bays`` windows. ``ROOF``, ``BARE`` and ``WALL`` are where their parts begin and end in v.
 """
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from probscene.models.textures import bricks, courses, noise, painted
 
-SIDE = 512
+TALL, WIDE = 512, 256
 ROOF, BARE, WALL = (0.01, 0.24), 0.28, (0.3125, 1.0)
 _SIGNS = ((150, 50, 44), (52, 84, 120), (60, 96, 70), (196, 168, 90), (84, 78, 84))
 _GLASS, _FRAME = np.array([46.0, 54.0, 62.0]), (240.0, 240.0, 236.0)
@@ -35,12 +35,12 @@ def facade(
         shutters: their colour on both sides of a window, as it appears on a white wall.
     """
     rng = np.random.default_rng(seed)
-    picture = np.empty((SIDE, SIDE, 3))
-    split, top = int(0.25 * SIDE), int(WALL[0] * SIDE)
+    picture = np.empty((TALL, WIDE, 3))
+    split, top = int(0.25 * TALL), int(WALL[0] * TALL)
     picture[:split] = _roof(rng, roof, split)
-    picture[split:top] = painted((228, 228, 228), 3 * noise(rng, top - split, SIDE, 2.0))
-    picture[top:] = _wall(rng, wall, SIDE - top)
-    high, wide = (SIDE - top) / storeys, SIDE / bays
+    picture[split:top] = painted((228, 228, 228), 3 * noise(rng, top - split, WIDE, 2.0))
+    picture[top:] = _wall(rng, wall, TALL - top)
+    high, wide = (TALL - top) / storeys, WIDE / bays
     for storey in range(storeys):
         lowest = storey == storeys - 1
         for bay in range(bays):
@@ -52,7 +52,7 @@ def facade(
             else:
                 _window(rng, picture, x, y, wide, high, *window, shutters)
         if storey:
-            _fill(picture, 0, y - 2, SIDE, y + 1, 0.88 * picture[int(y), :, :].mean(0))
+            _fill(picture, 0, y - 2, WIDE, y + 1, 0.88 * picture[int(y), :, :].mean(0))
     return np.rint(np.clip(picture, 0, 255)).astype(np.uint8)
 
 
@@ -61,24 +61,24 @@ def _fill(picture, x0, y0, x1, y1, colour) -> None:
 
 
 def _wall(rng, kind: str, height: int) -> np.ndarray:
-    stains = 5 * noise(rng, height, SIDE, (30.0, 6.0)) + 2.5 * noise(rng, height, SIDE, 0.8)
+    stains = 5 * noise(rng, height, WIDE, (30.0, 4.0)) + 2.5 * noise(rng, height, WIDE, 0.8)
     if kind == "bricks":
-        tile = cv2.resize(bricks(int(rng.integers(99))), (128, height // 3), interpolation=cv2.INTER_AREA)
+        tile = cv2.resize(bricks(int(rng.integers(99))), (64, height // 3), interpolation=cv2.INTER_AREA)
         return np.tile(tile, (4, 4, 1))[:height] + 0.6 * stains[..., None]
     if kind == "boards":
         return painted((224, 224, 222), stains - 30 * (np.arange(height) % 9 < 1.5)[:, None])
     if kind == "panels":
-        shade, joint = courses(rng, height, SIDE, 8, 8, 2.0, 4.0, bond=False)
+        shade, joint = courses(rng, height, WIDE, 8, 8, 1.4, 4.0, bond=False)
         return painted((222, 222, 222), shade + stains - 40 * joint)
     return painted((228, 228, 226), stains)
 
 
 def _roof(rng, kind: str, height: int) -> np.ndarray:
     if kind == "felt":
-        return painted((214, 214, 214), 6 * noise(rng, height, SIDE, 1.0) + 6 * noise(rng, height, SIDE, 20.0))
-    shade, _ = courses(rng, height, SIDE, 16, 64, 1.0, 9.0)
+        return painted((214, 214, 214), 6 * noise(rng, height, WIDE, 1.0) + 6 * noise(rng, height, WIDE, 12.0))
+    shade, _ = courses(rng, height, WIDE, 16, 32, 1.0, 9.0)
     bow = (np.arange(height) * 16 / height % 1)[:, None]
-    return painted((196, 196, 196), shade + 46 * (bow - 0.4) + 5 * noise(rng, height, SIDE, 1.0))
+    return painted((196, 196, 196), shade + 46 * (bow - 0.4) + 5 * noise(rng, height, WIDE, 1.0))
 
 
 def _window(rng, picture, x, y, wide, high, width, height, shutters) -> None:
@@ -88,10 +88,10 @@ def _window(rng, picture, x, y, wide, high, width, height, shutters) -> None:
         for side in (-1, 1):
             edge = cx + side * w * 1.62
             _fill(picture, min(edge, cx), cy - h, max(edge, cx), cy + h, np.array(shutters, float))
-    _fill(picture, cx - w - 3, cy - h - 3, cx + w + 3, cy + h + 3, _FRAME)
+    _fill(picture, cx - w - 2, cy - h - 3, cx + w + 2, cy + h + 3, _FRAME)
     _panes(rng, picture, cx - w, cy - h, cx + w, cy + h)
-    _fill(picture, cx - 1, cy - h, cx + 1.5, cy + h, _FRAME)
-    _fill(picture, cx - w - 5, cy + h + 2, cx + w + 5, cy + h + 6, (176, 176, 174))
+    _fill(picture, int(cx), cy - h, int(cx) + 1, cy + h, _FRAME)
+    _fill(picture, cx - w - 3, cy + h + 2, cx + w + 3, cy + h + 6, (176, 176, 174))
 
 
 def _panes(rng, picture, x0, y0, x1, y1) -> None:
@@ -109,13 +109,13 @@ def _panes(rng, picture, x0, y0, x1, y1) -> None:
 
 
 def _door(rng, picture, x, y, wide, high) -> None:
-    w = min(wide * 0.22, high * 0.2)
+    w = min(wide * 0.2, high * 0.11)
     cx, bottom, top = x + wide / 2, y + high, y + high * 0.24
     colour = np.array([(92, 60, 44), (58, 76, 66), (70, 74, 88), (120, 44, 40)][int(rng.integers(4))], float)
-    _fill(picture, cx - w - 4, top - 4, cx + w + 4, bottom, _FRAME)
+    _fill(picture, cx - w - 2, top - 4, cx + w + 2, bottom, _FRAME)
     _fill(picture, cx - w, top, cx + w, bottom, colour)
     _panes(rng, picture, cx - w * 0.6, top + 4, cx + w * 0.6, top + high * 0.2)
-    _fill(picture, cx - w - 8, bottom - 4, cx + w + 8, bottom, (150, 150, 148))
+    _fill(picture, cx - w - 4, bottom - 4, cx + w + 4, bottom, (150, 150, 148))
 
 
 def _shop(rng, picture, x, y, wide, high) -> None:
@@ -129,7 +129,7 @@ def _shop(rng, picture, x, y, wide, high) -> None:
     for at in letters[rng.random(len(letters)) < 0.85]:
         _fill(picture, x + at * wide, y + 0.15 * high, x + (at + 0.05) * wide, y + 0.24 * high, (232, 230, 220))
     if rng.random() < 0.4:
-        stripes = (np.arange(round(0.94 * wide)) // max(4, round(wide / 16)) % 2)[None, :, None]
+        stripes = (np.arange(round(0.94 * wide)) // max(3, round(wide / 16)) % 2)[None, :, None]
         y0, x0 = round(y + 0.26 * high), round(x + 0.03 * wide)
         rows = round(0.16 * high)
         picture[y0 : y0 + rows, x0 : x0 + stripes.shape[1]] = np.where(stripes, sign, (226, 222, 214))

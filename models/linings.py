@@ -21,12 +21,12 @@ def slabs() -> tuple[Mesh, ...]:
 
 def kerbs() -> tuple[Mesh, ...]:
     """Kerb stones, 0.15 m wide and 0.12 m high, a joint every metre."""
-    return _lining(paving(91, 128, rows=1, columns=4, bond=False), (188, 186, 180), (4.0, 1.0), 1.0, (0.15, 0.12))
+    return _lining(paving(91, rows=1, columns=4, bond=False), (188, 186, 180), (4.0, 1.0), 1.0, (0.15, 0.12))
 
 
 def lawns() -> tuple[Mesh, ...]:
     """Raised grass, 1 m wide and 1 m high, to be scaled as ``slabs``."""
-    return _lining(leaves(92, 256), (112, 130, 70), (3.0, 1.5), 0.13)
+    return _lining(leaves(92), (112, 130, 70), (2.0, 1.0), 0.13)
 
 
 def _lining(texture, colour, tile, upright: float, size=(1.0, 1.0)) -> tuple[Mesh, ...]:

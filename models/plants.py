@@ -68,7 +68,7 @@ def _rough(rng, radii, at, colour, rows: int = 5, sides: int = 8, rough: float =
 def _trunk(rng, height: float, radius: float, colour=BARK) -> Solid:
     lean = rng.normal(0, 0.03 * height, 2)
     path = [(0, 0, 0), (lean[0] * 0.4, lean[1] * 0.4, height * 0.5), (*lean, height)]
-    return tube(path, (radius, radius * 0.75, radius * 0.4), 6, colour)
+    return mapped(tube(path, (radius, radius * 0.75, radius * 0.4), 6, colour), 1.7)
 
 
 def _broad(seed: int, height: float, radius: float, crown: float, colour, bark=BARK) -> Solid:

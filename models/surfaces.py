@@ -39,7 +39,7 @@ def surfaces() -> dict[str, Surface]:
     made["paving"] = Surface("sidewalk", _slabs(10, (158, 154, 148), 8, 8, 10.0), (4.0, 4.0))
     made["bricks"] = Surface("sidewalk", _slabs(11, (150, 118, 104), 32, 16, 9.0), (3.2, 3.2))
     made["kerb"] = Surface("sidewalk", _slabs(12, (170, 168, 163), 4, 1, 7.0, bond=False), (4.0, 4.0))
-    made["grass"] = Surface("terrain", _grass(20, (86, 112, 54), 8.0), (8.0, 8.0))
+    made["grass"] = Surface("terrain", _grass(20, (86, 112, 54), 8.0), (6.4, 6.4))
     made["meadow"] = Surface("terrain", _grass(21, (124, 124, 70), 14.0), (10.24, 10.24))
     made["median"] = Surface("terrain", _grass(22, (98, 118, 62), 9.0), (5.12, 5.12))
     made["gravel"] = Surface("terrain", _stones(30, (146, 138, 124)), (4.0, 4.0))
@@ -69,30 +69,30 @@ def _marking(seed: int, colour, strength: float, paint: np.ndarray, dash: float,
     return painted(mixed, np.zeros((rows, 16)))
 
 
-def _slabs(seed: int, colour, rows: int, columns: int, vary: float, bond: bool = True, size: int = 512) -> np.ndarray:
+def _slabs(seed: int, colour, rows: int, columns: int, vary: float, bond: bool = True, size: int = 256) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    shade, joint = courses(rng, size, size, rows, columns, 2.4, vary, bond)
-    shade = shade + 5 * noise(rng, size, size, 0.7) + 4 * noise(rng, size, size, 40.0) - 46 * joint
+    shade, joint = courses(rng, size, size, rows, columns, 1.4, vary, bond)
+    shade = shade + 5 * noise(rng, size, size, 0.7) + 4 * noise(rng, size, size, 20.0) - 46 * joint
     return painted(colour, shade)
 
 
-def _grass(seed: int, colour, patches: float, size: int = 512) -> np.ndarray:
+def _grass(seed: int, colour, patches: float, size: int = 256) -> np.ndarray:
     """Blades and tufts, with dry patches."""
     rng = np.random.default_rng(seed)
-    blades = 13 * noise(rng, size, size, (1.4, 0.5), 0.6) + 7 * noise(rng, size, size, 4.0)
-    dry = patches * np.tanh(noise(rng, size, size, 30.0))[..., None] * [1.3, 0.55, 0.1]
+    blades = 13 * noise(rng, size, size, (1.2, 0.5), 0.5) + 7 * noise(rng, size, size, 2.5)
+    dry = patches * np.tanh(noise(rng, size, size, 18.0))[..., None] * [1.3, 0.55, 0.1]
     return painted(np.asarray(colour, float) + dry, blades)
 
 
-def _stones(seed: int, colour, size: int = 512) -> np.ndarray:
+def _stones(seed: int, colour, size: int = 256) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    pebbles = 16 * np.tanh(1.4 * noise(rng, size, size, 2.0)) + 9 * noise(rng, size, size, 0.7)
-    return painted(colour, pebbles + 5 * noise(rng, size, size, 40.0))
+    pebbles = 16 * np.tanh(1.4 * noise(rng, size, size, 1.2)) + 9 * noise(rng, size, size, 0.5)
+    return painted(colour, pebbles + 5 * noise(rng, size, size, 20.0))
 
 
-def _soil(seed: int, colour, size: int = 512) -> np.ndarray:
+def _soil(seed: int, colour, size: int = 256) -> np.ndarray:
     """Trodden earth with stones and some weeds."""
     rng = np.random.default_rng(seed)
-    weeds = np.clip(noise(rng, size, size, 14.0) - 0.9, 0, 1)[..., None] * [-30.0, 8.0, -22.0]
-    earth = 7 * noise(rng, size, size, 0.7) + 6 * noise(rng, size, size, 5.0) + 5 * noise(rng, size, size, 50.0)
+    weeds = np.clip(noise(rng, size, size, 7.0) - 0.9, 0, 1)[..., None] * [-16.0, 4.0, -12.0]
+    earth = 7 * noise(rng, size, size, 0.7) + 6 * noise(rng, size, size, 3.0) + 5 * noise(rng, size, size, 25.0)
     return painted(np.asarray(colour, float) + weeds, earth + 40 * (noise(rng, size, size, 1.2) > 2.6))

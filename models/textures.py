@@ -63,11 +63,11 @@ def courses(rng, height: int, width: int, rows: int, columns: int, joint: float,
     return shade, np.clip(joint / 2 + 0.5 - reach, 0, 1)
 
 
-def paving(seed: int, size: int = 256, rows: int = 4, columns: int = 4, bond: bool = True) -> np.ndarray:
+def paving(seed: int, size: int = 128, rows: int = 4, columns: int = 4, bond: bool = True) -> np.ndarray:
     """Slabs with dark joints, light grey."""
     rng = np.random.default_rng(seed)
-    shade, joint = courses(rng, size, size, rows, columns, 2.5, 7.0, bond)
-    shade = shade + 5 * noise(rng, size, size, 1.0) + 4 * noise(rng, size, size, 24.0) - 50 * joint
+    shade, joint = courses(rng, size, size, rows, columns, 1.4, 7.0, bond)
+    shade = shade + 5 * noise(rng, size, size, 0.7) + 4 * noise(rng, size, size, 12.0) - 50 * joint
     return painted((206, 204, 200), shade)
 
 

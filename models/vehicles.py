@@ -11,7 +11,7 @@ import numpy as np
 from probscene.mesh import Mesh
 from probscene.models.solids import ROUND, Solid, box, circle, finish, place, solid
 
-PAINT, GLASS, TYRE, RIM, TRIM = (238, 238, 238), (34, 40, 46), (26, 26, 28), (168, 170, 173), (44, 45, 48)
+PAINT, GLASS, TYRE, RIM, TRIM = (238, 238, 238), (34, 40, 46), (26, 26, 28), (150, 152, 156), (44, 45, 48)
 LAMP, TAIL, PLATE = (240, 240, 228), (158, 20, 22), (236, 236, 230)
 STATIONS = 15
 SIDE, WINDOW, RAIL, TOP = 0, 1, 2, 3  # of the seven panels of a ring and its floor, on the left
@@ -93,7 +93,8 @@ def _car(body: Body) -> Mesh:
     ]
     half = body.length / 2
     plates = [box((0.03, 0.50, 0.11), (x, 0, z), PLATE) for x, z in ((half, 0.42), (-half, body.tail - 0.22))]
-    return finish(_shell(body), *wheels, *mirrors, *plates)
+    bumper = box((0.04, body.width * 0.66, 0.13), (0.01 - half, 0, body.sill + 0.08), TRIM)
+    return finish(_shell(body), *wheels, *mirrors, *plates, bumper)
 
 
 def _shell(body: Body) -> Solid:
@@ -197,21 +198,21 @@ def _stations(body: Body) -> np.ndarray:
 
 def wheel(x: float, y: float, radius: float, side: int, width: float = 0.21, sides: int = 10) -> Solid:
     """A tyre with its rim; ``y`` is its outer face, ``side`` 1 on the left of the car."""
-    outer, rim = circle(radius, sides), circle(radius * 0.66, sides // 2, 0.25)
-    n, m = sides, sides // 2
+    outer, rim, n, m = circle(radius, sides), circle(radius * 0.66, sides), sides, sides // 2
     points = [
-        np.column_stack([outer[:, 0], np.full(n, y - side * width), outer[:, 1]]),
         np.column_stack([outer[:, 0], np.full(n, y), outer[:, 1]]),
-        np.column_stack([rim[:, 0], np.full(m, y - side * 0.015), rim[:, 1]]),
+        np.column_stack([rim[:, 0], np.full(n, y - side * 0.015), rim[:, 1]]),
+        np.column_stack([outer[::2, 0], np.full(m, y - side * width), outer[::2, 1]]),  # the inside is hardly seen
     ]
-    faces, k = [], np.arange(n)
-    faces += [(i, j, j + n) for i, j in zip(k, (k + 1) % n, strict=True)]
-    faces += [(i, j + n, i + n) for i, j in zip(k, (k + 1) % n, strict=True)]
-    for i in range(m):  # the side wall, between a point of the rim and two of the tyre
-        a, b, c = n + 2 * i, n + 2 * i + 1, n + (2 * i + 2) % n
-        faces += [(a, b, 2 * n + i), (b, c, 2 * n + i), (c, 2 * n + (i + 1) % m, 2 * n + i)]
-    faces += [(0, i + 1, i) for i in range(1, n - 1)]
-    hub = _fan(*(2 * n + i for i in range(m)))
+    faces = []
+    for i in range(n):
+        j = (i + 1) % n
+        faces += [(i, j, j + n), (i, j + n, i + n)]
+    for i in range(m):
+        a, b, c, inner, after = 2 * i, 2 * i + 1, (2 * i + 2) % n, 2 * n + i, 2 * n + (i + 1) % m
+        faces += [(b, a, inner), (c, b, after), (b, inner, after)]
+    faces += [(a, c, b) for a, b, c in _fan(*(2 * n + i for i in range(m)))]
+    hub = _fan(*(n + i for i in range(n)))
     colour = [TYRE] * len(faces) + [RIM] * len(hub)
     made = solid(np.concatenate(points), np.array(faces + hub), np.array(colour, float), False, ROUND)
     return place(made, (x, 0, radius))
