@@ -28,8 +28,8 @@ def light(value: Value) -> Light:
     return Light(
         azimuth=value("sun", "azimuth"),
         elevation=value("sun", "elevation"),
-        sun=1.0 - 0.9 * cloud,
-        ambient=0.40 + 0.32 * cloud,
+        sun=1.1 - 1.0 * cloud,
+        ambient=0.44 + 0.32 * cloud,
         zenith=zenith,
         horizon=horizon,
         haze=value("weather", "haze"),

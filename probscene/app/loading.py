@@ -21,7 +21,12 @@ from probscene.renderers.sprites import SpriteRenderer
 from probscene.scenarios import join
 from probscene.world import World
 
-BUILT_IN = {"multi_mnist": "probscene.models.multi_mnist", "aerial2d": "probscene.models.aerial2d"}
+BUILT_IN = {
+    "multi_mnist": "probscene.models.multi_mnist",
+    "aerial2d": "probscene.models.aerial2d",
+    "driving": "probscene.models.driving",
+    "driving_simple": "probscene.models.driving_simple",
+}
 
 
 def load_model(reference: str) -> SceneModel:
