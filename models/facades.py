@@ -1,7 +1,7 @@
 """Pictures of walls with windows, one a building: rows of roof, of bare wall, and of storeys down to the ground.
 
-``(TALL, WIDE, 3)`` uint8, light, to be multiplied by the colour of a wall; they repeat from left to right, every
-``bays`` windows. ``ROOF``, ``BARE`` and ``WALL`` are where their parts begin and end in v.
+``(h, WIDE, 3)`` uint8, h 512, or 256 of low houses; light, to be multiplied by the colour of a wall; they repeat from
+left to right, every ``bays`` windows. ``ROOF``, ``BARE`` and ``WALL`` are where their parts begin and end in v.
 """
 
 import cv2
@@ -9,7 +9,7 @@ import numpy as np
 
 from probscene.models.textures import bricks, courses, noise, painted
 
-TALL, WIDE = 512, 256
+WIDE = 256
 ROOF, BARE, WALL = (0.01, 0.24), 0.28, (0.3125, 1.0)
 _SIGNS = ((150, 50, 44), (52, 84, 120), (60, 96, 70), (196, 168, 90), (84, 78, 84))
 _GLASS, _FRAME = np.array([46.0, 54.0, 62.0]), (240.0, 240.0, 236.0)
@@ -35,12 +35,13 @@ def facade(
         shutters: their colour on both sides of a window, as it appears on a white wall.
     """
     rng = np.random.default_rng(seed)
-    picture = np.empty((TALL, WIDE, 3))
-    split, top = int(0.25 * TALL), int(WALL[0] * TALL)
+    tall = 512 if storeys > 2 else 256
+    picture = np.empty((tall, WIDE, 3))
+    split, top = int(0.25 * tall), int(WALL[0] * tall)
     picture[:split] = _roof(rng, roof, split)
     picture[split:top] = painted((228, 228, 228), 3 * noise(rng, top - split, WIDE, 2.0))
-    picture[top:] = _wall(rng, wall, TALL - top)
-    high, wide = (TALL - top) / storeys, WIDE / bays
+    picture[top:] = _wall(rng, wall, tall - top)
+    high, wide = (tall - top) / storeys, WIDE / bays
     for storey in range(storeys):
         lowest = storey == storeys - 1
         for bay in range(bays):

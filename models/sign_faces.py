@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
-SIDE = 128
+SIDE = 64
 RED, BLUE, YELLOW, WHITE, BLACK = (188, 30, 36), (28, 78, 150), (236, 186, 40), (240, 240, 238), (30, 30, 30)
-_FINE = 4
+_FINE = 8
 _MIDDLE = SIDE * _FINE // 2
 
 

@@ -28,7 +28,7 @@ def surfaces() -> dict[str, Surface]:
     """
     made = {}
     for k, (name, colour) in enumerate(ASPHALTS.items()):
-        made[name] = Surface("road", _asphalt(k, colour), (10.24, 10.24))
+        made[name] = Surface("road", _asphalt(k, colour), (10.24, 5.12))
         for line, (strength, paint, dash) in {
             "dashed": (0.92, _LINE, DASH / PITCH),
             "solid": (0.92, _LINE, 1.0),
@@ -47,15 +47,15 @@ def surfaces() -> dict[str, Surface]:
     return made
 
 
-def _asphalt(seed: int, colour, size: int = 512) -> np.ndarray:
+def _asphalt(seed: int, colour, rows: int = 512, columns: int = 256) -> np.ndarray:
     """Grain, stains drawn out along the road, a few cracks and a mended patch."""
     rng = np.random.default_rng(seed)
-    grain = 6 * noise(rng, size, size, 0.5) + 3 * noise(rng, size, size, 1.6)
-    stains = 4 * noise(rng, size, size, (60.0, 9.0)) + 3 * noise(rng, size, size, 30.0)
-    patch = np.zeros((size, size))
-    y, x, h, w = 60 + 90 * seed, 80 + 110 * seed, 120, 56
-    patch[y : y + h, x : x + w] = -9
-    shade = grain + stains + patch - 34 * cracks(rng, size, size, 5 + 4 * seed)
+    grain = 6 * noise(rng, rows, columns, 0.5) + 3 * noise(rng, rows, columns, 1.6)
+    stains = 4 * noise(rng, rows, columns, (60.0, 9.0)) + 3 * noise(rng, rows, columns, 30.0)
+    patch = np.zeros((rows, columns))
+    y, x = 60 + 90 * seed, 30 + 60 * seed
+    patch[y : y + 120, x : x + 56] = -9
+    shade = grain + stains + patch - 34 * cracks(rng, rows, columns, 3 + 2 * seed)
     return painted(colour, shade)
 
 

@@ -36,8 +36,8 @@ def kind_and_mesh(request):
 
 
 def welded(mesh):
-    """Triangles over vertices that are one where they are within a tenth of a millimetre."""
-    _, same = np.unique(np.round(mesh.positions.astype(float), 4), axis=0, return_inverse=True)
+    """Triangles over vertices that are one where they are at the same place."""
+    _, same = np.unique(mesh.positions, axis=0, return_inverse=True)
     return same.reshape(-1)[mesh.triangles]
 
 
