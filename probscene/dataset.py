@@ -44,6 +44,7 @@ class ImageFolder:
     Attributes:
         paths: the L files.
         windows: of each of them, what is seen of it, see ``window``; None where that is all.
+        scales: of each of them, how many of the canvas's rows a row of it becomes.
         resized: how many of them are of another size.
         cropped: how many of them are of another shape.
         distinct: how many of them are left without those that equal another one in every pixel.
@@ -69,6 +70,7 @@ class ImageFolder:
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths: list[Path] = []
         self.windows: list[Window | None] = []
+        self.scales: list[float] = []
         self.bad: dict[Path, str] = {}
         sizes, cut, pictures = Counter(), Counter(), set()
         with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
@@ -82,6 +84,7 @@ class ImageFolder:
                     pictures.add(found.picture)
                     seen = window(found.size, self.canvas)
                     self.windows.append(seen)
+                    self.scales.append(self.canvas[0] / (found.size[0] if seen is None else seen.height))
                     if seen is not None:
                         digest.update(repr(tuple(seen)).encode())
                         cut[found.size] += 1

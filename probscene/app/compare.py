@@ -19,8 +19,8 @@ from probscene.app.labels import Labels
 from probscene.app.likelihood import Likelihood, likelihood
 from probscene.app.nesting import GROUPS, PARENTS, label
 from probscene.app.run import Run
+from probscene.app.shown import counted, number_of
 from probscene.app.source import Source
-from probscene.app.structures import sampled
 from probscene.dataset import ImageFolder
 from probscene.errors import ProbsceneError, RunError
 from probscene.inference.metrics import Shares, histogram, pooled_shares, total_variation
@@ -178,12 +178,12 @@ def compare(
     def each(scenes):
         nonlocal done
         done += scenes
-        progress("counting", done, (1 + len(runs)) * num, "")
+        progress("counting", done, (1 + len(runs)) * number_of(truth, num), "")
 
     sources: dict[str, Source] = {}
     likelihoods: dict[str, Likelihood] = {}
     for name, policy in {PRIOR: model.prior, **{name: run.guide() for name, run in runs.items()}}.items():
-        found = sampled(model, policy, num, seed, each)
+        found = counted(model, policy, num, seed, truth, each)
         sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:
             likelihoods[name] = likelihood(policy, truth.derivation)

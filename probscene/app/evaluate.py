@@ -24,8 +24,9 @@ from probscene.app.labels import Labels
 from probscene.app.likelihood import Likelihood, likelihood
 from probscene.app.run import Run
 from probscene.app.seen import features_in, own_net
+from probscene.app.shown import counted, number_of
 from probscene.app.source import Source
-from probscene.app.structures import Relation, sampled
+from probscene.app.structures import Relation
 from probscene.app.view import feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import ProbsceneError
@@ -138,7 +139,7 @@ def evaluate(
     Args:
         target: its images; without them there is only the run's own record of what the network saw.
         truth: the labels of the target's images.
-        num: structures a source.
+        num: structures a source; see ``shown.SHOWN`` where they are rendered for it.
         features: networks to compare images by, see ``seen.network``; none, as it renders.
         images: how many are compared at most, where they are.
 
@@ -156,13 +157,13 @@ def evaluate(
     def each(scenes):
         nonlocal done
         done += scenes
-        progress("counting", done, 2 * num, "")
+        progress("counting", done, 2 * number_of(truth, num), "")
 
     columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
     compared = image_distances(run, target, features, progress, images, seed) if features else {}
     sources, likelihoods = {}, {}
     for name, policy in policies.items():
-        found = sampled(run.model, policy, num, seed, each)
+        found = counted(run.model, policy, num, seed, truth, each)
         sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:
             likelihoods[name] = likelihood(policy, truth.derivation)

@@ -30,6 +30,8 @@ from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
+SEEN = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
+
 
 class Labels(NamedTuple):
     """The truth of L images, in the order of their files.
@@ -39,12 +41,15 @@ class Labels(NamedTuple):
         derivation: the structures themselves, where they are known.
         classes: the C that are labelled, in the model's order; all of the model's where None.
         notes: what a person should know, one sentence each.
+        min_height: where objects are labelled that can be seen, and not all that a structure has: that of a box which
+            is counted, pixels of the canvas.
     """
 
     structures: Structures
     derivation: Derivation | None = None
     classes: tuple[str, ...] | None = None
     notes: tuple[str, ...] = ()
+    min_height: float | None = None
 
     def columns(self, model: SceneModel) -> list[int]:
         """Of the model's classes, the C that are labelled, by number."""
@@ -68,7 +73,8 @@ def read_labels(
     """
     if Path(path).is_dir():
         counts, classes, notes = read_kitti(Path(path), model, target, some, min_height)
-        return Labels(Structures(counts, {}), classes=classes, notes=notes)
+        low = min_height * float(np.median(target.scales))
+        return Labels(Structures(counts, {}), classes=classes, notes=(SEEN, *notes), min_height=low)
     if min_height:
         raise DataError(f"Expected a folder of KITTI's labels for a least height of objects, actual the file {path}.")
     if Path(path).suffix != ".jsonl":

@@ -16,8 +16,11 @@ from pycocotools.coco import COCO
 
 from probscene.app.generate import generate_scenes
 from probscene.app.kitti_labels import read_kitti, read_objects
-from probscene.app.labels import read_labels
+from probscene.app.labels import SEEN, Labels, read_labels
 from probscene.app.loading import load_model
+from probscene.app.run import Run
+from probscene.app.shown import SHOWN, counted, shown
+from probscene.app.structures import Structures, sampled
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
 
@@ -125,8 +128,45 @@ def test_a_written_dataset_is_read_back(tmp_path):
     seen = [Counter(dataset.cats[a["category_id"]]["name"] for a in dataset.imgToAnns[i]) for i in range(40)]
     target = ImageFolder(tmp_path / "out" / "images", model.canvas, model.channels)
     read = read_labels(tmp_path / "out" / "Kitti" / "raw" / "training" / "label_2", model, target)
-    assert read.classes == model.classes and not read.notes
+    assert read.classes == model.classes and read.notes == (SEEN,)
     assert read.structures.counts.tolist() == [[found[name] for name in model.classes] for found in seen]
+
+
+@pytest.mark.parametrize("file", ["plates.py", "lots.py"])
+def test_scenes_are_counted_as_the_labels_that_would_be_written_of_them(file, tmp_path):
+    model = load_model(str(Path(__file__).with_name(file)))
+    generate_scenes(model, model.prior, 70, tmp_path / "out", seed=4, format="kitti")
+    double = tmp_path / "double"  # images that are shown at half of their size
+    double.mkdir()
+    for path in (tmp_path / "out" / "images").iterdir():
+        with Image.open(path) as image:
+            image.resize((2 * image.width, 2 * image.height)).save(double / path.name)
+    folder, seen = tmp_path / "out" / "Kitti" / "raw" / "training" / "label_2", 0
+    for low in (0.0, 5.505, 11.505):
+        target = ImageFolder(tmp_path / "out" / "images", model.canvas, model.channels)
+        labels = read_labels(folder, model, target, min_height=low)
+        told = []
+        counts = shown(model, model.prior, 70, 4, labels.min_height, told.append)
+        assert told == [64, 6] and labels.classes == model.classes
+        assert np.array_equal(counts, labels.structures.counts)
+        assert np.array_equal(counted(model, model.prior, 70, 4, labels).counts, counts)
+        assert counts.sum() != seen
+        seen = counts.sum()
+        target = ImageFolder(double, model.canvas, model.channels)
+        assert read_labels(folder, model, target, min_height=2 * low).min_height == pytest.approx(low)
+    assert sampled(model, model.prior, 200, 4).counts.mean() > shown(model, model.prior, 200, 4, 0.0).mean()
+
+
+def test_no_more_scenes_are_rendered_than_it_takes(monkeypatch, discs):
+    model, asked = load_model(str(discs.file)), []
+    none = np.zeros((1, 2), np.int64)
+    monkeypatch.setattr("probscene.app.shown.shown", lambda *given: asked.append(given[2]) or none)
+    labels = Labels(Structures(none, {}), min_height=0.0)
+    for num in (5, 10_000):
+        counted(model, model.prior, num, 0, labels)
+    assert asked == [5, SHOWN]
+    for truth in (None, labels._replace(min_height=None)):
+        assert len(counted(model, model.prior, 50, 0, truth)) == 50
 
 
 @pytest.fixture
@@ -148,6 +188,9 @@ def test_the_commands_take_the_folder(call, fitted, target, labelled, tmp_path):
         assert done.code == 0, done.err
         record = json.loads((tmp_path / "e.json").read_text())
         assert record["sources"]["truth"]["mean_number"] == target.counts.sum() / 40
+        model = Run.open(fitted).model
+        assert record["sources"]["prior"]["mean_number"] == shown(model, model.prior, 100, 0, 0.0).sum() / 100
+        assert SEEN in record["notes"] and SEEN in done.out
         assert "40 DontCare" in record["notes"][-1] and "40 DontCare" in done.out
         done = call(command, fitted, *words, *more, "--min-height", 9)
         assert done.code == 0, done.err
