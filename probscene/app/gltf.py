@@ -34,18 +34,20 @@ def write_gltf(path: Path, world: World, scene: int, canvas: tuple[int, int]) ->
     for piece in pieces(world, scene):
         number = used[piece.name] = used.get(piece.name, -1) + 1
         material = trimesh.visual.material.PBRMaterial(
-            baseColorFactor=np.r_[_linear(piece.colour / 255), 1.0],
             baseColorTexture=None if piece.texture is None else Image.fromarray(piece.texture),
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )
         # trimesh counts v from the texture's lower edge.
         uv = np.zeros((len(piece.positions), 2)) if piece.uv is None else piece.uv * [1, -1] + [0, 1]
+        visual = trimesh.visual.TextureVisuals(uv, material=material)
+        linear = np.c_[_linear(piece.colour / 255), np.ones(len(uv))]
+        visual.vertex_attributes["color"] = np.rint(255 * linear).astype(np.uint8)
         mesh = trimesh.Trimesh(
             piece.positions,
             np.arange(len(piece.positions)).reshape(-1, 3),
             vertex_normals=piece.normals,
-            visual=trimesh.visual.TextureVisuals(uv, material=material),
+            visual=visual,
             process=False,
         )
         name = piece.name if number == 0 else f"{piece.name} part {number}"
@@ -59,5 +61,5 @@ def write_gltf(path: Path, world: World, scene: int, canvas: tuple[int, int]) ->
 
 
 def _linear(colour: np.ndarray) -> np.ndarray:
-    """sRGB in 0..1 to linear light, as glTF's factors are."""
+    """sRGB in 0..1 to linear light, as glTF's vertex colours are."""
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)

@@ -1,4 +1,4 @@
-"""A 3D scene in pieces of one colour and one texture, as viewers and exchange formats take them.
+"""A 3D scene in pieces, one for each object and strip of ground, as viewers and exchange formats take them.
 
 World axes, metres. Axis letters: N scenes, M nodes, F triangles of a piece.
 """
@@ -17,15 +17,15 @@ NEAR, FAR, SIDE = -20.0, 150.0, 60.0  # metres of ground that are shown before, 
 
 
 class Piece(NamedTuple):
-    """Triangles of one colour.
+    """An object's triangles.
 
     Attributes:
-        name: of what it belongs to, such as ``"car 3"``; equal for all pieces of one object.
+        name: such as ``"car 3"``, unique but where several layers draw a node.
         positions: ``(3F, 3)`` corners, three a triangle, in the object's own axes.
         normals: ``(3F, 3)``, likewise.
         uv: ``(3F, 2)`` texture coordinates, v downward, or None.
         texture: ``(h, w, 3)`` uint8 sRGB that multiplies the colour, or None.
-        colour: ``(3,)`` sRGB in 0..255.
+        colour: ``(3F, 3)`` sRGB in 0..255.
         matrix: ``(4, 4)`` from the object's axes to the world's.
     """
 
@@ -47,7 +47,7 @@ def pieces(world: World, scene: int) -> Iterator[Piece]:
             tint = layer.tint[scene, node].numpy().astype(np.float64)
             matrix = _placed(*(float(getattr(layer, key)[scene, node]) for key in ("x", "y", "z", "yaw")))
             matrix[:3, :3] *= layer.scale[scene, node].numpy()
-            yield from _of_mesh(layer.meshes[int(layer.mesh[scene, node])], name, tint, matrix)
+            yield _of_mesh(layer.meshes[int(layer.mesh[scene, node])], name, tint, matrix)
     if world.ground is not None:
         yield from _of_ground(world, scene)
 
@@ -71,7 +71,7 @@ def intrinsics(world: World, scene: int) -> NDArray[np.float64]:
     return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 
 
-def _of_mesh(mesh: Mesh, name: str, tint: NDArray[np.float64], matrix: NDArray[np.float64]) -> Iterator[Piece]:
+def _of_mesh(mesh: Mesh, name: str, tint: NDArray[np.float64], matrix: NDArray[np.float64]) -> Piece:
     corners = mesh.positions[mesh.triangles]  # (F, 3, 3)
     if mesh.normals is None:
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -79,11 +79,9 @@ def _of_mesh(mesh: Mesh, name: str, tint: NDArray[np.float64], matrix: NDArray[n
         normals = np.repeat(normal[:, None], 3, 1)
     else:
         normals = mesh.normals
-    colour = mesh.colour * np.where(mesh.tinted[:, None], tint, 1.0)
-    for one in np.unique(colour, axis=0):
-        own = (colour == one).all(1)
-        uv = None if mesh.texture is None else mesh.uv[own].reshape(-1, 2)
-        yield Piece(name, corners[own].reshape(-1, 3), normals[own].reshape(-1, 3), uv, mesh.texture, one, matrix)
+    colour = np.repeat(mesh.colour * np.where(mesh.tinted[:, None], tint, 1.0), 3, 0)
+    uv = None if mesh.texture is None else mesh.uv.reshape(-1, 2)
+    return Piece(name, corners.reshape(-1, 3), normals.reshape(-1, 3), uv, mesh.texture, colour, matrix)
 
 
 def _of_ground(world: World, scene: int) -> Iterator[Piece]:
@@ -100,7 +98,7 @@ def _of_ground(world: World, scene: int) -> Iterator[Piece]:
         # As a Surface says: rows run along +x, columns along -y.
         uv = np.c_[-corners[:, 1] / surface.tile[1], (corners[:, 0] - offset) / surface.tile[0]]
         up = np.tile(np.float32([0, 0, 1]), (6, 1))
-        colour = np.full(3, 255.0)
+        colour = np.full((6, 3), 255.0)
         yield Piece(f"ground {strip}", positions, up, uv.astype(np.float32), surface.texture, colour, np.eye(4))
 
 

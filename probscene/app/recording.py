@@ -97,7 +97,7 @@ def _log_world(rr, recording, world: World, batch: RenderBatch, scene: int, colo
         mesh = rr.Mesh3D(
             vertex_positions=corners,
             vertex_normals=turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12),
-            albedo_factor=[*np.rint(piece.colour).astype(int).tolist(), 255],
+            vertex_colors=np.rint(piece.colour).astype(np.uint8),
             **texture,
         )
         recording.log(f"world/objects/{piece.name.replace(' ', '/')}/{number}", mesh)

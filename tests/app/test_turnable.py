@@ -67,13 +67,9 @@ def test_a_gltf_file_holds_every_object_where_it_stands(tmp_path, call, lots):
     for m, k in enumerate(world.kind[0].tolist()):
         if k < 0:
             continue
-        name = f"{lots.grammar.kinds[k]} {m}"
-        parts = [n for n in whole.graph.nodes_geometry if n == name or n.startswith(f"{name} part")]
-        corners = []
-        for part in parts:
-            matrix, geometry = whole.graph[part]
-            corners.append(trimesh.transform_points(whole.geometry[geometry].vertices, back @ matrix))
-        corners = np.concatenate(corners)
+        matrix, geometry = whole.graph[f"{lots.grammar.kinds[k]} {m}"]
+        shape = whole.geometry[geometry]
+        corners = trimesh.transform_points(shape.vertices, back @ matrix)
         layer = next(layer for layer in world.layers if layer.present[0, m])
         mesh = layer.meshes[int(layer.mesh[0, m])]
         c, s = torch.cos(layer.yaw[0, m]).item(), torch.sin(layer.yaw[0, m]).item()
@@ -84,6 +80,11 @@ def test_a_gltf_file_holds_every_object_where_it_stands(tmp_path, call, lots):
             mesh.positions[:, 2] + layer.z[0, m].item(),
         ]
         assert np.allclose(np.unique(corners.round(3), axis=0), np.unique(expected.round(3), axis=0), atol=2e-3)
+        shown = np.unique(np.asarray(shape.visual.vertex_attributes["color"])[:, :3], axis=0)
+        srgb = mesh.colour / 255 * np.where(mesh.tinted[:, None], layer.tint[0, m].numpy(), 1.0)
+        linear = np.unique(np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4), axis=0)
+        assert np.allclose(shown[np.lexsort(shown.T)], 255 * linear[np.lexsort(linear.T)], atol=0.51)
+        assert (shape.visual.material.baseColorTexture is None) == (mesh.texture is None)
     ground = [n for n in whole.graph.nodes_geometry if n.startswith("ground")]
     assert len(ground) == 3 and whole.has_camera
 
