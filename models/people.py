@@ -126,12 +126,12 @@ def _trunk(pose: Pose) -> Solid:
 
 
 def _head(pose: Pose, flesh, hair) -> Solid:
-    """Hair above and behind."""
-    made = ball((0.105, 0.085, 0.135), rows=5, sides=7, colour=flesh)
+    """Hair above and behind, and the neck."""
+    made = ball((0.105, 0.085, 0.135), rows=5, sides=6, colour=flesh)
     middle = made.positions[made.triangles].mean(1)
     haired = (middle[:, 2] > 0.07) | ((middle[:, 0] < -0.02) & (middle[:, 2] > -0.06))
     made = made._replace(colour=np.where(haired[:, None], np.asarray(hair, float), made.colour))
-    return place(made, pose.head)
+    return join(place(made, pose.head), tube([pose.neck, np.array(pose.head) - [0, 0, 0.06]], 0.06, 4, flesh))
 
 
 def bicycle(basket: bool = False) -> Solid:
