@@ -10,33 +10,10 @@ from probscene.renderers import mesh_atlas as atlas
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers import shading_kernel as shading
 from probscene.renderers.engine import ti
-from probscene.renderers.raster_kernel import fill, fill_map, up
-
-CORNER = 5  # floats a vertex in the scratch: u z, v z, z, u, v; on the map column, row, metres towards the sun
-SLACK, STEEPEST = 0.02, 1.0  # metres by which a shadow keeps off what casts it: always, and at most for the slope
+from probscene.renderers.raster_kernel import fill, high, low, up
+from probscene.renderers.vertex_kernel import CORNER, transform, vertex
 
 i32, f32, f64 = ti.i32, ti.f32, ti.f64
-
-
-@ti.func
-def transform(k: i32, matrix: i32, divide: i32, base: i32, whole: ti.template(), real: ti.template(),
-              positions: ti.template(), corners: ti.template()):  # fmt: skip
-    """An instance's vertices into the scratch."""
-    m, source = k * tables.REALS + matrix, ti.cast(whole[k * tables.INTEGERS + tables.VERTEX], i32) * 3
-    a = ti.Vector([real[m + i] for i in range(12)], dt=f64)
-    for i in range(ti.cast(whole[k * tables.INTEGERS + tables.VERTICES], i32)):
-        x, y = ti.cast(positions[source + 3 * i], f64), ti.cast(positions[source + 3 * i + 1], f64)
-        z, to = ti.cast(positions[source + 3 * i + 2], f64), base + i * CORNER
-        u, v, depth = (a[0] * x + a[1] * y + a[2] * z + a[3], a[4] * x + a[5] * y + a[6] * z + a[7],
-                       a[8] * x + a[9] * y + a[10] * z + a[11])  # fmt: skip
-        corners[to], corners[to + 1], corners[to + 2] = u, v, depth
-        if divide != 0 and depth >= tables.NEAR:
-            corners[to + 3], corners[to + 4] = u / depth, v / depth
-
-
-@ti.func
-def vertex(at: i32, corners: ti.template()):
-    return ti.Vector([corners[at], corners[at + 1], corners[at + 2]], dt=f64)
 
 
 @ti.func
@@ -52,9 +29,9 @@ def cosines(n: i32, m: i32, real: ti.template(), faces: ti.template()):
     """A normal's cosines towards the sun and upward, in an instance that is turned and scaled."""
     x, y, z = ti.cast(faces[n], f64), ti.cast(faces[n + 1], f64), ti.cast(faces[n + 2], f64)
     a, b, c = x * real[m + tables.UNSCALE], y * real[m + tables.UNSCALE + 1], z * real[m + tables.UNSCALE + 2]
-    length = ti.max(ti.sqrt(a * a + b * b + c * c), f64(1e-12))
+    share = 1 / high(ti.sqrt(a * a + b * b + c * c), f64(1e-12))
     sun = x * real[m + tables.TO_SUN] + y * real[m + tables.TO_SUN + 1] + z * real[m + tables.TO_SUN + 2]
-    return sun / length, c / length
+    return sun * share, c * share
 
 
 @ti.func
@@ -144,13 +121,13 @@ def draw_instance(
                     u1, v1 = at_near(a, b)
                     u2, v2 = at_near(a, c)
         if front:
-            least_u, largest_u = ti.min(u0, ti.min(u1, u2)), ti.max(u0, ti.max(u1, u2))
-            least_v, largest_v = ti.min(v0, ti.min(v1, v2)), ti.max(v0, ti.max(v1, v2))
+            least_u, largest_u = low(u0, low(u1, u2)), high(u0, high(u1, u2))
+            least_v, largest_v = low(v0, low(v1, v2)), high(v0, high(v1, v2))
             if behind == 1:
-                least_u, largest_u = ti.min(least_u, u3), ti.max(largest_u, u3)
-                least_v, largest_v = ti.min(least_v, v3), ti.max(largest_v, v3)
-            low_u, high_u = ti.min(low_u, least_u), ti.max(high_u, largest_u)
-            low_v, high_v = ti.min(low_v, least_v), ti.max(high_v, largest_v)
+                least_u, largest_u = low(least_u, u3), high(largest_u, u3)
+                least_v, largest_v = low(least_v, v3), high(largest_v, v3)
+            low_u, high_u = low(low_u, least_u), high(high_u, largest_u)
+            low_v, high_v = low(low_v, least_v), high(high_v, largest_v)
             column, row = up(least_u, width), up(least_v, height)
             covers = column < up(largest_u, width) and row < up(largest_v, height)
             if zooms == 2 and not covers:
@@ -181,32 +158,9 @@ def draw_instance(
                         )  # fmt: skip
     if node >= 0 and low_u <= high_u:
         e = node * tables.EXTENT
-        extent[e], extent[e + 1] = ti.min(extent[e], low_u + 0.5), ti.min(extent[e + 1], low_v + 0.5)
-        extent[e + 2], extent[e + 3] = ti.max(extent[e + 2], high_u + 0.5), ti.max(extent[e + 3], high_v + 0.5)
+        extent[e], extent[e + 1] = low(extent[e], low_u + 0.5), low(extent[e + 1], low_v + 0.5)
+        extent[e + 2], extent[e + 3] = high(extent[e + 2], high_u + 0.5), high(extent[e + 3], high_v + 0.5)
     return last, area
-
-
-@ti.func
-def cast_shadow(
-    k: i32, size: i32, base: i32, corner_base: i32, whole: ti.template(), real: ti.template(),
-    positions: ti.template(), triangles: ti.template(), shadow: ti.template(), corners: ti.template(),
-):  # fmt: skip
-    """Draw an instance on the shadow map, both sides of its triangles, each pushed away from the sun by its slope."""
-    transform(k, tables.TO_MAP, 0, corner_base, whole, real, positions, corners)
-    first = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32)
-    for t in range(first, first + ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLES], i32)):
-        a = vertex(corner_base + triangles[3 * t] * CORNER, corners)
-        b = vertex(corner_base + triangles[3 * t + 1] * CORNER, corners)
-        c = vertex(corner_base + triangles[3 * t + 2] * CORNER, corners)
-        across = up(ti.min(a[0], ti.min(b[0], c[0])), size) < up(ti.max(a[0], ti.max(b[0], c[0])), size)
-        if across and up(ti.min(a[1], ti.min(b[1], c[1])), size) < up(ti.max(a[1], ti.max(b[1], c[1])), size):
-            one, other = b - a, c - a
-            normal = one.cross(other)
-            if normal[2] != 0:
-                d_u, d_v = -normal[0] / normal[2], -normal[1] / normal[2]
-                start = a[2] - d_u * a[0] - d_v * a[1]
-                start -= SLACK + ti.min(ti.abs(d_u) + ti.abs(d_v), STEEPEST)
-                fill_map(a[0], a[1], b[0], b[1], c[0], c[1], start, d_u, d_v, size, base, shadow)
 
 
 @ti.func

@@ -11,8 +11,9 @@ from probscene.renderers.texture_atlas import TextureAtlas
 # Columns of a face: sRGB colour in 0..1, whether it takes a tint, whether its corners' normals differ, the normals and
 # texture coordinates of its corners.
 COLOUR, TINTED, SMOOTH, NORMAL, UV, FACE = 0, 3, 4, 5, 14, 20
-# Columns of ``rows``, one row a mesh: where its vertices and triangles begin, how many there are, its texture or -1.
-VERTEX, VERTICES, TRIANGLE, TRIANGLES, TEXTURE = range(5)
+# Columns of ``rows``, one row a mesh: where its vertices and triangles begin, how many there are, its texture or -1,
+# whether it is closed.
+VERTEX, VERTICES, TRIANGLE, TRIANGLES, TEXTURE, CLOSED = range(6)
 
 _FACES, _TEXELS = 1 << 20, 1 << 24  # kept between calls, 96 MiB and 128 MiB
 _MOST = (1 << 31) // FACE  # the kernel's indices are 32-bit
@@ -34,7 +35,7 @@ class MeshAtlas:
     def _clear(self) -> None:
         self._meshes: WeakKeyDictionary[Mesh, int] = WeakKeyDictionary()
         self._surfaces: WeakKeyDictionary[Surface, int] = WeakKeyDictionary()
-        self._rows, self._bounds = np.zeros((0, 5), np.int64), np.zeros((0, 2, 3))
+        self._rows, self._bounds = np.zeros((0, 6), np.int64), np.zeros((0, 2, 3))
         self.positions, self.corners = np.zeros(3, np.float32), np.zeros(3, np.int32)  # Taichi takes no empty array
         self.faces = np.zeros(FACE, np.float32)
         self.textures = TextureAtlas()
@@ -68,6 +69,7 @@ class MeshAtlas:
                 len(self.corners) // 3 + triangles.cumsum()[:-1],
                 triangles[1:],
                 [texture.get(mesh, -1) for mesh in meshes],
+                [_closed(mesh) for mesh in meshes],
             ],
             1,
         )
@@ -79,7 +81,7 @@ class MeshAtlas:
         self.faces = np.concatenate([self.faces, *(_faces(mesh).ravel() for mesh in meshes)])
 
     def rows(self, meshes: tuple[Mesh, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """The rows of known meshes ``(len(meshes), 5)`` int64, and their least and largest x, y, z ``(.., 2, 3)``."""
+        """The rows of known meshes ``(len(meshes), 6)`` int64, and their least and largest x, y, z ``(.., 2, 3)``."""
         index = [self._meshes[mesh] for mesh in meshes]
         return self._rows[index], self._bounds[index]
 
@@ -104,3 +106,12 @@ def _faces(mesh: Mesh) -> np.ndarray:
     if mesh.uv is not None:
         faces[:, UV : UV + 6] = mesh.uv.reshape(-1, 6)
     return faces
+
+
+def _closed(mesh: Mesh) -> bool:
+    """Whether each edge of a triangle is, the other way round, one of another's, by where its ends are."""
+    _, vertex = np.unique(mesh.positions, axis=0, return_inverse=True)
+    start = vertex[mesh.triangles].astype(np.int64)
+    end = np.roll(start, -1, axis=1)
+    size = len(mesh.positions)
+    return np.array_equal(np.sort(start * size + end, axis=None), np.sort(end * size + start, axis=None))

@@ -19,7 +19,7 @@ MAX_NODES, MAX_INSTANCES, MAX_SCALE = 32767, 65535, 1e4
 class Placed(NamedTuple):
     """Every mesh that stands in the world, unsorted. I instances.
 
-    ``scene, node (I,)`` int64, the node -1 without a label; ``layer (I,)``; ``rows (I, 5)`` of the atlas; ``middle,
+    ``scene, node (I,)`` int64, the node -1 without a label; ``layer (I,)``; ``rows (I, 6)`` of the atlas; ``middle,
     half (I, 3)`` of the mesh's own box; ``at (I, 3)`` metres; ``yaw (I,)``; ``scale, tint (I, 3)``.
     """
 
@@ -148,7 +148,7 @@ def _placed(world: World, atlas: MeshAtlas) -> Placed:
         )
     if not parts:
         none, three = np.zeros(0, np.int64), np.zeros((0, 3))
-        return Placed(none, none, none, np.zeros((0, 5), np.int64), three, three, three, np.zeros(0), three, three)
+        return Placed(none, none, none, np.zeros((0, 6), np.int64), three, three, three, np.zeros(0), three, three)
     return Placed(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -209,7 +209,11 @@ def _fill(whole, real, placed: Placed, sight: View, canvas: tuple[int, int], map
 
     lit[:, :2] *= per_metre[scene][..., None]
     lit_at[:, :2] = (lit_at[:, :2] - first[scene]) * per_metre[scene]
-    whole[:, : tables.TEXTURE + 1] = placed.rows
+    whole[:, : tables.CLOSED + 1] = placed.rows
+    least, largest = ((across - first[scene]) * per_metre[scene] for across in (cast_low, cast_high))
+    reach = np.concatenate([np.floor(least) - 1, largest + 1], 1)
+    reach = np.clip(reach, [0, 0, -1, -1], [map_size, map_size, map_size - 1, map_size - 1])
+    whole[:, tables.MAP_BOX : tables.MAP_BOX + 4] = np.where(casts[:, None], reach, [0, 0, -1, -1])
     whole[:, tables.NODE], whole[:, tables.SEEN], whole[:, tables.CASTS] = placed.node, seen, casts
     real[:, tables.TO_IMAGE : tables.TO_IMAGE + 12] = np.dstack([image, image_at]).reshape(-1, 12)
     real[:, tables.TO_MAP : tables.TO_MAP + 12] = np.dstack([lit, lit_at]).reshape(-1, 12)

@@ -132,31 +132,35 @@ def scene_table(world: World, sight: View, shadow: tuple[np.ndarray, ...]) -> np
     rows, light, photo = table[: len(world)], world.light, world.photo
     rows[:, tables.RAY : tables.RAY + 9] = sight.ray.reshape(-1, 9)
     rows[:, tables.EYE : tables.EYE + 3] = sight.eye
-    rows[:, tables.FOCAL], rows[:, tables.CENTRE], rows[:, tables.CENTRE + 1] = numbers(
-        world.camera, "focal", "centre_x", "centre_y"
-    )
     if world.ground is not None:
         rows[:, tables.GROUNDED] = sight.eye[:, 2] > 0
         (rows[:, tables.OFFSET],) = numbers(world.ground, "offset")
+    lights = rows[:, tables.LIGHT :]
+    focal, lights[:, tables.LENS + 1], lights[:, tables.LENS + 2] = numbers(
+        world.camera, "focal", "centre_x", "centre_y"
+    )
+    lights[:, tables.LENS], lights[:, tables.BLOCK] = 1 / focal, np.clip(focal // 64, 1, 8)
     exposure, contrast, saturation, noise = numbers(photo, "exposure", "contrast", "saturation", "noise")
     sun, ambient, haze, zenith, horizon = numbers(light, "sun", "ambient", "haze", "zenith", "horizon")
-    up = sight.sun[:, 2, 2]
-    rows[:, tables.SUN] = np.where(up > 0, sun, 0) * exposure
-    rows[:, tables.AMBIENT], rows[:, tables.SUN_UP], rows[:, tables.HAZE] = ambient * exposure, up, haze
-    rows[:, tables.ZENITH : tables.ZENITH + 3] = zenith * exposure[:, None]
-    rows[:, tables.HORIZON : tables.HORIZON + 3] = horizon * exposure[:, None]
+    rows[:, tables.SUN_UP] = sight.sun[:, 2, 2]
+    lights[:, tables.SUN] = np.where(sight.sun[:, 2, 2] > 0, sun, 0) * exposure
+    lights[:, tables.AMBIENT], lights[:, tables.HAZE] = ambient * exposure, haze
+    lights[:, tables.HORIZON : tables.HORIZON + 3] = horizon * exposure[:, None]
+    lights[:, tables.MORE : tables.MORE + 3] = (zenith - horizon) * exposure[:, None]
+    lights[:, tables.CLIMB : tables.CLIMB + 3] = sight.ray[:, 2]
     mapped, first, per_metre = shadow
-    rows[:, tables.SHADOWED] = mapped & (rows[:, tables.SUN] > 0)
-    on_map = rows[:, tables.ON_MAP : tables.ON_MAP + 12].reshape(-1, 3, 4)
+    lights[:, tables.SHADOWED] = mapped & (lights[:, tables.SUN] > 0)
+    on_map = lights[:, tables.ON_MAP : tables.ON_MAP + 12].reshape(-1, 3, 4)
     on_map[:, :, 1:] = product(sight.sun, sight.ray)
     on_map[:, :2, 1:] *= per_metre[..., None]
     on_map[:, :2, 0] = -first * per_metre
+    lights[:, tables.ON_MAP : tables.ON_MAP + 12] = on_map.reshape(-1, 12)
     grey = (1 - saturation)[:, None, None] * _GREY
     matrix = contrast[:, None, None] * (saturation[:, None, None] * np.eye(3) + grey)
-    rows[:, tables.MATRIX : tables.MATRIX + 9] = matrix.reshape(-1, 9)
-    rows[:, tables.BIAS] = 0.5 * (1 - contrast)
-    rows[:, tables.DEVELOPED] = (contrast != 1) | (saturation != 1)
-    rows[:, tables.NOISE] = noise
+    lights[:, tables.MATRIX : tables.MATRIX + 9] = matrix.reshape(-1, 9)
+    lights[:, tables.BIAS] = 0.5 * (1 - contrast)
+    lights[:, tables.DEVELOPED] = (contrast != 1) | (saturation != 1)
+    lights[:, tables.NOISE] = noise / 255
     return table
 
 

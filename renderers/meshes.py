@@ -23,9 +23,9 @@ from probscene.errors import ModelError
 from probscene.renderers import engine, shading_kernel
 from probscene.renderers import mesh_kernel as kernel
 from probscene.renderers import mesh_tables as tables
-from probscene.renderers.geometry_kernel import CORNER
 from probscene.renderers.mesh_atlas import MeshAtlas
 from probscene.renderers.mesh_instances import Instances, instances, names
+from probscene.renderers.vertex_kernel import CORNER
 from probscene.world import World
 
 _MAX_CANVAS = 1 << 24
@@ -62,7 +62,7 @@ class MeshRenderer:
             raise ModelError(f"Expected 1 or 4 samples a pixel, actual {samples}.")
         self.canvas, self.samples = (int(height), int(width)), samples
         self.threads = threads or engine.available_threads()
-        self.map_size = min(2048, max(64, 5 * int(width) // 6))
+        self.map_size = min(2048, max(256, 5 * int(width) // 96 * 16))
         self._atlas = MeshAtlas()
         self._scratch: dict[str, np.ndarray] = {}
 
@@ -81,19 +81,19 @@ class MeshRenderer:
         self._atlas.trim()
         (N, M), (height, width) = world.kind.shape, self.canvas
         pixels = height * width
-        image, instance = np.empty(3 * _even(N * pixels), np.uint8), np.empty(max(1, N * pixels), np.int16)
+        image, instance = np.empty(max(1, 3 * N * pixels), np.uint8), np.empty(max(1, N * pixels), np.int16)
         semantic, depth = np.empty(max(1, N * pixels), np.uint8), np.empty(max(1, N * pixels), np.float32)
         nodes = max(1, N), max(1, M)
         result = np.tile(np.array([width, height, 0, 0, 0, 0], np.int32), (*nodes, 1))
         extent = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (*nodes, 1))
         drawn, box = np.zeros((N, M), bool), np.zeros((N, M, 7))
-        step = min(_SCENES, _even(max(1, _CHUNK // pixels - 3)))
+        step = min(_SCENES, max(1, _CHUNK // pixels))
         for start in range(0, N, step):
             part = slice(start, min(start + step, N))
             table = instances(world[part], self._atlas, self.canvas, self.map_size)
-            here, words = slice(start * pixels, part.stop * pixels), slice(start * pixels, _even(part.stop * pixels))
+            here = slice(start * pixels, part.stop * pixels)
             self._render(
-                world[part], table, image[3 * words.start : 3 * words.stop], instance[here], semantic[here],
+                world[part], table, image[3 * here.start : 3 * here.stop], instance[here], semantic[here],
                 depth[here], result[part].reshape(-1), extent[part].reshape(-1),
             )  # fmt: skip
             drawn[part], box[part] = table.drawn, table.box
@@ -126,33 +126,28 @@ class MeshRenderer:
             "seen": (seen, np.uint64),
             "stamp": (height * width, np.int32),
             "shadow": (self.map_size**2, np.float32),
+            "opened": (self.map_size**2 // 256, np.int32),
             "corners": (most_vertices * CORNER, np.float64),
             "records": (most_records * shading_kernel.RECORD, np.float32),
             "marks": (most_records * shading_kernel.MARKS, np.int32),
             "line": (3 * width, np.float32),
-            "packed": (width, np.uint32),
         }
         largest = max(size for size, _ in each.values())
         workers = max(1, min(self.threads, N, ((1 << 31) - 1) // largest))
         for name, (size, dtype) in each.items():
             if name not in self._scratch or self._scratch[name].size < workers * size:
                 self._scratch[name] = np.zeros(max(1, workers * size), dtype)
-        self._scratch["stamp"][:] = 0
-        self._scratch["line"][:] = 0
+        for name in ("stamp", "opened", "line"):
+            self._scratch[name][:] = 0
         atlas = self._atlas
         kernel.render(
             self.samples == 4, workers, N, height, width, max(1, world.kind.shape[1]), strips, self.map_size,
             most_vertices, most_records, np.zeros(1, np.int32), table.first, table.whole, table.real, table.scenes,
             world.photo.seed.cpu().numpy().astype(np.int64), table.edges, table.strips, table.tiles,
             atlas.positions, atlas.corners, atlas.faces, atlas.textures.table, atlas.textures.texels,
-            *(self._scratch[name] for name in each), image, image.view(np.uint32), instance, semantic, depth,
+            *(self._scratch[name] for name in each), image, instance, semantic, depth,
             result, extent,
         )  # fmt: skip
-
-
-def _even(count: int) -> int:
-    """The next multiple of four: the kernel writes four pixels at once."""
-    return -(-count // 4) * 4
 
 
 def _labels(result: np.ndarray, extent: np.ndarray, canvas: tuple[int, int]) -> dict[str, torch.Tensor]:

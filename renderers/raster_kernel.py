@@ -8,21 +8,33 @@ The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above 
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers.engine import ti
 
-FAR = 1 << 29
-
 i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
+
+
+@ti.func
+def low(a, b):
+    """The lesser; ti.min takes several instructions, for the sake of NaN."""
+    return ti.select(a < b, a, b)
+
+
+@ti.func
+def high(a, b):
+    """The greater."""
+    return ti.select(a > b, a, b)
 
 
 @ti.func
 def up(value: f64, most: i32):
     """The first whole number not below the value, within 0..most."""
-    bounded = ti.min(ti.max(value, 0.0), ti.cast(most, f64))
-    return FAR - ti.cast(FAR - bounded, i32)  # ceil by truncation: the real one is a call
+    bounded = low(high(value, f64(0.0)), ti.cast(most, f64))
+    whole = ti.cast(bounded, i32)  # the real ceil is a call
+    return whole + ti.cast(ti.cast(whole, f64) < bounded, i32)
 
 
 @ti.func
 def key(w: f32, record: i32):
-    return (ti.cast(ti.bit_cast(w, u32), u64) << 32) | ti.cast(record, u64)
+    """A word of the visibility buffer; rounding may not take 1/z to 0 or below."""
+    return (ti.cast(ti.bit_cast(high(w, f32(1e-9)), u32), u64) << 32) | ti.cast(record, u64)
 
 
 @ti.func
@@ -43,7 +55,7 @@ def columns(y: f64, u0: f64, v0: f64, v1: f64, u1: f64, whole: f64, upper: f64, 
     one, other = u0 + (y - v0) * whole, u0 + (y - v0) * upper
     if y >= v1:
         other = u1 + (y - v1) * lower
-    return up(ti.min(one, other), width), up(ti.max(one, other), width)
+    return up(low(one, other), width), up(high(one, other), width)
 
 
 @ti.func
@@ -77,34 +89,14 @@ def fill(
 
 
 @ti.func
-def fill_map(
-    a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, d: f64, d_u: f64, d_v: f64,
-    size: i32, base: i32, shadow: ti.template(),
-):  # fmt: skip
-    """Keep what is nearest to the sun; its distance is ``d`` at the first texel and linear."""
-    u0, v0, u1, v1, u2, v2 = by_height(a0, b0, a1, b1, a2, b2)
-    whole, upper, lower = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
-    slope = ti.cast(d_u, f32)
-    for row in range(up(v0, size), up(v2, size)):
-        y = ti.cast(row, f64)
-        first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, size)
-        start = ti.cast(d + d_v * y + d_u * ti.cast(first, f64), f32)
-        line = base + row * size
-        for column in range(first, last):
-            near = start + slope * ti.cast(column - first, f32)
-            if near > shadow[line + column]:
-                shadow[line + column] = near
-
-
-@ti.func
-def beyond(low: i32, high: i32, constant: f64, slope: f64):
-    """The columns of ``low..high`` at which ``constant + slope * column`` is positive: a part at one of its ends."""
-    first, last = low, high
+def beyond(start: i32, end: i32, constant: f64, slope: f64):
+    """The columns of ``start..end`` at which ``constant + slope * column`` is positive: a part at one of its ends."""
+    first, last = start, end
     if slope == 0:
         if constant <= 0:
             last = first
     else:
-        at = ti.max(up(-constant / slope, high), low)
+        at = ti.max(up(-constant / slope, end), start)
         if slope > 0:
             first = at
         else:
@@ -137,19 +129,17 @@ def fill_ground(
             seen[line + column] = u64(0)
         for column in range(ti.max(last, first), width):
             seen[line + column] = u64(0)
-        low, high = first, last
+        left, right = first, last
         for strip in range(strips):
-            a, b = low, high  # what lies above the edges so far
+            a, b = left, right  # what lies above the edges so far
             if strip < strips - 1:
                 gap = eye_y - edges[scene * (strips - 1) + strip]
                 constant, slope = gap * ray_z - eye_z * ray_y, gap * z_u - eye_z * y_u
-                a, b = beyond(low, high, constant, slope)
-                if a > low:
-                    high = a
+                a, b = beyond(left, right, constant, slope)
+                if a > left:
+                    right = a
                 else:
-                    low = b
-            else:
-                low = high
+                    left = b
             w, w_u = ti.cast(-ray_z / eye_z, f32), ti.cast(-z_u / eye_z, f32)
             for column in range(a, b):
                 seen[line + column] = key(w + w_u * ti.cast(column, f32), strip + 1)

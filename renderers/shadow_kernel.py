@@ -1,0 +1,105 @@
+"""The shadow map: how far towards the sun the first thing is, for each texel, seen along the light.
+
+The map is cleared, written and read in tiles of 16 x 16, and only those that something may cast a shadow on.
+"""
+
+from probscene.renderers import mesh_tables as tables
+from probscene.renderers.engine import ti
+from probscene.renderers.raster_kernel import by_height, columns, high, low, up
+from probscene.renderers.vertex_kernel import CORNER, transform, vertex
+
+NOTHING = -1e30
+SLACK, STEEPEST = 0.02, 1.0  # metres by which a shadow keeps off what casts it: always, and at most for the slope
+
+i32, f32, f64 = ti.i32, ti.f32, ti.f64
+
+
+@ti.func
+def tile_at(column: i32, row: i32, base: i32, size: i32):
+    """The tile of the shadow map that a texel lies in; ``base`` is the map's."""
+    return (base >> 8) + (row >> 4) * (size >> 4) + (column >> 4)
+
+
+@ti.func
+def open_tiles(k: i32, mark: i32, size: i32, base: i32, whole: ti.template(), shadow: ti.template(),
+               opened: ti.template()):  # fmt: skip
+    """Clear the tiles of the shadow map that an instance may reach, and one texel beyond; to be done for all at first.
+
+    Where no tile is opened nothing casts a shadow, and the map is never read.
+    """
+    at = k * tables.INTEGERS + tables.MAP_BOX
+    left, top = ti.cast(whole[at], i32) >> 4, ti.cast(whole[at + 1], i32) >> 4
+    right, bottom = ti.cast(whole[at + 2], i32) >> 4, ti.cast(whole[at + 3], i32) >> 4
+    for row in range(top, bottom + 1):
+        for column in range(left, right + 1):
+            tile = tile_at(column * 16, row * 16, base, size)
+            if opened[tile] != mark:
+                opened[tile] = mark
+                for y in range(row * 16, ti.min(row * 16 + 17, size)):
+                    for x in range(base + y * size + column * 16, base + y * size + ti.min(column * 16 + 17, size)):
+                        shadow[x] = f32(NOTHING)
+
+
+@ti.func
+def fill_map(
+    a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, d: f64, d_u: f64, d_v: f64,
+    size: i32, base: i32, shadow: ti.template(),
+):  # fmt: skip
+    """Keep what is nearest to the sun; its distance is ``d`` at the first texel and linear."""
+    u0, v0, u1, v1, u2, v2 = by_height(a0, b0, a1, b1, a2, b2)
+    whole, upper, lower = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
+    slope = ti.cast(d_u, f32)
+    for row in range(up(v0, size), up(v2, size)):
+        y = ti.cast(row, f64)
+        first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, size)
+        start = ti.cast(d + d_v * y + d_u * ti.cast(first, f64), f32)
+        line = base + row * size
+        for column in range(first, last):
+            near = start + slope * ti.cast(column - first, f32)
+            if near > shadow[line + column]:
+                shadow[line + column] = near
+
+
+@ti.func
+def cast_shadow(
+    k: i32, size: i32, base: i32, corner_base: i32, whole: ti.template(), real: ti.template(),
+    positions: ti.template(), triangles: ti.template(), shadow: ti.template(), corners: ti.template(),
+):  # fmt: skip
+    """Draw an instance on the shadow map, each triangle pushed away from the sun by its slope.
+
+    Of a closed mesh those that face the sun will do.
+    """
+    transform(k, tables.TO_MAP, 0, corner_base, whole, real, positions, corners)
+    first = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32)
+    closed = whole[k * tables.INTEGERS + tables.CLOSED] != 0
+    for t in range(first, first + ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLES], i32)):
+        a = vertex(corner_base + triangles[3 * t] * CORNER, corners)
+        b = vertex(corner_base + triangles[3 * t + 1] * CORNER, corners)
+        c = vertex(corner_base + triangles[3 * t + 2] * CORNER, corners)
+        one, other = b - a, c - a
+        faces = one[0] * other[1] - one[1] * other[0]  # the sun, where positive
+        if faces > 0 or (faces < 0 and not closed):
+            across = up(low(a[0], low(b[0], c[0])), size) < up(high(a[0], high(b[0], c[0])), size)
+            if across and up(low(a[1], low(b[1], c[1])), size) < up(high(a[1], high(b[1], c[1])), size):
+                d_u = (one[2] * other[1] - one[1] * other[2]) / faces
+                d_v = (one[0] * other[2] - one[2] * other[0]) / faces
+                start = a[2] - d_u * a[0] - d_v * a[1]
+                start -= SLACK + ti.min(ti.abs(d_u) + ti.abs(d_v), STEEPEST)
+                fill_map(a[0], a[1], b[0], b[1], c[0], c[1], start, d_u, d_v, size, base, shadow)
+
+
+@ti.func
+def sunlit(column: f32, row: f32, near: f32, size: i32, base: i32, mark: i32,
+           shadow: ti.template(), opened: ti.template()):  # fmt: skip
+    """Share of the four nearest texels of the shadow map that let the sun through, by their distance; 1 beyond it."""
+    share = f32(1.0)
+    if column >= 0 and row >= 0 and column < ti.cast(size - 1, f32) and row < ti.cast(size - 1, f32):
+        i, j = ti.cast(column, i32), ti.cast(row, i32)
+        if opened[tile_at(i, j, base, size)] == mark:
+            across, down = column - ti.cast(i, f32), row - ti.cast(j, f32)
+            at = base + j * size + i
+            a, b = ti.cast(near >= shadow[at], f32), ti.cast(near >= shadow[at + 1], f32)
+            c, d = ti.cast(near >= shadow[at + size], f32), ti.cast(near >= shadow[at + size + 1], f32)
+            upper, lower = a + (b - a) * across, c + (d - c) * across
+            share = upper + (lower - upper) * down
+    return share
