@@ -81,7 +81,8 @@ def street_scenes(
     meshes, surfaces = look(scenario)
     road, _, there = things(nodes, meshes)
     standing = [Meshes(kind, meshes[kind], *there) for kind in nodes.things]
-    decoration = [slabs(nodes, road, meshes), fences(nodes, road, meshes), backdrop(nodes)]
+    farthest = (there.x * graph.mask(*nodes.things)).amax(1, keepdim=True)
+    decoration = [slabs(nodes, road, meshes), fences(nodes, road, meshes), backdrop(nodes, farthest)]
     return graph.build(
         *standing,
         *(layer for layer in decoration if layer is not None),

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from probscene.mesh import Mesh
 from probscene.models.driving_nodes import Nodes
@@ -14,19 +15,19 @@ from probscene.models.textures import bricks, leaves
 from probscene.world import Meshes
 
 WIDTH, WIDER = 198.0, 2.2  # metres of a wall's mesh, and by how much it is widened
+BEHIND = 15.0  # metres between the middle of the last thing and the wall
 WALLS = {"city": (4, 5, 2), "suburban": (0, 1, 2, 3, 4), "rural": (0, 1, 2, 3)}
 
 
-def backdrop(nodes: Nodes) -> Meshes:
-    """One wall across the end of the street."""
+def backdrop(nodes: Nodes, farthest: Tensor) -> Meshes:
+    """One wall across the end of the street, behind what stands farthest, ``(N, 1)`` metres."""
     options = torch.tensor(WALLS[nodes.scenario])
     share = nodes.only("street", "end")
     which = options[(share * len(options)).long().clamp(max=len(options) - 1)]
     there = torch.ones_like(which, dtype=torch.bool)
     scale = torch.tensor([1.0, WIDER, 1.0])
-    return Meshes(
-        (), walls(), which, nodes.only("street", "view"), 0.0, scale=scale.expand(*which.shape, 3), present=there
-    )
+    x = torch.maximum(nodes.only("street", "view"), farthest + BEHIND)
+    return Meshes((), walls(), which, x, 0.0, scale=scale.expand(*which.shape, 3), present=there)
 
 
 @cache
