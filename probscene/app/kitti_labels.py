@@ -136,9 +136,7 @@ def _object(fields: list[str], where: str) -> Object:
             raise DataError(f"Expected a number for {name} {where}, actual {text!r}.")
     found = Object(fields[0], *values[3:7])
     if found.right < found.left or found.bottom < found.top:
-        raise DataError(
-            f"Expected a box from left to right and top to bottom {where}, actual {' '.join(fields[4:8])}."
-        )
+        raise DataError(f"Expected a box from left to right and top to bottom {where}, actual {' '.join(fields[4:8])}.")
     return found
 
 
@@ -151,9 +149,7 @@ def _class(type: str, classes: tuple[str, ...]) -> str | None:
 
 def _notes(occurring: Counter, of_type: dict[str, str | None]) -> list[str]:
     """Which types count as something of another name, and which not at all."""
-    renamed = [
-        f"{name} as {own}" for name in occurring if (own := of_type[name]) and own.casefold() != name.casefold()
-    ]
+    renamed = [f"{name} as {own}" for name in occurring if (own := of_type[name]) and own.casefold() != name.casefold()]
     out = [f"{number} {name}" for name, number in occurring.most_common() if of_type[name] is None]
     notes = [f"Counted are {', '.join(sorted(renamed))}."] if renamed else []
     return notes + ([f"Not counted, since the model has no such class: {', '.join(out)}."] if out else [])
