@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from probscene.app.loading import load_model
+from probscene.app.loading import load_model, renderer_for
 from probscene.app.pieces import camera_matrix, intrinsics, pieces
 from probscene.app.provenance import chunk_randomness
 from probscene.sampling import sample
@@ -91,10 +92,10 @@ def test_a_gltf_file_holds_every_object_where_it_stands(tmp_path, call, lots):
 
 def test_what_is_projected_from_pieces_is_what_is_rendered(lots):
     """The amodal box of every box and lid, from corners that OpenCV projects."""
-    from probscene.app.loading import renderer_for
-
-    scenes = scenes_of(lots, 12, 1)
-    world, batch = scenes.drawing, renderer_for(lots)(scenes.drawing)
+    world = scenes_of(lots, 12, 1).drawing
+    turned = {name: 0.3 * torch.rand(12) - 0.15 for name in ("yaw", "pitch", "roll", "x", "y")}
+    world = replace(world, camera=replace(world.camera, **turned))
+    batch = renderer_for(lots)(world)
     for scene in range(12):
         to_camera = np.linalg.inv(camera_matrix(world, scene))
         corners: dict[str, list] = {}
