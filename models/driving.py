@@ -79,7 +79,7 @@ def street_scenes(
         graph = SceneGraph(grammar, derive(grammar, structure, num_scenes, structures.MAX_STEPS))
         nodes = Nodes(graph, scenario)
     meshes, surfaces = look(scenario)
-    road, _, there = things(nodes, meshes)
+    road, there = things(nodes, meshes)
     standing = [Meshes(kind, meshes[kind], *there) for kind in nodes.things]
     farthest = (there.x * graph.mask(*nodes.things)).amax(1, keepdim=True)
     decoration = [slabs(nodes, road, meshes), fences(nodes, road, meshes), backdrop(nodes, farthest)]

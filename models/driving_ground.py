@@ -26,7 +26,7 @@ LOOKS = {
     },
 }
 MEDIANS = ("median", "median", "paving")
-LAWNS = 2 / 3  # share of medians, and of verges in a city, that are green
+LAWNS = 0.5  # share of medians, and of verges in a city, that are green
 BEHIND = 10.0  # metres by which slabs begin behind the camera
 FENCES = {"city": (), "suburban": (0, 1, 2), "rural": (3,)}  # which of the meshes
 FENCED, PANELS = {"suburban": 0.6, "rural": 0.25}, 13

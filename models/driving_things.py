@@ -11,7 +11,7 @@ from probscene.mesh import Mesh
 from probscene.models.driving_layout import Street, extent, in_line, in_width
 from probscene.models.driving_nodes import VEHICLES, Nodes
 from probscene.models.driving_parameters import TINTS, gap
-from probscene.models.driving_strips import Strip, strips
+from probscene.models.driving_strips import strips
 
 OVERHEAD = 2.0  # metres
 PLANTED = 3.6  # metres across, of what stands on a median, at most
@@ -31,7 +31,7 @@ class Things(NamedTuple):
     tint: Tensor
 
 
-def things(nodes: Nodes, meshes: Mapping[str, tuple[Mesh, ...]]) -> tuple[Street, Strip, Things]:
+def things(nodes: Nodes, meshes: Mapping[str, tuple[Mesh, ...]]) -> tuple[Street, Things]:
     """The street and what stands on it."""
     graph = nodes.graph
     standing = graph.mask(*nodes.things)
@@ -60,7 +60,7 @@ def things(nodes: Nodes, meshes: Mapping[str, tuple[Mesh, ...]]) -> tuple[Street
     ahead, aside = (base * scale[..., :2]).unbind(-1)
     x = x - (yaw.cos() * ahead - yaw.sin() * aside)
     y = y - (yaw.sin() * ahead + yaw.cos() * aside)
-    return road, strip, Things(mesh, x, y, height, yaw, scale, tint)
+    return road, Things(mesh, x, y, height, yaw, scale, tint)
 
 
 def footprint(mesh: Mesh, kind: str) -> tuple[list[float], list[float]]:
