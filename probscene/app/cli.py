@@ -76,7 +76,7 @@ app = typer.Typer(
 )
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, made by 'probscene fit'.")]
-Model = Annotated[str, typer.Argument(metavar="MODEL", help="A built-in model (multi_mnist, aerial2d, driving) or a .py file.")]
+Model = Annotated[str, typer.Argument(metavar="MODEL", help="multi_mnist, aerial2d, driving, or a .py file.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same result.")]
 MinHeight = Annotated[float, typer.Option(min=0, help="Of objects that KITTI's labels count, pixels of their boxes.")]
 PresetName = StrEnum("PresetName", ["quick", "default", "paper"])
