@@ -1,9 +1,9 @@
-"""CPU time of rendering streets of meshes, against moderngl on Mesa's llvmpipe and the time it takes to write the bytes.
+"""CPU time of rendering streets of meshes, against moderngl on Mesa's llvmpipe and the time to write the bytes.
 
-    python benchmarks/render_meshes.py --scenes 16 --repeats 5
+    python benchmarks/render_meshes.py --scenes 32 --repeats 5
 
-30 objects a scene, 14,000 triangles, a third of them textured, all with smooth normals; ground in seven strips, sun with
-a shadow map, haze. The peer draws the same triangles with the same matrices into an image, an id buffer and a depth
+30 objects a scene, 14,000 triangles, a third of them textured, all with smooth normals; ground in seven strips, sun
+with a shadow map, haze. The peer draws the same triangles by the same matrices into an image, an id buffer and a depth
 buffer, back faces culled, shadows from a map of the same size with 2 x 2 samples, and reads all three back; its lists
 of what to draw are prepared outside the time, and it finds no boxes, counts or silhouettes, the renderer does. "fill"
 writes the bytes of image, ids, classes and depth into fresh memory. Figures are CPU milliseconds an image over all
@@ -90,40 +90,6 @@ def streets(scenes: int, canvas: tuple[int, int]) -> World:
 
 
 HEAD = "#version 330\n"
-MAP_VERTEX = HEAD + """
-uniform vec4 to_map[3];
-uniform float map_size;
-in vec3 position;
-void main() {
-    vec4 p = vec4(position, 1);
-    vec2 at = (vec2(dot(to_map[0], p), dot(to_map[1], p)) + 0.5) / map_size * 2 - 1;
-    gl_Position = vec4(at, -dot(to_map[2], p) / 400, 1);
-}"""
-EMPTY = HEAD + "void main() {}"
-VERTEX = HEAD + """
-uniform vec4 to_image[3];
-uniform vec4 to_map[3];
-uniform mat3 turn;
-uniform vec2 canvas;
-in vec3 position;
-in vec3 normal;
-in vec2 uv;
-in vec3 colour;
-out vec3 facing;
-out vec2 place;
-out vec3 base;
-out vec3 lit;
-out float far;
-void main() {
-    vec4 p = vec4(position, 1);
-    vec3 at = vec3(dot(to_image[0], p), dot(to_image[1], p), dot(to_image[2], p));
-    lit = vec3(dot(to_map[0], p), dot(to_map[1], p), dot(to_map[2], p));
-    facing = turn * normal;
-    place = uv;
-    base = colour;
-    far = at.z;
-    gl_Position = vec4((at.xy + 0.5 * at.z) / canvas * 2 - at.z, at.z * 1.0004 - 0.20004, at.z);
-}"""
 SHADED = """
 uniform sampler2DShadow shadow;
 uniform float map_size;
@@ -143,7 +109,42 @@ void shade(vec3 albedo, vec3 normal, vec3 lit, float far) {
     id = label;
 }
 """
-MESH_FRAGMENT = HEAD + SHADED + """
+MAP_VERTEX = """
+uniform vec4 to_map[3];
+uniform float map_size;
+in vec3 position;
+void main() {
+    vec4 p = vec4(position, 1);
+    vec2 at = (vec2(dot(to_map[0], p), dot(to_map[1], p)) + 0.5) / map_size * 2 - 1;
+    gl_Position = vec4(at, -dot(to_map[2], p) / 400, 1);
+}"""
+EMPTY = "void main() {}"
+VERTEX = """
+uniform vec4 to_image[3];
+uniform vec4 to_map[3];
+uniform mat3 turn;
+uniform vec3 tint;
+uniform vec2 canvas;
+in vec3 position;
+in vec3 normal;
+in vec2 uv;
+in vec3 colour;
+out vec3 facing;
+out vec2 place;
+out vec3 base;
+out vec3 lit;
+out float far;
+void main() {
+    vec4 p = vec4(position, 1);
+    vec3 at = vec3(dot(to_image[0], p), dot(to_image[1], p), dot(to_image[2], p));
+    lit = vec3(dot(to_map[0], p), dot(to_map[1], p), dot(to_map[2], p));
+    facing = turn * normal;
+    place = uv;
+    base = colour * tint;
+    far = at.z;
+    gl_Position = vec4((at.xy + 0.5 * at.z) / canvas * 2 - at.z, at.z * 1.0004 - 0.20004, at.z);
+}"""
+MESH_FRAGMENT = """
 uniform sampler2D panes;
 uniform bool textured;
 in vec3 facing;
@@ -156,7 +157,7 @@ void main() {
     if (textured) albedo *= texture(panes, place).rgb;
     shade(albedo, facing, lit, far);
 }"""
-GROUND_VERTEX = HEAD + """
+GROUND_VERTEX = """
 uniform mat3 to_image;
 uniform vec3 eye;
 uniform vec4 to_map[3];
@@ -173,7 +174,7 @@ void main() {
     far = at.z;
     gl_Position = vec4((at.xy + 0.5 * at.z) / canvas * 2 - at.z, at.z * 1.0004 - 0.20004, at.z);
 }"""
-GROUND_FRAGMENT = HEAD + SHADED + """
+GROUND_FRAGMENT = """
 uniform float edges[6];
 uniform int choice[7];
 uniform sampler2DArray surfaces;
@@ -186,11 +187,11 @@ void main() {
     vec3 albedo = texture(surfaces, vec3(-where.y / 4, where.x / 4, choice[strip])).rgb;
     shade(albedo, vec3(0, 0, 1), lit, far);
 }"""
-SKY_VERTEX = HEAD + """
+SKY_VERTEX = """
 in vec2 position;
 out vec2 at;
 void main() { at = position; gl_Position = vec4(position, 0.999999, 1); }"""
-SKY_FRAGMENT = HEAD + """
+SKY_FRAGMENT = """
 uniform vec2 canvas;
 uniform vec3 lens;
 uniform vec3 zenith;
@@ -229,10 +230,9 @@ class Peer:
         self.map_buffer = context.framebuffer(depth_attachment=self.map)
         image, ids = context.renderbuffer((width, height), 3), context.renderbuffer((width, height), 1, dtype="i2")
         self.buffer = context.framebuffer([image, ids], context.depth_renderbuffer((width, height)))
-        self.draw = context.program(vertex_shader=VERTEX, fragment_shader=MESH_FRAGMENT)
-        self.cast = context.program(vertex_shader=MAP_VERTEX, fragment_shader=EMPTY)
-        self.ground = context.program(vertex_shader=GROUND_VERTEX, fragment_shader=GROUND_FRAGMENT)
-        self.sky = context.program(vertex_shader=SKY_VERTEX, fragment_shader=SKY_FRAGMENT)
+        self.draw, self.cast = self._program(VERTEX, SHADED + MESH_FRAGMENT), self._program(MAP_VERTEX, EMPTY)
+        self.ground = self._program(GROUND_VERTEX, SHADED + GROUND_FRAGMENT)
+        self.sky = self._program(SKY_VERTEX, SKY_FRAGMENT)
         horizon = tuple(light.horizon[0].tolist())
         for program in (self.draw, self.ground):
             program["map_size"], program["canvas"] = map_size, (width, height)
@@ -251,6 +251,9 @@ class Peer:
         rows = sight.sun * per_metre[:, :, None]
         self.ground_map = np.concatenate([rows, on_map[:, :, :1] - rows @ sight.eye[:, :, None]], 2).astype("f4")
         self._meshes(layer.meshes, world.ground.surfaces)
+
+    def _program(self, vertex: str, fragment: str):
+        return self.context.program(vertex_shader=HEAD + vertex, fragment_shader=HEAD + fragment)
 
     def _meshes(self, meshes, surfaces):
         self.drawn, self.casting, self.panes = [], [], []
@@ -303,6 +306,7 @@ class Peer:
                 self.draw["to_image"].write(self.real[k, tables.TO_IMAGE : tables.TO_IMAGE + 12])
                 self.draw["to_map"].write(self.real[k, tables.TO_MAP : tables.TO_MAP + 12])
                 self.draw["turn"], self.draw["label"] = (cos, sin, 0, -sin, cos, 0, 0, 0, 1), int(node) + 1
+                self.draw["tint"].write(self.real[k, tables.TINT : tables.TINT + 3])
                 self.draw["textured"] = panes is not None if (panes := self.panes[mesh[k]]) else False
                 if panes:
                     panes.use(1)
@@ -341,7 +345,7 @@ def least(runs: dict[str, Callable], repeats: int, scenes: int) -> dict[str, flo
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=16)
+    parser.add_argument("--scenes", type=int, default=32)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--pictures", help="a folder for the first scene as both draw it")

@@ -69,7 +69,7 @@ def record_triangle(
         if faces[face + atlas.TINTED] != 0:
             colour *= ti.cast(real[s + tables.TINT + channel], f32)
         records[r + shading.RGB + channel] = colour
-    marks[m + shading.LABEL] = ti.cast(whole[k * tables.INTEGERS + tables.NODE], i32) + 1
+    marks[m + shading.LABEL] = ti.cast(whole[k * tables.INTEGERS + tables.NODE] + 1, i32)
     marks[m + shading.CLASS] = ti.cast(whole[k * tables.INTEGERS + tables.SEMANTIC], i32)
     marks[m + shading.IMAGE], marks[m + shading.VARIES] = texture, ti.cast(varies, i32)
 
@@ -139,18 +139,18 @@ def draw_instance(
                 scale = f64(1.0) / a.dot(p)
                 p, q, o = p * scale, q * scale, o * scale
                 w = p + q + o
-                last += 1
+                last += i32(1)
                 record_triangle(
                     k, t * atlas.FACE, record_base + last * shading.RECORD, mark_base + last * shading.MARKS,
                     ti.cast(ti.min(column, width - 1), f64), ti.cast(ti.min(row, height - 1), f64), p, q, o,
                     whole, real, faces, records, marks,
                 )  # fmt: skip
-                for piece in range(ti.select(behind == 1, 2, 1)):
+                for piece in range(ti.select(behind == 1, i32(2), i32(1))):
                     if piece == 1:
                         u1, v1, u2, v2 = u2, v2, u3, v3
-                    for zoom in range(1, zooms + 1):
+                    for zoom in range(i32(1), zooms + i32(1)):
                         by, shift = ti.cast(zoom, f64), 0.5 * ti.cast(zoom - 1, f64)
-                        stamped = ti.select(zoom == 1, mark, 0)
+                        stamped = ti.select(zoom == 1, mark, i32(0))
                         area += fill(
                             u0 * by + shift, v0 * by + shift, u1 * by + shift, v1 * by + shift, u2 * by + shift,
                             v2 * by + shift, w[2] - (w[0] + w[1]) * shift / by, w[0] / by, w[1] / by, last, stamped,
@@ -191,5 +191,5 @@ def lay_ground(
         records[r + shading.PLANE_UP] = f32(1.0)
         for channel in ti.static(range(3)):
             records[r + shading.RGB + channel] = f32(1.0)
-        marks[m + shading.LABEL], marks[m + shading.CLASS] = 0, strip[at + 1]
-        marks[m + shading.IMAGE], marks[m + shading.VARIES] = strip[at], 0
+        marks[m + shading.LABEL], marks[m + shading.CLASS] = i32(0), strip[at + 1]
+        marks[m + shading.IMAGE], marks[m + shading.VARIES] = strip[at], i32(0)

@@ -35,14 +35,16 @@ class MeshAtlas:
     def _clear(self) -> None:
         self._meshes: WeakKeyDictionary[Mesh, int] = WeakKeyDictionary()
         self._surfaces: WeakKeyDictionary[Surface, int] = WeakKeyDictionary()
+        self._covers = 0  # surfaces that were ever added
         self._rows, self._bounds = np.zeros((0, 6), np.int64), np.zeros((0, 2, 3))
         self.positions, self.corners = np.zeros(3, np.float32), np.zeros(3, np.int32)  # Taichi takes no empty array
         self.faces = np.zeros(FACE, np.float32)
         self.textures = TextureAtlas()
 
     def trim(self) -> None:
-        """Forget everything once it has grown large; to be called between worlds."""
-        if self.corners.size > 3 * _FACES or self.textures.texels.size > _TEXELS:
+        """Forget everything once it has grown large or most of it is gone; to be called between worlds."""
+        packed, living = len(self._rows) + self._covers, len(self._meshes) + len(self._surfaces)
+        if self.corners.size > 3 * _FACES or self.textures.texels.size > _TEXELS or packed > 2 * living:
             self._clear()
 
     def add(self, meshes: list[Mesh], surfaces: list[Surface]) -> None:
@@ -54,6 +56,7 @@ class MeshAtlas:
         meshes = [mesh for mesh in dict.fromkeys(meshes) if mesh not in self._meshes]
         surfaces = [surface for surface in dict.fromkeys(surfaces) if surface not in self._surfaces]
         self._surfaces.update(zip(surfaces, self.textures.add([surface.texture for surface in surfaces]), strict=True))
+        self._covers += len(surfaces)
         if not meshes:
             return
         textured = [mesh for mesh in meshes if mesh.texture is not None]

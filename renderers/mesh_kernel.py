@@ -23,9 +23,9 @@ def record_of(word: u64):
 @ti.func
 def run_end(x: i32, width: i32, line: i32, record: i32, seen: ti.template()):
     """The first column after ``x`` of another record."""
-    end = x + 1
+    end = x + i32(1)
     while end < width and record_of(seen[line + end]) == record:
-        end += 1
+        end += i32(1)
     return end
 
 
@@ -57,7 +57,7 @@ def label_run(
         result[t + tables.BOX] = ti.min(result[t + tables.BOX], x)
         result[t + tables.BOX + 1] = ti.min(result[t + tables.BOX + 1], row)
         result[t + tables.BOX + 2] = ti.max(result[t + tables.BOX + 2], end)
-        result[t + tables.BOX + 3] = row + 1
+        result[t + tables.BOX + 3] = row + i32(1)
         result[t + tables.PIXELS] = result[t + tables.PIXELS] + end - x
 
 
@@ -133,14 +133,14 @@ def render(
             map_base, corner_base = worker * map_size * map_size, worker * most_vertices * 5
             record_base, mark_base = worker * most_records * shading.RECORD, worker * most_records * shading.MARKS
             line_base = worker * width * 3
-            scene = ti.atomic_add(queue[0], 1)
+            scene = ti.atomic_add(queue[0], i32(1))
             while scene < scenes:
                 laid = ti.select(scene_table[scene * tables.SCENE + tables.GROUNDED] != 0, strips, 0)
                 lay_ground(
                     scene, laid, record_base, mark_base, 0.5 * ti.cast(width, f64), 0.5 * ti.cast(height, f64),
                     scene_table, strip, tiles, records, marks,
                 )  # fmt: skip
-                for zoom in range(1, ti.static(3 if fine else 2)):
+                for zoom in range(i32(1), i32(ti.static(3 if fine else 2))):
                     fill_ground(
                         scene, laid, height * zoom, width * zoom, base + (zoom - 1) * pixels,
                         1 / ti.cast(zoom, f64), -0.25 * ti.cast(zoom - 1, f64), scene_table, edges, seen,
@@ -149,9 +149,9 @@ def render(
                 for k in range(first[scene], first[scene + 1]):
                     node = ti.cast(whole[k * tables.INTEGERS + tables.NODE], i32)
                     if node < 0:
-                        mark = 0
+                        mark = i32(0)
                     elif node != marked:
-                        mark, marked = k + 1, node
+                        mark, marked = k + i32(1), node
                     if node >= 0 or whole[k * tables.INTEGERS + tables.SEEN] != 0:
                         target = ti.select(node < 0, -1, scene * nodes + node)
                         last, area = draw_instance(
@@ -175,7 +175,7 @@ def render(
                     pixel, line_at = row * width, base + row * width
                     out, x, v = scene * pixels + pixel, i32(0), ti.cast(row, f32)
                     if ti.static(fine):
-                        fine_at, tap = base + pixels + 4 * pixel, i32(0)
+                        fine_at, tap = base + pixels + i32(4) * pixel, i32(0)
                         label_row(
                             out, row, scene * nodes, width, line_at, mark_base, seen, marks, instance, semantic, depth,
                             result,
@@ -185,16 +185,16 @@ def render(
                             u, share = ti.cast(x, f32), f32(1.0)
                             v = ti.cast(row, f32)
                             while tap == 0 and end < width and even(end, line_at, fine_at, width, record, seen):
-                                end += 1
+                                end += i32(1)
                             if end == x:  # its four samples, one after another
-                                across, down = tap & 1, tap >> 1
-                                at = fine_at + 2 * x + across + down * 2 * width
+                                across, down = tap & i32(1), tap >> 1
+                                at = fine_at + x + x + across + down * (width + width)
                                 record, share = record_of(seen[at]), f32(0.25)
                                 u += f32(0.5) * ti.cast(across, f32) - f32(0.25)
                                 v += f32(0.5) * ti.cast(down, f32) - f32(0.25)
-                                tap = (tap + 1) & 3
+                                tap = (tap + i32(1)) & i32(3)
                                 end = x + ti.cast(tap == 0, i32)
-                            count = ti.max(end - x, 1)
+                            count = ti.max(end - x, i32(1))
                             if record == 0:
                                 shading.shade_sky(
                                     x, count, u, v, share, pixel, out, light, seeds[scene], line_base, True, line,
@@ -233,4 +233,4 @@ def render(
                                     shadow, opened, records, marks, textures, texels, line, image, depth,
                                 )  # fmt: skip
                             x = end
-                scene = ti.atomic_add(queue[0], 1)
+                scene = ti.atomic_add(queue[0], i32(1))

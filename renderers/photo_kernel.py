@@ -6,6 +6,7 @@ from probscene.renderers.raster_kernel import high, low
 
 i32, i64, u32, u64, f32 = ti.i32, ti.i64, ti.u32, ti.u64, ti.f32
 
+
 @ti.func
 def scatter(seed: i64, pixel: i32):
     """64 bits of an image's pixel (a mix after Steele, Lea and Flood 2014)."""

@@ -84,7 +84,7 @@ def fill(
             for column in range(first, last):
                 if stamp[stamps + column] != mark:
                     stamp[stamps + column] = mark
-                    area += 1
+                    area += i32(1)
     return area
 
 
@@ -125,7 +125,7 @@ def fill_ground(
         if strips > 0:
             first, last = beyond(0, width, -ray_z, -z_u)
             first, last = beyond(first, last, eye_z / tables.NEAR + ray_z, z_u)
-        for column in range(0, first):
+        for column in range(i32(0), first):
             seen[line + column] = u64(0)
         for column in range(ti.max(last, first), width):
             seen[line + column] = u64(0)

@@ -88,7 +88,7 @@ def shade(
     tall = f32(1.0) + tall * tall
     table_row, texel_width, texel_height = i32(0), f32(1.0), f32(1.0)
     if texture >= 0:
-        table_row = texture * COLUMNS
+        table_row = texture * i32(COLUMNS)
         texel_width, texel_height = ti.cast(table[table_row + WIDTH], f32), ti.cast(table[table_row + HEIGHT], f32)
     begin, block = i32(0), ti.cast(light[BLOCK], i32)
     while begin < count:
@@ -108,11 +108,11 @@ def shade(
             step_t = high(ti.abs(t_u - t * w_u), ti.abs(t_v - t * w_v)) * z
             across = level(step_s * texel_width, table[table_row + LEVELS_X])
             along = level(step_t * texel_height, table[table_row + LEVELS_Y])
-            width = ti.max(table[table_row + WIDTH] >> across, 1)
-            height = ti.max(table[table_row + HEIGHT] >> along, 1)
-            texels_at, stride = table[table_row + AT + along * LEVELS + across], width + 2
-            most_u, most_v = width * 256 + 255, height * 256 + 255
-            size_u, size_v = ti.cast(width * 256, f32), ti.cast(height * 256, f32)
+            width = ti.max(table[table_row + WIDTH] >> across, i32(1))
+            height = ti.max(table[table_row + HEIGHT] >> along, i32(1))
+            texels_at, stride = table[table_row + AT + along * LEVELS + across], width + i32(2)
+            most_u, most_v = (width << 8) + i32(255), (height << 8) + i32(255)
+            size_u, size_v = ti.cast(width << 8, f32), ti.cast(height << 8, f32)
         for i in range(begin, end):
             step = ti.cast(i, f32)
             column, x = u + step, left + step

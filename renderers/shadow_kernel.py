@@ -9,6 +9,7 @@ from probscene.renderers.raster_kernel import by_height, columns, high, low, up
 from probscene.renderers.vertex_kernel import CORNER, transform, vertex
 
 NOTHING = -1e30
+TILE = 4  # bits of a tile's width
 SLACK, STEEPEST = 0.02, 1.0  # metres by which a shadow keeps off what casts it: always, and at most for the slope
 
 i32, f32, f64 = ti.i32, ti.f32, ti.f64
@@ -17,7 +18,7 @@ i32, f32, f64 = ti.i32, ti.f32, ti.f64
 @ti.func
 def tile_at(column: i32, row: i32, base: i32, size: i32):
     """The tile of the shadow map that a texel lies in; ``base`` is the map's."""
-    return (base >> 8) + (row >> 4) * (size >> 4) + (column >> 4)
+    return (base >> 2 * TILE) + (row >> TILE) * (size >> TILE) + (column >> TILE)
 
 
 @ti.func
@@ -28,15 +29,17 @@ def open_tiles(k: i32, mark: i32, size: i32, base: i32, whole: ti.template(), sh
     Where no tile is opened nothing casts a shadow, and the map is never read.
     """
     at = k * tables.INTEGERS + tables.MAP_BOX
-    left, top = ti.cast(whole[at], i32) >> 4, ti.cast(whole[at + 1], i32) >> 4
-    right, bottom = ti.cast(whole[at + 2], i32) >> 4, ti.cast(whole[at + 3], i32) >> 4
-    for row in range(top, bottom + 1):
-        for column in range(left, right + 1):
-            tile = tile_at(column * 16, row * 16, base, size)
+    left, top = ti.cast(whole[at], i32) >> TILE, ti.cast(whole[at + 1], i32) >> TILE
+    right, bottom = ti.cast(whole[at + 2], i32) >> TILE, ti.cast(whole[at + 3], i32) >> TILE
+    for row in range(top, bottom + i32(1)):
+        for column in range(left, right + i32(1)):
+            tile = tile_at(column << TILE, row << TILE, base, size)
             if opened[tile] != mark:
                 opened[tile] = mark
-                for y in range(row * 16, ti.min(row * 16 + 17, size)):
-                    for x in range(base + y * size + column * 16, base + y * size + ti.min(column * 16 + 17, size)):
+                from_x, from_y = column << TILE, row << TILE
+                to_x, to_y = ti.min(from_x + i32(17), size), ti.min(from_y + i32(17), size)
+                for y in range(from_y, to_y):
+                    for x in range(base + y * size + from_x, base + y * size + to_x):
                         shadow[x] = f32(NOTHING)
 
 

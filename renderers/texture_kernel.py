@@ -4,6 +4,7 @@ from probscene.renderers.engine import ti
 
 i32, i64, u64, f32 = ti.i32, ti.i64, ti.u64, ti.f32
 
+
 @ti.func
 def level(texels: f32, levels: i32):
     """The level at which steps of so many texels are nearest to one, on a scale of logarithms."""

@@ -1,16 +1,24 @@
 """Laws of the mesh renderer, against its numpy twin and against itself."""
 
+import resource
+import subprocess
+import sys
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from probscene.errors import ModelError
+from probscene.renderers import meshes as meshes_module
 from probscene.renderers.mesh_reference import MeshReference
 from probscene.renderers.meshes import MeshRenderer
 from probscene.world import Camera, Light, Meshes, Photo
 
 CANVAS = (40, 66)
-RENDERER = MeshRenderer(CANVAS, threads=1)
+RENDERER, SMOOTH = (MeshRenderer(CANVAS, threads=1, samples=samples) for samples in (1, 4))
 
 
 def random_world(shapes, seed, sun=True, lying=True):
@@ -45,9 +53,7 @@ def random_world(shapes, seed, sun=True, lying=True):
     light = Light(
         uniform(-3, 3, number, 1), uniform(0.3, 1.4, number, 1), 0.6 if sun else 0.0, haze=uniform(0, 0.03, number, 1)
     )
-    photo = Photo(
-        *(uniform(0.7, 1.3, number, 1) for _ in range(3)), noise=uniform(0, 9, number, 1), seed=seed % 1000
-    )
+    photo = Photo(*(uniform(0.7, 1.3, number, 1) for _ in range(3)), noise=uniform(0, 9, number, 1), seed=seed % 1000)
     layers = [
         layer("car", nodes, present=some(nodes)),
         layer("car", nodes, present=some(nodes) & some(nodes), labelled=bool(generator.integers(0, 2))),
@@ -65,7 +71,7 @@ def test_agrees_with_the_numpy_twin(shapes, seed, lying):
     ours, twin = RENDERER(world), MeshReference(CANVAS)(world)
     agrees(ours, twin)
     apart = (ours.image.int() - twin.image.int()).abs().amax(1)
-    assert (apart > 3).float().mean() < 0.01
+    assert (apart > 3).float().mean() < 1e-3
 
 
 def agrees(ours, twin):
@@ -78,8 +84,190 @@ def agrees(ours, twin):
     deep, depth = ours.space.depth[same], twin.space.depth[same]
     close = torch.isclose(deep, depth, rtol=1e-3)
     assert (~close).float().mean() <= 1e-3
-    assert (ours.pixels - twin.pixels).abs().max() <= 3 and (ours.box - twin.box).abs().max() <= 40
+    if same.all():
+        assert torch.equal(ours.pixels, twin.pixels) and torch.equal(ours.box, twin.box)
+        torch.testing.assert_close(ours.visible, twin.visible, rtol=0, atol=0.02)
     torch.testing.assert_close(ours.amodal_box, twin.amodal_box, rtol=1e-4, atol=1e-2)
     torch.testing.assert_close(ours.space.truncated, twin.space.truncated, rtol=0, atol=1e-3)
     torch.testing.assert_close(ours.space.box, twin.space.box, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(ours.space.intrinsics, twin.space.intrinsics)
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 2**32 - 1))
+def test_shadows_are_where_rays_to_the_sun_are_stopped(shapes, seed):
+    world = random_world(shapes, seed)
+    ours, twin = RENDERER(world), MeshReference(CANVAS)(world)
+    agrees(ours, twin)
+    apart = (ours.image.int() - twin.image.int()).abs().amax(1)
+    assert (apart > 12).float().mean() < 0.03  # the map's texels are not rays
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 2**32 - 1))
+def test_four_samples_are_the_mean_of_four_rays_and_leave_labels_alone(shapes, seed):
+    world = random_world(shapes, seed, sun=False)
+    smooth, plain = SMOOTH(world), RENDERER(world)
+    assert shapes.same(smooth._replace(image=plain.image), plain)
+    apart = (smooth.image.int() - MeshReference(CANVAS, 4)(world).image.int()).abs().amax(1)
+    assert (apart > 8).float().mean() < 0.03  # where all four see one triangle, it is shaded once
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 3), st.sampled_from([1, 4]))
+def test_same_bytes_for_any_threads_and_any_batch(shapes, seed, cut, samples):
+    world = random_world(shapes, seed)
+    batch = (RENDERER if samples == 1 else SMOOTH)(world)
+    assert shapes.same(batch, MeshRenderer(CANVAS, threads=2, samples=samples)(world))
+    for part in (slice(0, cut), slice(cut, None), slice(cut, cut + 1)):
+        again = (RENDERER if samples == 1 else SMOOTH)(world[part])
+        space = batch.space._replace(**{k: v[part] for k, v in batch.space._asdict().items() if k != "names"})
+        assert shapes.same(batch.__class__(*(tensor[part] for tensor in batch[:-1]), space), again)
+
+
+def many(shapes, number: int):
+    """Worlds of two boxes, no two alike."""
+    generator = np.random.default_rng(0)
+    kind = torch.zeros(number, 2, dtype=torch.int64)
+    x, y = (torch.from_numpy(generator.uniform(*limits, kind.shape)) for limits in ((5, 20), (-3, 3)))
+    boxes = Meshes("car", (shapes.box(2, 1, 1),), 0, x, y)
+    return shapes.world(boxes, kind=kind, ground=shapes.road(), camera=Camera.kitti(CANVAS))
+
+
+def test_same_bytes_for_several_launches(shapes, monkeypatch):
+    world = many(shapes, 150)  # more than one launch has
+    batch = RENDERER(world)
+    assert batch.pixels.gt(0).any(1).float().mean() > 0.9
+    for name in ("_SCENES", "_CHUNK"):
+        monkeypatch.setattr(meshes_module, name, 1)
+        assert shapes.same(batch, MeshRenderer(CANVAS, threads=2)(world))
+
+
+def test_nothing_is_left_of_the_world_before(shapes, monkeypatch):
+    worlds = [random_world(shapes, seed) for seed in (3, 4, 5)]
+    batches = [RENDERER(world) for world in worlds]
+    renderer = MeshRenderer(CANVAS, threads=1)
+    assert all(shapes.same(renderer(worlds[i]), batches[i]) for i in (0, 2, 1, 0))
+    monkeypatch.setattr("probscene.renderers.mesh_atlas._FACES", 0)  # forget the meshes at every call
+    renderer = MeshRenderer(CANVAS, threads=1)
+    assert all(shapes.same(renderer(worlds[i]), batches[i]) for i in (0, 2, 1, 0))
+
+
+def test_the_batch_owns_its_memory(shapes):
+    world = many(shapes, 2)
+    first = RENDERER(world)
+    kept = first.image.clone()
+    RENDERER(random_world(shapes, 1)).image.zero_()
+    assert torch.equal(first.image, kept)
+
+
+def test_memory_stays_flat(shapes):
+    """Meshes, textures and worlds of their own at each call."""
+    renderer = MeshRenderer(CANVAS, threads=1)
+    for i in range(320):
+        renderer(many(shapes, 8))
+        if i == 20:
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 30_000  # kB
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (2, 0), (2, 1)])
+@pytest.mark.parametrize("layers", [0, 1])
+@pytest.mark.parametrize("samples", [1, 4])
+def test_empty_worlds(shapes, shape, layers, samples):
+    nothing = torch.zeros(shape, dtype=torch.bool)
+    layer = Meshes("car", (shapes.box(1, 1, 1),), 0, 5.0, 0.0)
+    for ground in (None, shapes.road()):
+        world = shapes.world(*(layer,) * layers, kind=torch.full(shape, -1), present=nothing, ground=ground)
+        batch = MeshRenderer(CANVAS, 1, samples)(world)
+        assert batch.image.shape == (shape[0], 3, *CANVAS) and not batch.instance.any()
+        assert batch.box.shape == batch.amodal_box.shape == (*shape, 4) and batch.space.box.shape == (*shape, 7)
+        assert (batch.kind == -1).all() and not batch.visible.any() and not batch.space.truncated.any()
+        assert ground is not None or torch.isinf(batch.space.depth).all()
+
+
+def test_what_is_behind_the_camera_has_an_empty_label(shapes):
+    world = shapes.world(Meshes("car", (shapes.box(2, 1, 1),), 0, -9.0, 0.0))
+    batch = RENDERER(world)
+    assert batch.kind.item() == 0 and batch.pixels.item() == 0 and batch.visible.item() == 0
+    assert not batch.box.any() and not batch.amodal_box.any() and batch.space.truncated.item() == 0
+    assert batch.space.box[0, 0].tolist() == pytest.approx([1, 1, 2, 0, 1.65, -9, -np.pi / 2])
+
+
+def test_the_last_of_very_many_nodes_has_its_id(shapes):
+    present = torch.zeros(1, 32767, dtype=torch.bool)
+    present[0, -1] = True
+    kind = torch.zeros(1, 32767, dtype=torch.int64)
+    camera = Camera.kitti(CANVAS)
+    wall = Meshes("car", (shapes.box(1, 9, 9),), 0, 8.0, 0.0)
+    batch = RENDERER(shapes.world(wall, kind=kind, present=present, camera=camera))
+    assert batch.instance[0, 10, 30] == 32767 and batch.pixels[0, -1] > 0
+    with pytest.raises(ModelError, match="32767 nodes"):
+        RENDERER(shapes.world(kind=torch.zeros(1, 32768, dtype=torch.int64)))
+
+
+def test_more_meshes_or_triangles_than_there_may_be_are_named(shapes, monkeypatch):
+    dots = Meshes(
+        (), (shapes.box(1, 1, 1),), 0, 50.0, 0.0, present=torch.ones(1, 65536, dtype=torch.bool), labelled=False
+    )
+    with pytest.raises(ModelError, match="at most 65535 meshes in a scene, actual 65536"):
+        RENDERER(shapes.world(dots))
+    monkeypatch.setattr(meshes_module, "_MOST_TRIANGLES", 23)
+    with pytest.raises(ModelError, match="at most 23 triangles in sight of a scene, actual 24"):
+        RENDERER(many(shapes, 1))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("x", float("nan"), "finite x"),
+        ("yaw", float("inf"), "finite yaw"),
+        ("y", 2e6, "y within 1e\\+06 m, actual 2e\\+06"),
+        ("scale", 0.0, "actual 0; bound"),
+        ("scale", 1e9, "at most 10000 in a world, actual 1e\\+09"),
+        ("mesh", 3, r"meshes of layer 0 in 0\.\.0, actual 3\.\.3"),
+    ],
+)
+def test_what_cannot_be_rendered_is_named(shapes, field, value, message):
+    world = shapes.world(Meshes("car", (shapes.box(1, 1, 1),), 0, 9.0, 0.0))
+    (layer,) = world.layers
+    broken = replace(layer, **{field: torch.full_like(getattr(layer, field), value)})
+    with pytest.raises(ModelError, match=message):
+        RENDERER(replace(world, layers=(broken,)))
+    absent = replace(broken, present=torch.zeros(1, 1, dtype=torch.bool))
+    assert not RENDERER(replace(world, layers=(absent,))).instance.any()
+
+
+def test_worlds_that_cannot_be_are_named(shapes):
+    world = shapes.world(Meshes("car", (shapes.box(1, 1, 1),), 0, 9.0, 0.0))
+    with pytest.raises(ModelError, match="layer 0 as"):
+        RENDERER(replace(world, kind=torch.zeros(1, 2, dtype=torch.int64)))
+    with pytest.raises(ModelError, match="positive focal length"):
+        RENDERER(replace(world, camera=replace(world.camera, focal=torch.tensor([-1.0]))))
+    with pytest.raises(ModelError, match="finite cameras"):
+        RENDERER(replace(world, camera=replace(world.camera, yaw=torch.tensor([np.inf]))))
+    with pytest.raises(ModelError, match="at most 256 classes"):
+        RENDERER(replace(world, kinds=tuple(map(str, range(300)))))
+
+
+@pytest.mark.parametrize(
+    "options", [((0, 5), 1), ((5, -1), 1), ((1 << 13, 1 << 12), 1), ((5, 5), 0), ((5, 5), 1, 2), ((5, 5), 1, 16)]
+)
+def test_renderers_that_cannot_be_are_named(options):
+    with pytest.raises(ModelError, match="Expected"):
+        MeshRenderer(*options)
+
+
+def test_a_users_own_taichi_is_left_alone():
+    code = """
+import torch
+from probscene.renderers import engine
+from probscene.renderers.meshes import MeshRenderer
+from probscene.world import Camera, Light, Photo, World, resolve_scene
+engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)
+parts = {k: resolve_scene(v, 1) for k, v in dict(camera=Camera(), light=Light(), photo=Photo()).items()}
+batch = MeshRenderer((20, 20), threads=1)(World(torch.zeros(1, 0, dtype=torch.int64), (), (), ground=None, **parts))
+assert batch.image.float().mean() > 100
+"""
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
