@@ -13,6 +13,8 @@ from probscene.renderers.engine import ti
 from probscene.renderers.raster_kernel import fill, high, low, up
 from probscene.renderers.vertex_kernel import CORNER, transform, vertex
 
+STEEPEST = 1.0  # metres; see record_triangle
+
 i32, f32, f64 = ti.i32, ti.f32, ti.f64
 
 
@@ -43,22 +45,29 @@ def put_plane(at: i32, plane, u: f64, v: f64, records: ti.template()):
 
 @ti.func
 def record_triangle(
-    k: i32, face: i32, r: i32, m: i32, from_u: f64, from_v: f64, p, q, o,
+    k: i32, face: i32, r: i32, m: i32, from_u: f64, from_v: f64, texel: f64, p, q, o,
     whole: ti.template(), real: ti.template(), faces: ti.template(), records: ti.template(), marks: ti.template(),
 ):  # fmt: skip
-    """What shading needs of a triangle; ``p, q, o`` are the planes of its corners' shares, over depth."""
+    """What shading needs of a triangle; ``p, q, o`` are the planes of its corners' shares, over depth.
+
+    Light finds it nearer to the sun by as much as it rises over a texel of the shadow map, lest it shade itself.
+    """
     s, w, texture = k * tables.REALS, p + q + o, ti.cast(whole[k * tables.INTEGERS + tables.TEXTURE], i32)
     records[r + shading.FROM_U], records[r + shading.FROM_V] = ti.cast(from_u, f32), ti.cast(from_v, f32)
     records[r + shading.W_U], records[r + shading.W_V] = ti.cast(w[0], f32), ti.cast(w[1], f32)
     sun0, up0 = cosines(face + atlas.NORMAL, s, real, faces)
-    varies = faces[face + atlas.SMOOTH] != 0
+    varies, least = faces[face + atlas.SMOOTH] != 0, sun0
     if varies:
         sun1, up1 = cosines(face + atlas.NORMAL + 3, s, real, faces)
         sun2, up2 = cosines(face + atlas.NORMAL + 6, s, real, faces)
+        least = low(sun0, low(sun1, sun2))
         put_plane(r + shading.PLANE_SUN, p * sun0 + q * sun1 + o * sun2, from_u, from_v, records)
         put_plane(r + shading.PLANE_UP, p * up0 + q * up1 + o * up2, from_u, from_v, records)
     else:
         records[r + shading.PLANE_SUN], records[r + shading.PLANE_UP] = ti.cast(sun0, f32), ti.cast(up0, f32)
+    least = high(least, f64(0.01))
+    lift = texel * ti.sqrt(high(1 - least * least, f64(0.0))) / least
+    records[r + shading.LIFT] = ti.cast(low(lift, f64(STEEPEST)), f32)
     if texture >= 0:
         for axis in ti.static(range(2)):
             f = face + atlas.UV + axis
@@ -77,7 +86,7 @@ def record_triangle(
 @ti.func
 def draw_instance(
     k: i32, mark: i32, count: i32, node: i32, height: i32, width: i32, zooms: i32, base: i32, stamp_base: i32,
-    corner_base: i32, record_base: i32, mark_base: i32,
+    corner_base: i32, record_base: i32, mark_base: i32, texel: f64,
     whole: ti.template(), real: ti.template(), positions: ti.template(), triangles: ti.template(),
     faces: ti.template(), seen: ti.template(), stamp: ti.template(), corners: ti.template(), records: ti.template(),
     marks: ti.template(), extent: ti.template(),
@@ -142,7 +151,8 @@ def draw_instance(
                 last += i32(1)
                 record_triangle(
                     k, t * atlas.FACE, record_base + last * shading.RECORD, mark_base + last * shading.MARKS,
-                    ti.cast(ti.min(column, width - 1), f64), ti.cast(ti.min(row, height - 1), f64), p, q, o,
+                    ti.cast(ti.min(column, width - 1), f64), ti.cast(ti.min(row, height - 1), f64), texel,
+                    p, q, o,
                     whole, real, faces, records, marks,
                 )  # fmt: skip
                 for piece in range(ti.select(behind == 1, i32(2), i32(1))):
@@ -188,7 +198,7 @@ def lay_ground(
         put_plane(r + shading.PLANE_S, across / -tiles[at + 1], middle_u, middle_v, records)
         put_plane(r + shading.PLANE_T, along / tiles[at], middle_u, middle_v, records)
         records[r + shading.PLANE_SUN] = ti.cast(scenes[s + tables.SUN_UP], f32)
-        records[r + shading.PLANE_UP] = f32(1.0)
+        records[r + shading.PLANE_UP], records[r + shading.LIFT] = f32(1.0), f32(0.0)
         for channel in ti.static(range(3)):
             records[r + shading.RGB + channel] = f32(1.0)
         marks[m + shading.LABEL], marks[m + shading.CLASS] = i32(0), strip[at + 1]

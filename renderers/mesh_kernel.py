@@ -145,6 +145,7 @@ def render(
                         scene, laid, height * zoom, width * zoom, base + (zoom - 1) * pixels,
                         1 / ti.cast(zoom, f64), -0.25 * ti.cast(zoom - 1, f64), scene_table, edges, seen,
                     )  # fmt: skip
+                texel = scene_table[scene * tables.SCENE + tables.TEXEL]
                 last, mark, marked = laid, i32(0), i32(-1)
                 for k in range(first[scene], first[scene + 1]):
                     node = ti.cast(whole[k * tables.INTEGERS + tables.NODE], i32)
@@ -156,8 +157,8 @@ def render(
                         target = ti.select(node < 0, -1, scene * nodes + node)
                         last, area = draw_instance(
                             k, mark, last, target, height, width, ti.static(2 if fine else 1), base, stamp_base,
-                            corner_base, record_base, mark_base, whole, real, positions, triangles, faces, seen,
-                            stamp, corners, records, marks, extent,
+                            corner_base, record_base, mark_base, texel, whole, real, positions, triangles, faces,
+                            seen, stamp, corners, records, marks, extent,
                         )  # fmt: skip
                         if node >= 0:
                             total = target * tables.RESULTS + tables.WHOLE

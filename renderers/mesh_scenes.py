@@ -149,6 +149,7 @@ def scene_table(world: World, sight: View, shadow: tuple[np.ndarray, ...]) -> np
     lights[:, tables.MORE : tables.MORE + 3] = (zenith - horizon) * exposure[:, None]
     lights[:, tables.CLIMB : tables.CLIMB + 3] = sight.ray[:, 2]
     mapped, first, per_metre = shadow
+    rows[:, tables.TEXEL] = np.sqrt(1 / per_metre[:, 0] ** 2 + 1 / per_metre[:, 1] ** 2)
     lights[:, tables.SHADOWED] = mapped & (lights[:, tables.SUN] > 0)
     on_map = lights[:, tables.ON_MAP : tables.ON_MAP + 12].reshape(-1, 3, 4)
     on_map[:, :, 1:] = product(sight.sun, sight.ray)

@@ -15,7 +15,8 @@ TO_IMAGE, TO_MAP, TO_SUN, UNSCALE, TINT, REALS = 0, 12, 24, 27, 30, 33
 
 # One row a scene, float64. RAY: the world's x, y and z along a pixel's ray for each metre of depth, each a constant
 # and what a column and a row add; EYE: where the camera is; from LIGHT on, LIGHTS numbers of which shading needs all.
-RAY, EYE, GROUNDED, OFFSET, SUN_UP, LIGHT = 0, 9, 12, 13, 14, 15
+# TEXEL: metres from corner to corner of a texel of the shadow map.
+RAY, EYE, GROUNDED, OFFSET, SUN_UP, TEXEL, LIGHT = 0, 9, 12, 13, 14, 15, 16
 # Light is as the image shows it, exposure included. MORE: the zenith's colour less the horizon's; LENS: one over the
 # focal length and the principal point; ON_MAP: column, row and metres towards the sun on the shadow map, each of the
 # eye, and of the ray like RAY; CLIMB: z of RAY; BLOCK: pixels of a row that share what hardly changes.

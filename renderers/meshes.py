@@ -8,8 +8,8 @@ interpolated as they are, not to unit length. Textures are filtered bilinearly, 
 height apart. The ground's textures lie from x = ``offset`` and y = 0; it is seen from above only. Nothing nearer than
 0.1 m along the camera's z is seen. A sun below the horizon gives no light.
 
-Shadows fall within 60 m of the camera, or 36 times its height: texels of the map are about a decimetre wide there, and
-what casts a shadow keeps off it by as much.
+Shadows fall within 60 m of the camera, or 36 times its height; texels of the map are about a decimetre wide there, less
+where few things cast shadows.
 
 With four samples a pixel its colour is the mean of what they see; labels and depth are those of its middle, the same
 bytes as with one.

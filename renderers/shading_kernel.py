@@ -27,8 +27,10 @@ from probscene.renderers.texture_atlas import AT, COLUMNS, HEIGHT, LEVELS, LEVEL
 from probscene.renderers.texture_kernel import level, place, sample
 
 # A record: the pixel at which its planes start; planes over the image, each a value and what a column and a row add, of
-# both texture coordinates and of the cosines towards the sun and upward, divided by depth; 1/z's own steps; its colour.
-FROM_U, FROM_V, PLANE_S, PLANE_T, PLANE_SUN, PLANE_UP, W_U, W_V, RGB, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 19
+# both texture coordinates and of the cosines towards the sun and upward, divided by depth; 1/z's own steps; its colour;
+# metres by which it counts as nearer to the sun.
+FROM_U, FROM_V, PLANE_S, PLANE_T, PLANE_SUN, PLANE_UP = 0, 1, 2, 5, 8, 11
+W_U, W_V, RGB, LIFT, RECORD = 14, 15, 16, 19, 20
 # Its whole numbers: label or 0, class, texture or -1, whether the cosines vary.
 LABEL, CLASS, IMAGE, VARIES, MARKS = range(5)
 
@@ -80,7 +82,7 @@ def shade(
         up_u = records[r + PLANE_UP + 1]
         sun_row += records[r + PLANE_SUN + 2] * down
         up_row += records[r + PLANE_UP + 2] * down
-    w_u, w_v = records[r + W_U], records[r + W_V]
+    w_u, w_v, lift = records[r + W_U], records[r + W_V], records[r + LIFT] + light[ON_MAP + 8]
     red, green, blue = records[r + RGB], records[r + RGB + 1], records[r + RGB + 2]
     map_u, map_v = light[ON_MAP + 1] + light[ON_MAP + 3] * v, light[ON_MAP + 5] + light[ON_MAP + 7] * v
     map_d = light[ON_MAP + 9] + light[ON_MAP + 11] * v
@@ -126,7 +128,7 @@ def shade(
                 if light[SHADOWED] != 0:
                     map_x = light[ON_MAP] + z * (map_u + light[ON_MAP + 2] * column)
                     map_y = light[ON_MAP + 4] + z * (map_v + light[ON_MAP + 6] * column)
-                    near = light[ON_MAP + 8] + z * (map_d + light[ON_MAP + 10] * column)
+                    near = lift + z * (map_d + light[ON_MAP + 10] * column)
                     through = sunlit(map_x, map_y, near, map_size, map_base, mark, shadow, opened)
                 sky += light[SUN] * sun * through
             r0, g0, b0 = red * sky, green * sky, blue * sky

@@ -10,7 +10,7 @@ from probscene.renderers.vertex_kernel import CORNER, transform, vertex
 
 NOTHING = -1e30
 TILE = 4  # bits of a tile's width
-SLACK, STEEPEST = 0.02, 1.0  # metres by which a shadow keeps off what casts it: always, and at most for the slope
+SLACK = 0.02  # metres by which a shadow keeps off what casts it
 
 i32, f32, f64 = ti.i32, ti.f32, ti.f64
 
@@ -68,10 +68,7 @@ def cast_shadow(
     k: i32, size: i32, base: i32, corner_base: i32, whole: ti.template(), real: ti.template(),
     positions: ti.template(), triangles: ti.template(), shadow: ti.template(), corners: ti.template(),
 ):  # fmt: skip
-    """Draw an instance on the shadow map, each triangle pushed away from the sun by its slope.
-
-    Of a closed mesh those that face the sun will do.
-    """
+    """Draw an instance on the shadow map; of a closed mesh the triangles that face the sun will do."""
     transform(k, tables.TO_MAP, 0, corner_base, whole, real, positions, corners)
     first = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32)
     closed = whole[k * tables.INTEGERS + tables.CLOSED] != 0
@@ -87,8 +84,7 @@ def cast_shadow(
                 d_u = (one[2] * other[1] - one[1] * other[2]) / faces
                 d_v = (one[0] * other[2] - one[2] * other[0]) / faces
                 start = a[2] - d_u * a[0] - d_v * a[1]
-                start -= SLACK + ti.min(ti.abs(d_u) + ti.abs(d_v), STEEPEST)
-                fill_map(a[0], a[1], b[0], b[1], c[0], c[1], start, d_u, d_v, size, base, shadow)
+                fill_map(a[0], a[1], b[0], b[1], c[0], c[1], start - SLACK, d_u, d_v, size, base, shadow)
 
 
 @ti.func
