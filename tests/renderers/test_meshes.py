@@ -15,7 +15,7 @@ from probscene.errors import ModelError
 from probscene.renderers import meshes as meshes_module
 from probscene.renderers.mesh_reference import MeshReference
 from probscene.renderers.meshes import MeshRenderer
-from probscene.world import Camera, Light, Meshes, Photo
+from probscene.world import Camera, Light, Meshes, Photo, resolve_scene
 
 CANVAS = (40, 66)
 RENDERER, SMOOTH = (MeshRenderer(CANVAS, threads=1, samples=samples) for samples in (1, 4))
@@ -91,6 +91,22 @@ def agrees(ours, twin):
     torch.testing.assert_close(ours.space.truncated, twin.space.truncated, rtol=0, atol=1e-3)
     torch.testing.assert_close(ours.space.box, twin.space.box, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(ours.space.intrinsics, twin.space.intrinsics)
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_agrees_with_the_numpy_twin_through_a_longer_lens(shapes, seed, thick):
+    """Where what hardly changes is computed once for several pixels."""
+    canvas = (30, 150)
+    world = random_world(shapes, seed, sun=False)
+    haze = torch.full((len(world),), 0.1 if thick else 0.002)
+    parts = {"camera": Camera(600.0, 75.0, 12.0, pitch=0.03), "light": Light(sun=0.0)}
+    parts = {name: resolve_scene(part, len(world)) for name, part in parts.items()}
+    world = replace(world, camera=parts["camera"], light=replace(parts["light"], haze=haze))
+    ours, twin = MeshRenderer(canvas, threads=1)(world), MeshReference(canvas)(world)
+    agrees(ours, twin)
+    apart = (ours.image.int() - twin.image.int()).abs().amax(1)
+    assert (apart > 3).float().mean() < 0.01
 
 
 @settings(max_examples=12)
