@@ -108,7 +108,7 @@ class Light:
 
     Args:
         azimuth, elevation: of the sun, radians: from +x to the left, and above the horizon.
-        sun: its strength, 0 under clouds; a surface that faces it gets ``sun + ambient``.
+        sun: its strength, 0 under clouds; a surface that faces it and the sky gets ``sun + ambient``.
         ambient: strength of the light of the sky.
         zenith, horizon: colours of the sky, blended by the sine of the elevation.
         haze: share of the horizon's colour that a metre of air adds, ``1 - exp(-haze * distance)``.
