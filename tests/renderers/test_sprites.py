@@ -343,7 +343,6 @@ def test_malformed_renderers_are_named(canvas, threads):
 
 ENGINE = """
 import os, torch
-from probscene.batch import RenderBatch
 from probscene.drawing import Drawing, Sprites, resolve
 from probscene.errors import ProbsceneError
 from probscene.renderers import engine
