@@ -25,7 +25,7 @@ def test_python_examples_run(capsys):
 
 def test_commands_exist():
     named = set(re.findall(r"^    probscene (\w+)", README, re.MULTILINE))
-    assert named == {"check", "preview", "fit", "generate", "evaluate", "report", "compare"}
+    assert named == {"check", "preview", "view", "fit", "generate", "evaluate", "report", "compare"}
     for command in named:
         assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 
