@@ -3,6 +3,7 @@
 Axis letters: N scenes, M nodes.
 """
 
+from collections.abc import Callable, Iterable
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -14,7 +15,18 @@ from probscene.derivation import Derivation
 from probscene.drawing import Drawing, Layer, Sprites, resolve
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
-from probscene.world import Camera, Ground, Light, Meshes, Photo, World, resolve_ground, resolve_meshes, resolve_scene
+from probscene.world import (
+    Camera,
+    Ground,
+    Light,
+    Meshes,
+    MeshLayer,
+    Photo,
+    World,
+    resolve_ground,
+    resolve_meshes,
+    resolve_scene,
+)
 
 
 class SceneGraph:
@@ -66,10 +78,6 @@ class SceneGraph:
         mask = self.mask(*kinds)
         return (self.parent.unsqueeze(-1) == self.parent.unsqueeze(-2)) & mask.unsqueeze(-2)
 
-    def _of_nodes(self, layer: Sprites, kinds: tuple[str, ...]) -> Layer:
-        mask = self.mask(*kinds)
-        return resolve(layer, mask if layer.present is None else mask & layer.present)
-
     def build(
         self,
         *layers: Meshes,
@@ -83,19 +91,10 @@ class SceneGraph:
         Raises:
             ModelError: values of a wrong shape, out of range or not finite.
         """
-        resolved = []
-        for layer in layers:
-            kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds
-            if kinds == ():
-                present = _decorated(layer, len(self.kind))
-                resolved.append(resolve_meshes(replace(layer, labelled=False), present))
-            else:
-                mask = self.mask(*kinds)
-                resolved.append(resolve_meshes(layer, mask if layer.present is None else mask & layer.present))
         parts = {"camera": camera, "light": light or Light(), "photo": photo or Photo()}
         parts = {name: resolve_scene(part, len(self.kind)) for name, part in parts.items()}
         ground = None if ground is None else resolve_ground(ground, len(self.kind))
-        return World(self.kind, self.grammar.kinds, tuple(resolved), ground=ground, **parts)
+        return World(self.kind, self.grammar.kinds, self._resolved(layers, resolve_meshes), ground=ground, **parts)
 
     def draw(self, *layers: Sprites, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drawing:
         """What to render: layers from the back to the front.
@@ -103,14 +102,18 @@ class SceneGraph:
         Raises:
             ModelError: values of a wrong shape, out of range or not finite.
         """
-        resolved = []
+        return Drawing(self.kind, self.grammar.kinds, self._resolved(layers, resolve), background)
+
+    def _resolved(self, layers: Iterable[Sprites | Meshes], resolve: Callable) -> tuple[Layer | MeshLayer, ...]:
+        found = []
         for layer in layers:
             kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds
             if kinds == ():
-                resolved.append(resolve(replace(layer, labelled=False), _decorated(layer, len(self.kind))))
+                found.append(resolve(replace(layer, labelled=False), _decorated(layer, len(self.kind))))
             else:
-                resolved.append(self._of_nodes(layer, kinds))
-        return Drawing(self.kind, self.grammar.kinds, tuple(resolved), background)
+                mask = self.mask(*kinds)
+                found.append(resolve(layer, mask if layer.present is None else mask & layer.present))
+        return tuple(found)
 
 
 def _decorated(layer: Sprites | Meshes, num_scenes: int) -> Tensor:
