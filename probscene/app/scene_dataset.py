@@ -14,6 +14,8 @@ only where its batches are of 64.
 Axis letters: N scenes, M nodes, n objects of an image, H W.
 """
 
+import atexit
+import os
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -112,6 +114,10 @@ class SceneDataset(IterableDataset):
         info = get_worker_info()
         worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
         model, policy = self._open()
+        if info is not None:
+            # Threads of libraries that are at work when a process ends abort it now and then; a worker has nothing to
+            # put in order. Registered last, this is called first.
+            atexit.register(os._exit, 0)
         render = renderer_for(model, threads=1)
         start = int(self._epoch) * (_ENDLESS if self.num is None else -(-self.num // CHUNK))
         share = CHUNK if self.batch_size is None or workers == 1 else self.batch_size
