@@ -5,6 +5,7 @@ many of them a second; the last part trains on whole images, without which crops
 letters: N images, M nodes, K crops.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,6 +20,8 @@ from probscene.inference.resume import batch_seed
 from probscene.sampling import seed_everything
 
 STEPS_A_DRAW = 16
+FULL = 128**2  # pixels of a reduced image of which a step takes as many as the schedule says
+FEWEST = 4  # images a step, however large
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,8 @@ class CountSchedule:
     Args:
         steps: of Adam.
         whole: fraction of the steps, the last ones, on whole images.
-        images: images a step.
+        images: images a step, of up to 128 x 128 pixels when reduced; of larger ones, whose crops are as many and
+            whose drawing takes longer, fewer to the same number of pixels, but at least 4.
         crops: crops a step, from those images.
         crop: their side in pixels of the reduced image.
         window: side of the middle part of a crop that counts, cells; the rest is context.
@@ -100,16 +104,21 @@ class CountBatches:
     def __init__(self, net: CountNet, draw: Draw, schedule: CountSchedule, seed: int):
         self.net, self.draw, self.schedule, self.seed = net, draw, schedule, seed
 
+    @property
+    def images(self) -> int:
+        """Images a step."""
+        area = math.prod(self.net.canvas) / self.net.reduce**2
+        return min(self.schedule.images, max(FEWEST, round(self.schedule.images * FULL / area)))
+
     def after(self, done: int) -> Iterator[list[Batch]]:
         """The batches that are left after ``done`` steps, a draw at a time, while another thread makes the next."""
         return ahead(self._draw, range(done, self.schedule.steps, STEPS_A_DRAW))
 
     def _draw(self, done: int) -> list[Batch]:
-        s = self.schedule
         seed_everything(batch_seed(self.seed, done))
-        steps = min(STEPS_A_DRAW, s.steps - done)
-        drawn = self.draw(steps * s.images)
-        rows = (slice(i * s.images, (i + 1) * s.images) for i in range(steps))
+        steps, images = min(STEPS_A_DRAW, self.schedule.steps - done), self.images
+        drawn = self.draw(steps * images)
+        rows = (slice(i * images, (i + 1) * images) for i in range(steps))
         return [self._batch(Examples(*(x[some] for x in drawn)), done + i) for i, some in enumerate(rows)]
 
     def _batch(self, batch: Examples, step: int) -> Batch:

@@ -54,7 +54,7 @@ class CountNet(nn.Module):
         if groups is not None:
             each = (f"{name} {number + 1}" for number in range(groups.most) for name in self.objects)
             self.names = (groups.kind, *each)
-        self.channels = channels
+        self.channels, self.canvas = channels, canvas
         reduction = min(8, 2 ** max(0, round(math.log2(max(canvas) / 128))))
         self.register_buffer("reduction", torch.tensor(reduction))
         a, b, c = width
