@@ -6,6 +6,7 @@ All of its parts become one, with their transforms; corner normals are made anew
 
 import math
 import warnings
+from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probscene.errors import DataError
+from probscene.models.mesh_polygons import unfillable
 from probscene.models.mesh_sources import Sources, sources
 from probscene.models.solids import corner_normals, volume
 from probscene.models.texture_sheet import sheet
@@ -48,7 +50,7 @@ def read(file: Path) -> dict[str, np.ndarray | None]:
         except Exception as error:  # whatever it stumbles on, the file is at fault
             fault = f"{type(error).__name__}: {error}"
             raise DataError(
-                f"Expected a mesh that trimesh can read, actual {file} ({fault}); export it again."
+                f"Expected a mesh that trimesh can read, actual {file} ({fault}); export it again, triangulated."
             ) from None
         parts = [part for part in _parts(file, scene, named, trimesh.Trimesh) if len(part.triangles)]
     if not parts:
@@ -105,6 +107,10 @@ def _parts(file: Path, scene, named: Sources, triangular: type) -> list[Part]:
         positions, triangles = np.asarray(piece.vertices, float), np.asarray(piece.faces)
         if len(triangles) == 0:
             continue
+        if (at := unfillable(positions, _ply_faces(file, piece))) is not None:
+            raise DataError(
+                f"Expected triangles or convex polygons, actual one with a dent, face {at} of {file}; triangulate it."
+            )
         if triangles.ndim != 2 or triangles.shape[1] != 3:
             raise DataError(f"Expected triangles, actual faces of {triangles.shape[1:]} in {file}; triangulate it.")
         if triangles.min() < 0 or triangles.max() >= len(positions):
@@ -119,6 +125,19 @@ def _parts(file: Path, scene, named: Sources, triangular: type) -> list[Part]:
             triangles, uv = triangles[:, ::-1], None if uv is None else uv[:, ::-1]
         parts.append(Part(positions, triangles, colour, tinted, uv, texture))
     return parts
+
+
+def _ply_faces(file: Path, piece) -> Sequence[Sequence[int]]:
+    """The faces of a PLY as they are in the file; trimesh takes a binary one's to be all as long as the first."""
+    data = piece.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    names = (data.dtype.names or ()) if isinstance(data, np.ndarray) else data or ()
+    name = next((name for name in ("vertex_index", "vertex_indices") if name in names), None)
+    if name is None or isinstance(data, dict):
+        return () if name is None else data[name]
+    corners = data[name]["f1"]
+    if (data[name]["f0"] != corners.shape[1]).any():
+        raise DataError(f"Expected triangles, actual faces of several lengths in {file}; triangulate it.")
+    return corners
 
 
 def _look(file: Path, piece, named: Sources):
@@ -150,7 +169,11 @@ def _look(file: Path, piece, named: Sources):
         raise DataError(f"Expected finite texture coordinates, actual NaN or infinity in {file}; export it again.")
     if hasattr(material, "diffuse"):
         base = white  # OBJ exporters write a Kd that the texture replaces
-    return base, tinted, uv, np.asarray(image.convert("RGB"))
+    try:
+        return base, tinted, uv, np.asarray(image.convert("RGB"))  # decodes it only now
+    except (OSError, SyntaxError, ValueError) as error:
+        texture = named.textures.get(name, f"one of {file}")
+        raise DataError(f"Expected a picture that decodes, actual {texture} ({error}); replace it.") from None
 
 
 def _srgb(colour: np.ndarray, linear: bool) -> np.ndarray:

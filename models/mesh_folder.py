@@ -11,6 +11,7 @@ A material whose name holds "paint" or "tint" takes the colours that
 a model gives to its things; all other colours and textures stay as they are, those of glTF converted to sRGB.
 """
 
+import hashlib
 import re
 from functools import cache
 from pathlib import Path
@@ -53,6 +54,7 @@ SIZES = {
     "fence": Size("long", 0, 0.5, 50.0),
 }
 LENGTHWAYS = ("car", "van", "truck", "cyclist")  # longer than wide
+_OTHER = (".3ds", ".blend", ".dae", ".fbx", ".off", ".step", ".stp", ".usd", ".usda", ".usdc", ".usdz", ".x3d")
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
 _NAMED = re.compile(r"@(\d+\.?\d*)(?:x(\d+\.?\d*)x(\d+\.?\d*))?m$")
 
@@ -78,13 +80,33 @@ def folder(path: str | Path) -> dict[str, tuple[Mesh, ...]]:
         if sub.name not in SIZES:
             kinds = ", ".join((*KINDS, *DECORATION))
             raise DataError(f"Expected subfolders among {kinds}, actual {sub}; rename or remove it.")
-        files = sorted(p for p in sub.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+        there = sorted(p for p in sub.iterdir() if not p.name.startswith("."))
+        files = [p for p in there if p.suffix.lower() in SUFFIXES]
+        for other in (p for p in there if p.suffix.lower() in _OTHER):
+            raise DataError(
+                f"Expected meshes as {', '.join(SUFFIXES)}, actual {other}; export it as .glb or remove it."
+            )
         if not files:
             raise DataError(f"Expected mesh files ({', '.join(SUFFIXES)}) in {sub}, actual none; add one or remove it.")
         found[sub.name] = tuple(_checked(file, sub.name) for file in files)
     if not found:
         raise DataError(f"Expected subfolders such as car with mesh files in {root}, actual none; add one.")
     return {**street(), **found}
+
+
+@cache
+def described(path: str | Path) -> str:
+    """Which meshes ``folder`` gives, in words: where they are, and a digest of all that the folder holds.
+
+    Raises:
+        DataError: see ``folder``.
+    """
+    folder(path)
+    digest, root = hashlib.sha256(), Path(path)
+    for file in sorted(p for p in root.rglob("*") if p.is_file()):
+        data = hashlib.sha256(file.read_bytes()).digest()
+        digest.update(file.relative_to(root).as_posix().encode("utf-8", "surrogateescape") + b"\0" + data)
+    return f"meshes in {root} ({digest.hexdigest()[:12]})"
 
 
 def _checked(file: Path, kind: str) -> Mesh:

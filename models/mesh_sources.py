@@ -6,7 +6,10 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
+import numpy as np
+
 from probscene.errors import DataError
+from probscene.models.mesh_polygons import unfillable
 
 
 class Sources(NamedTuple):
@@ -25,7 +28,8 @@ def sources(file: Path) -> Sources:
     """Look through an OBJ and its MTL, or a glTF; other formats name no files.
 
     Raises:
-        DataError: a file that is named and not there, a glTF that is none or is compressed.
+        DataError: a file that is named and not there, a glTF that is none or is compressed, an OBJ with a polygon that
+            trimesh would fill wrongly.
     """
     suffix = file.suffix.lower()
     if suffix == ".obj":
@@ -53,6 +57,7 @@ def _text(file: Path) -> str:
 
 def _obj(file: Path) -> dict[str, str]:
     lines = _lines(file)
+    _check_polygons(file, lines)
     used, textures = {rest for word, rest in lines if word == "usemtl"}, {}
     for library in (rest for word, rest in lines if word == "mtllib"):
         if not (mtl := file.parent / library).is_file():
@@ -64,6 +69,36 @@ def _obj(file: Path) -> dict[str, str]:
             elif word.lower() == "map_kd" and material in used:
                 textures[material] = _there(file, mtl.parent, _without_options(rest))
     return textures
+
+
+def _check_polygons(file: Path, lines: list[tuple[str, str]]) -> None:
+    positions, polygons, numbers = [], [], []
+    for number, (word, rest) in enumerate(lines, 1):
+        if word == "v":
+            positions.append(_numbers(rest.split()[:3]))
+        elif word == "f" and len(corners := rest.split()) > 3:
+            polygons.append([_vertex(corner.partition("/")[0], len(positions)) for corner in corners])
+            numbers.append(number)
+    if polygons and (at := unfillable(np.array(positions).reshape(-1, 3), polygons)) is not None:
+        raise DataError(
+            f"Expected triangles or convex polygons, actual one with a dent in line {numbers[at]} of {file}; "
+            "triangulate it."
+        )
+
+
+def _vertex(text: str, before: int) -> int:
+    """An OBJ counts from 1, or back from the last one; -1 for what is no number."""
+    number = int(text) if text.removeprefix("-").isdecimal() else 0
+    return number - 1 if number > 0 else before + number if number < 0 else -1
+
+
+def _numbers(words: list[str]) -> list[float]:
+    """Three; what is no number is left for trimesh to find."""
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        found = []
+    return found if len(found) == 3 else [np.nan] * 3
 
 
 def _without_options(text: str) -> str:

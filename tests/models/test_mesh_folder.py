@@ -1,10 +1,13 @@
 """Meshes of one's own: what is read is what was written, in our pose; every fault is named with its file."""
 
 import base64
+import io
 import json
 import logging
 import math
+import re
 import shutil
+import struct
 import subprocess
 import sys
 
@@ -14,7 +17,7 @@ import trimesh
 from PIL import Image
 
 from probscene.errors import DataError
-from probscene.models.mesh_folder import SIZES, folder
+from probscene.models.mesh_folder import SIZES, described, folder
 from probscene.models.street_assets import DECORATION, KINDS, street
 
 TO_Y_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # x forward, y left, z up to z forward, x left, y up
@@ -211,6 +214,12 @@ def test_smooth_where_round_and_sharp_at_edges(tmp_path):
     assert np.allclose(np.abs(box.normals).max(-1), 1)
 
 
+def picture_of_half_its_bytes():
+    file = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)).save(file, "PNG")
+    return file.getvalue()[: file.tell() // 2]
+
+
 def gltf(**change):
     """A triangle of 4.4 m by 1.8 m with the data inside."""
     data = np.array([[-0.9, 0, 0], [0.9, 0, 0], [0, 1.5, 4.4]], np.float32).tobytes()
@@ -230,7 +239,15 @@ INSIDE = "data:application/octet-stream;base64,"
 MATERIAL = [{"name": "m", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
 PICTURE = {"materials": MATERIAL, "textures": [{"source": 0}], "images": [{"uri": "a%20b.png"}]}
 TEXTURED = "mtllib a.mtl\nvt 0 0\nusemtl m\n" + CAR_OBJ.replace("f 1 2 4 3", "f 1/1 2/1 4/1 3/1")
+FACES = CAR_OBJ.index("f")
+ALL_TEXTURED = "mtllib a.mtl\nvt 0 0\nusemtl m\n" + CAR_OBJ[:FACES] + re.sub(r"(\d)", r"\1/1", CAR_OBJ[FACES:])
 HUGE = CAR_OBJ.replace("2.2", "220").replace("0.9", "90").replace("1.5", "150")
+BROKEN = picture_of_half_its_bytes()
+DENTED = "v -0.9 0 -2.2\nv 0.9 0 -2.2\nv -0.5 0 0\nv 0.9 0 2.2\nv -0.9 0 2.2\n"
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\nelement face {}\n"
+    "property list uchar int vertex_indices\nend_header\n-2.2 -0.9 0\n-2.2 0.9 0\n0 -0.5 0\n2.2 0.9 0\n2.2 -0.9 0\n"
+)
 FAULTS = {
     "no triangle": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 0 4\n", "actual"),
     "an empty file": ("a.obj", "", "actual"),
@@ -250,6 +267,16 @@ FAULTS = {
     "no materials": ("a.obj", "mtllib gone.mtl\n" + CAR_OBJ, "gone.mtl, actual no such file"),
     "no texture": ("a.obj", TEXTURED, "texture my brick.png of .*no such file", "map_Kd -s 1 1 1 my brick.png\n"),
     "a texture that is none": ("a.obj", TEXTURED, r"Expected a picture, actual .*a\.mtl", "map_Kd a.mtl\n"),
+    "a broken texture": ("a.obj", ALL_TEXTURED, r"a picture that decodes, actual .*a\.png \(", "map_Kd a.png\n"),
+    "a polygon with a dent": ("a.obj", DENTED + "f 1 2 3 4 5\n", "one with a dent in line 6 of"),
+    "a dent, counted back": (
+        "a.obj",
+        DENTED + "f -5/1/1 -4/1/1 -3/1/1 -2/1/1 -1/1/1\n",
+        "one with a dent in line 6 of",
+    ),
+    "a dent in a ply": ("a.ply", PLY.format(1) + "5 0 1 2 3 4\n", "one with a dent, face 0 of"),
+    "a dent beside a triangle": ("a.ply", PLY.format(2) + "3 0 1 2\n5 0 1 2 3 4\n", "one with a dent, face 1 of"),
+    "another format": ("a.fbx", "", r"as \.glb, .*a\.fbx; export it as \.glb or remove"),
     "a gltf's texture": ("a.gltf", {**PICTURE}, "texture a b.png of .*no such file"),
     "a gltf's data": ("a.gltf", {"buffers": [{"byteLength": 36, "uri": "gone.bin"}]}, "gone.bin .*no such file"),
     "a gltf's order": ("a.gltf", {**PICTURE, "images": []}, "fit together"),
@@ -266,9 +293,63 @@ def test_faults_are_named_with_their_file(tmp_path, fault, caplog):
     write(tmp_path, "car", name, gltf(**data) if isinstance(data, dict) else data)
     if material:
         write(tmp_path, "car", "a.mtl", "newmtl m\n" + material[0])
+        write(tmp_path, "car", "a.png", BROKEN)
     with caplog.at_level(logging.DEBUG), pytest.raises(DataError, match=message) as caught:
         folder(tmp_path)
-    assert name in str(caught.value) and "; " in str(caught.value) and not caplog.records
+    assert name in str(caught.value) and "; " in str(caught.value)
+    assert not [record for record in caplog.records if not record.name.startswith("PIL.")]
+
+
+def area(mesh):
+    a, b, c = np.moveaxis(mesh.positions[mesh.triangles].astype(float), 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+
+
+@pytest.mark.parametrize("start", range(5))
+def test_polygons_are_filled_or_refused(tmp_path, start):
+    """Of a polygon with a dent, only the corner in it sees all; whichever comes first, the area is right or nothing."""
+    corners = [(start + i) % 5 + 1 for i in range(5)]
+    write(tmp_path, "car", "a.obj", DENTED + f"f {' '.join(map(str, corners))}\n")
+    try:
+        (car,) = folder(tmp_path)["car"]
+    except DataError as error:
+        assert "a dent" in str(error) and corners[0] != 3
+    else:
+        assert corners[0] == 3 and area(car) == pytest.approx(1.8 * 4.4 - 1.4 * 4.4 / 2)
+
+
+@pytest.mark.parametrize(
+    "faces", [[(0, 1, 2, 3, 4)], [(0, 1, 2), (0, 2, 3, 4)], [(0, 2, 3, 4), (0, 1, 2), (0, 1, 2, 3, 4)]]
+)
+def test_a_binary_ply_of_many_corners(tmp_path, faces):
+    """One with a dent; and lengths that differ, where the third file is as long as if they did not."""
+    header = PLY.partition("-2.2")[0].replace("ascii", "binary_little_endian").format(len(faces)).encode()
+    places = struct.pack("<15f", *map(float, PLY.partition("end_header\n")[2].split()))
+    lists = b"".join(struct.pack(f"<B{len(face)}i", len(face), *face) for face in faces)
+    write(tmp_path, "car", "a.ply", header + places + lists)
+    with pytest.raises(DataError, match="a dent, face 0|triangulate"):
+        folder(tmp_path)
+
+
+def test_polygons_without_dents_are_filled(tmp_path):
+    angle = np.arange(7) * 2 * math.pi / 7
+    ring = "".join(f"v {0.9 * math.sin(t):.6f} {math.sin(t):.6f} {2.2 * math.cos(t):.6f}\n" for t in angle)
+    write(tmp_path, "car", "a.obj", ring + "f 1 2 3 4 5 6 7\n")
+    write(tmp_path, "car", "b.obj", CAR_OBJ)
+    seven, cuboid = folder(tmp_path)["car"]
+    across = math.hypot(0.9, 1)
+    assert area(seven) == pytest.approx(3.5 * math.sin(2 * math.pi / 7) * 2.2 * across, rel=1e-5)
+    assert area(cuboid) == pytest.approx(2 * (4.4 * 1.8 + 4.4 * 1.5 + 1.8 * 1.5))
+
+
+def test_a_folder_is_described_by_all_that_it_holds(tmp_path):
+    for name in "ab":
+        write(tmp_path / name, "car", "a.obj", CAR_OBJ)
+    write(tmp_path / "b", "car", "a.png", "another")
+    a, b = (described(tmp_path / name) for name in "ab")
+    assert a.startswith(f"meshes in {tmp_path / 'a'} (") and a.split("(")[1] != b.split("(")[1]
+    with pytest.raises(DataError, match="Expected a folder of meshes"):
+        described(tmp_path / "c")
 
 
 def test_a_gltf_that_is_whole_is_read(tmp_path):
