@@ -172,8 +172,10 @@ def _look(file: Path, piece, named: Sources):
     try:
         return base, tinted, uv, np.asarray(image.convert("RGB"))  # decodes it only now
     except (OSError, SyntaxError, ValueError) as error:
-        texture = named.textures.get(name, f"one of {file}")
-        raise DataError(f"Expected a picture that decodes, actual {texture} ({error}); replace it.") from None
+        texture = named.textures.get(name, "one")
+        raise DataError(
+            f"Expected a picture that decodes, actual {texture}, which {file} names ({error}); replace it."
+        ) from None
 
 
 def _srgb(colour: np.ndarray, linear: bool) -> np.ndarray:
