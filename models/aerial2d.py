@@ -164,6 +164,12 @@ def assets() -> str:
     return f"pictures in {os.path.abspath(path)} (PROBSCENE_SPRITES)" if path else ""
 
 
+def drawn_with(path: str, prior: Policy) -> SceneModel:
+    """The model with the pictures in a folder."""
+    folder(path)  # which finds what is wrong with it
+    return aerial2d(partial(folder, path), f"pictures in {path}", prior)
+
+
 def aerial2d(look=scenery, assets: str = "", prior: Policy = PRIOR) -> SceneModel:
     """The model with scenery of any source, ``look() -> Scenery``; ``assets`` names it in words."""
 
@@ -176,7 +182,8 @@ def aerial2d(look=scenery, assets: str = "", prior: Policy = PRIOR) -> SceneMode
         """The experiment's truth; the paper has one, whatever the seed."""
         return model("aerial2d_target", TARGET, True)
 
-    return model("aerial2d", prior, False, pretraining=PRETRAINING, target=target)
+    other = partial(drawn_with, prior=prior)
+    return model("aerial2d", prior, False, pretraining=PRETRAINING, target=target, drawn_with=other)
 
 
 MODEL = aerial2d(assets=assets())

@@ -9,7 +9,7 @@ meshes cover on the ground, to within a centimetre.
 Departures from the paper: roads are straight; a median is there or not by a production of its own; vans and trucks are
 kinds of their own, left out unless asked for (``vehicles``), because a van that is labelled as a car is labelled wrong.
 
-Set the environment variable ``PROBSCENE_ASSETS`` to a folder of meshes, one subfolder a kind, to draw with these.
+``--assets DIR``, or the environment variable ``PROBSCENE_ASSETS``, draws with a folder of meshes, one subfolder a kind.
 """
 
 import os
@@ -28,7 +28,7 @@ from probscene.models.driving_ground import fences, ground, slabs
 from probscene.models.driving_light import camera, light, photo
 from probscene.models.driving_nodes import Nodes
 from probscene.models.driving_things import things
-from probscene.models.mesh_folder import folder
+from probscene.models.mesh_folder import described, folder
 from probscene.models.street_assets import GROUPS, street
 from probscene.models.surfaces import surfaces
 from probscene.policy import Policy
@@ -54,9 +54,10 @@ FITTING = {
 }
 
 
-def assets(scenario: str) -> Assets:
-    """The project's own meshes, those of the kinds in the folder ``PROBSCENE_ASSETS`` replaced by what is there."""
-    path, own = os.environ.get("PROBSCENE_ASSETS"), street()
+def assets(scenario: str, path: str | None = None) -> Assets:
+    """The project's own meshes, those of the kinds in a folder, ``PROBSCENE_ASSETS`` if none is named, replaced by what
+    is there."""
+    path, own = path or os.environ.get("PROBSCENE_ASSETS"), street()
     meshes = dict(folder(os.path.abspath(path)) if path else own)
     for kind, groups in FITTING[scenario].items():
         if meshes[kind] is own[kind]:
@@ -67,7 +68,12 @@ def assets(scenario: str) -> Assets:
 def default_assets() -> str:
     """Which meshes ``assets`` gives."""
     path = os.environ.get("PROBSCENE_ASSETS")
-    return f"meshes in {os.path.abspath(path)} (PROBSCENE_ASSETS)" if path else ""
+    return f"{described(os.path.abspath(path))} of PROBSCENE_ASSETS" if path else ""
+
+
+def drawn_with(path: str, scenario: str, **more) -> SceneModel:
+    """A scenario's model with meshes from a folder; ``more`` is as of ``driving``."""
+    return driving(scenario, look=partial(assets, path=path), assets=described(path), **more)
 
 
 def street_scenes(
@@ -124,7 +130,9 @@ def driving(
 
     name = f"driving_{scenario}" if prior == "tuned" else f"driving_{scenario}_{prior}"
     pretraining = structures.pretraining(scenario, prior, vehicles)
-    return model(name, structures.prior(scenario, prior, vehicles), pretraining=pretraining, target=target)
+    other = partial(drawn_with, scenario=scenario, prior=prior, canvas=canvas, vehicles=vehicles)
+    structure = structures.prior(scenario, prior, vehicles)
+    return model(name, structure, pretraining=pretraining, target=target, drawn_with=other)
 
 
 def scenarios(prior: str = "tuned", **more) -> dict[str, SceneModel]:

@@ -70,7 +70,7 @@ def folder(path: str | Path) -> dict[str, tuple[Mesh, ...]]:
     """
     root = Path(path)
     if not root.is_dir():
-        raise DataError(f"Expected a folder of meshes, actual {root}, which is none; name one with --assets.")
+        raise DataError(f"Expected a folder of meshes, actual {root}, which is none; put it there, or name another.")
     found = {}
     for sub in sorted(p for p in root.iterdir() if not p.name.startswith((".", "__"))):
         if not sub.is_dir():

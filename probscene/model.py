@@ -52,6 +52,8 @@ class SceneModel:
         classes: the kinds that are labelled and counted, in the order of the categories.
         channels: 1 if colour carries nothing (images are then read as grey), else 3.
         assets: what it draws with beside its own code, in words; a run is bound to it.
+        drawn_with: ``drawn_with(folder)``, the same model drawn with what is in a folder, an absolute path; it looks
+            through all of it at once. None where there is nothing that could be replaced.
         groups: by what objects are counted; over the whole image where None.
         pretraining: the policy whose derivations a guide is pretrained on, the prior where None. A guide learns only
             from what it draws: give it now and then longer lists than the prior has, where the target may have them.
@@ -72,6 +74,7 @@ class SceneModel:
     classes: tuple[str, ...]
     channels: int = 3
     assets: str = ""
+    drawn_with: Callable[[str], "SceneModel"] | None = None
     groups: Groups | None = None
     pretraining: Policy | None = None
     target: Callable[[int], "SceneModel"] | None = None

@@ -39,8 +39,8 @@ class JointGrammar(Grammar):
 
     Attributes:
         parts: as given.
-        first_rule: ``(S,)`` the joint number of each part's first rule; they follow in its own order.
-        first_symbol: ``(S,)`` likewise of its nonterminals.
+        first_rule: the joint number of each part's first rule, a list of S; the part's rules follow in its own order.
+        first_symbol: likewise of its nonterminals.
     """
 
     def __init__(self, parts: Mapping[str, Grammar]):
@@ -181,6 +181,10 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         """The scenarios' own targets, joined."""
         return join(f"{name}_target", {key: model.target(seed) for key, model in models.items()}, weights)
 
+    def drawn_with(folder: str) -> SceneModel:
+        """All scenarios drawn with one folder."""
+        return join(name, {key: model.drawn_with(folder) for key, model in models.items()}, weights)
+
     return SceneModel(
         name,
         grammar,
@@ -191,6 +195,7 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         tuple(dict.fromkeys(c for model in each for c in model.classes)),
         channels=each[0].channels,
         assets="; ".join(dict.fromkeys(model.assets for model in each if model.assets)),
+        drawn_with=drawn_with if all(model.drawn_with for model in each) else None,
         groups=groups.pop() if len(groups) == 1 else None,
         pretraining=pretraining,
         target=target if all(targets) else None,

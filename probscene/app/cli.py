@@ -78,6 +78,9 @@ app = typer.Typer(
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, made by 'probscene fit'.")]
 Model = Annotated[str, typer.Argument(metavar="MODEL", help="multi_mnist, aerial2d, driving, or a .py file.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same result.")]
+Assets = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="A folder of meshes (driving) or pictures (aerial2d) to draw with.")
+]
 MinHeight = Annotated[float, typer.Option(min=0, help="Of objects that KITTI's labels count, pixels of their boxes.")]
 PresetName = StrEnum("PresetName", ["quick", "default", "paper"])
 Objective = StrEnum("Objective", ["kde", "js", "witness", "mmd"])
@@ -93,12 +96,12 @@ def _everywhere(
 
 
 @app.command()
-def check(model: Model) -> None:
+def check(model: Model, assets: Assets = None) -> None:
     """Say whether a model's grammar is sound, how long its derivations are, and what to mend."""
     from probscene.app.loading import load_model
     from probscene.checks import check
 
-    report = check(load_model(model))
+    report = check(load_model(model, assets))
     print(report)
     if report.faults:
         raise ModelError(f"Expected a model without faults, actual {model} with {len(report.faults)}; mend them first.")
@@ -111,11 +114,12 @@ def preview(
     num: Annotated[int, typer.Option(help="How many scenes.")] = 16,
     seed: Seed = 0,
     boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes and class names.")] = False,
+    assets: Assets = None,
 ) -> None:
     """Draw a grid of scenes: of a model's prior, or of what a run has learnt."""
     from probscene.app.preview import preview
 
-    preview(model_or_run, out, num, _seed(seed), boxes)
+    preview(model_or_run, out, num, _seed(seed), boxes, assets)
     print(f"{num} scenes in {out}")
 
 
@@ -125,11 +129,12 @@ def view(
     out: Annotated[Path, typer.Option(metavar="FILE", help="scene.rrd for Rerun's viewer, or scene.glb (glTF, 3D).")],
     num: Annotated[int, typer.Option(help="How many scenes, one after the other; a .glb holds one.")] = 1,
     seed: Seed = 0,
+    assets: Assets = None,
 ) -> None:
     """Write scenes that one can turn: of a model's prior, or of what a run has learnt."""
     from probscene.app.turnable import view
 
-    view(model_or_run, out, num, _seed(seed))
+    view(model_or_run, out, num, _seed(seed), assets)
     print(f"{num} {'scene' if num == 1 else 'scenes'} in {out}")
 
 
@@ -156,6 +161,7 @@ def fit(
         str | None,
         typer.Option(metavar="NAME,...", help="Of a model that has several; a guide learns each. All if not given."),
     ] = None,
+    assets: Assets = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Learn which structures occur in a folder of unlabelled images."""
@@ -174,13 +180,14 @@ def fit(
     with Display() as show:
         if resume:
             given = chosen if preset or objective or guide or features or settings else None
-            run, images = session.resume(out, show, model, target, given, seed=seed, skip_bad=skip_bad, threads=threads)
+            settings = {"seed": seed, "skip_bad": skip_bad, "threads": threads}
+            run, images = session.resume(out, show, model, target, given, assets, **settings)
         elif model is None or target is None:
             raise ProbsceneError(
                 "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
             )
         else:
-            run, images = session.begin(model, target, out, chosen, seed or 0, bool(skip_bad), threads, show)
+            run, images = session.begin(model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets)
             ctx.obj.words.append("--resume")
         if not session.is_finished(run):
             session.carry_out(run, images, show)

@@ -42,18 +42,26 @@ Progress = Callable[[str, int, int, str], None]
 
 
 def create(
-    model: str, target: Path, out: Path, preset: Preset, seed: int, skip_bad: bool = False, threads: int | None = None
+    model: str,
+    target: Path,
+    out: Path,
+    preset: Preset,
+    seed: int,
+    skip_bad: bool = False,
+    threads: int | None = None,
+    assets: Path | None = None,
 ) -> Run:
     """A new run folder for a fit; the model is checked first, so that a wrong one leaves no folder behind.
 
     Args:
         threads: of torch; all that this process may use where None. Another number rounds differently, so it is
             recorded.
+        assets: a folder that the model is drawn with.
 
     Raises:
         ProbsceneError: see ``load_model`` and ``Run.create``.
     """
-    loaded = load_model(model)
+    loaded = load_model(model, assets)
     if preset.features not in TRAINED:
         feature_net(preset, loaded)
     record = {
@@ -65,7 +73,7 @@ def create(
         "preset": dataclasses.asdict(preset),
         "guide": preset.guide_settings(),
     }
-    return Run.create(out, model, record)
+    return Run.create(out, model, record, assets)
 
 
 def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guide:

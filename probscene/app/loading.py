@@ -7,6 +7,7 @@ them joined into one (``scenarios.join``), ``streets.py:city,rural`` is these tw
 import hashlib
 import importlib
 import importlib.util
+import os
 import sys
 import traceback
 from functools import cached_property
@@ -29,13 +30,29 @@ BUILT_IN = {
 }
 
 
-def load_model(reference: str) -> SceneModel:
+def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
     """The scene model that a name or a file gives.
 
+    Args:
+        assets: a folder of what it is to be drawn with.
+
     Raises:
-        ModelError: no such name or file, a file that does not import, one that exports none or several models, or a
-            scenario that it lacks.
+        ModelError: no such name or file, a file that does not import, one that exports none or several models, a
+            scenario that it lacks, or one that does not draw with a folder.
+        DataError: something in the folder cannot be used.
     """
+    model = _loaded(reference)
+    if assets is None:
+        return model
+    if model.drawn_with is None:
+        raise ModelError(
+            f"Expected a model that can be drawn with a folder of assets, actual {reference!r}, which has no "
+            "drawn_with; leave --assets out."
+        )
+    return model.drawn_with(os.path.abspath(assets))
+
+
+def _loaded(reference: str) -> SceneModel:
     base, scenarios = split_reference(reference)
     if base in BUILT_IN:
         return _exported(vars(importlib.import_module(BUILT_IN[base])), base, scenarios)

@@ -25,8 +25,13 @@ LINE = (96, 96, 96)
 Pixels = NDArray[np.uint8]
 
 
-def preview(model_or_run: str, out: Path, num: int = 16, seed: int = 0, boxes: bool = False) -> None:
+def preview(
+    model_or_run: str, out: Path, num: int = 16, seed: int = 0, boxes: bool = False, assets: Path | None = None
+) -> None:
     """Write a grid of scenes of a model's prior, or of a run's learnt structures, as a PNG.
+
+    Args:
+        assets: see ``opened``.
 
     Raises:
         ProbsceneError: a number that is not positive; see ``load_model`` and ``Run.guide``.
@@ -38,7 +43,7 @@ def preview(model_or_run: str, out: Path, num: int = 16, seed: int = 0, boxes: b
     out = Path(out)
     if out.is_dir():
         raise DataError(f"Expected a file to write the picture to, actual the folder {out}; name a file in it.")
-    model, policy = opened(model_or_run)
+    model, policy = opened(model_or_run, assets)
     batch = scenes(model, policy, num, seed)
     images = pixels(batch.image)
     if boxes:
@@ -47,16 +52,24 @@ def preview(model_or_run: str, out: Path, num: int = 16, seed: int = 0, boxes: b
     write_picture(out, grid(images))
 
 
-def opened(model_or_run: str) -> tuple[SceneModel, Policy]:
+def opened(model_or_run: str, assets: Path | None = None) -> tuple[SceneModel, Policy]:
     """A model and its prior, or a run's model and what the run has learnt.
 
+    Args:
+        assets: a folder that a model is drawn with.
+
     Raises:
-        ProbsceneError: see ``load_model`` and ``Run.guide``.
+        ProbsceneError: assets of a run, which has its own; see ``load_model`` and ``Run.guide``.
     """
     if is_run(model_or_run):
+        if assets is not None:
+            raise ProbsceneError(
+                f"Expected a model with --assets, actual the run {model_or_run}, which is drawn with what it was "
+                "fitted with; leave --assets out."
+            )
         run = Run.open(Path(model_or_run))
         return run.model, run.guide()
-    model = load_model(model_or_run)
+    model = load_model(model_or_run, assets)
     return model, model.prior
 
 

@@ -1,16 +1,17 @@
 """The run folder: what ``fit`` writes and every other command reads.
 
-    run.json               the configuration, the model, the target, the version that wrote it
-    model.py               a copy of the model's file, where it is not a built-in one
-    guide.safetensors      the learnt guide; there once the fit is finished
-    features.safetensors   the feature network
-    real.safetensors       features of the target images
-    log.jsonl              one line an update
-    checkpoint.safetensors what ``--resume`` goes on from
+run.json               the configuration, the model, the target, the version that wrote it
+model.py               a copy of the model's file, where it is not a built-in one
+guide.safetensors      the learnt guide; there once the fit is finished
+features.safetensors   the feature network
+real.safetensors       features of the target images
+log.jsonl              one line an update
+checkpoint.safetensors what ``--resume`` goes on from
 """
 
 import hashlib
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,11 @@ class Run:
         self._model: SceneModel | None = None
 
     @staticmethod
-    def create(path: Path, model: str, record: dict[str, Any]) -> "Run":
+    def create(path: Path, model: str, record: dict[str, Any], assets: Path | None = None) -> "Run":
         """A new run folder; ``record`` is kept in ``run.json``.
+
+        Args:
+            assets: a folder that the model is drawn with, from now on whenever the run is opened.
 
         Raises:
             RunError: the folder holds a run or other files already.
@@ -53,11 +57,14 @@ class Run:
         """
         path = Path(path)
         Run.check_free(path)
-        assets = load_model(model).assets
+        words = load_model(model, assets).assets
         make_folder(path)
         reference, file = lasting_reference(model), split_reference(model)[0]
         digest = None if file in BUILT_IN else _sha256(Path(file))
-        run = Run(path, {**record, "format": FORMAT, "model": reference, "model_sha256": digest, "assets": assets})
+        about = {"format": FORMAT, "model": reference, "model_sha256": digest, "assets": words}
+        if assets is not None:
+            about["assets_folder"] = os.path.abspath(assets)
+        run = Run(path, record | about)
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
         if digest is not None:
             write_whole(path / "model.py", lambda temporary: shutil.copyfile(file, temporary))
@@ -119,7 +126,7 @@ class Run:
                     f"Expected the model file {file} as it was when {self.path} was fitted, actual a missing or "
                     f"changed file. A copy is in {self.path / 'model.py'}: put it back, or fit again."
                 )
-            model = load_model(reference)
+            model = load_model(reference, self.record.get("assets_folder"))
             if model.assets != self.record["assets"]:
                 raise RunError(
                     f"Expected model {model.name} to draw with {self.record['assets'] or 'no assets'}, as when the run "

@@ -5,6 +5,7 @@
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,13 @@ TIMING = "timing.json"
 STAGES = ("reading", "features", "target", "pretraining", "structure")
 
 
-def checked_model(reference: str) -> SceneModel:
-    """A model without faults.
+def checked_model(reference: str, assets: Path | None = None) -> SceneModel:
+    """A model without faults, drawn with a folder of assets where one is named.
 
     Raises:
         ModelError: it does not load, or ``check`` finds faults.
     """
-    model = load_model(reference)
+    model = load_model(reference, assets)
     faults = check(model).faults
     if faults:
         raise ModelError(f"Expected a model without faults, actual {reference}: {' '.join(faults)}")
@@ -37,7 +38,15 @@ def checked_model(reference: str) -> SceneModel:
 
 
 def begin(
-    model: str, target: Path, out: Path, preset: Preset, seed: int, skip_bad: bool, threads: int | None, show: Display
+    model: str,
+    target: Path,
+    out: Path,
+    preset: Preset,
+    seed: int,
+    skip_bad: bool,
+    threads: int | None,
+    show: Display,
+    assets: Path | None = None,
 ) -> tuple[Run, ImageFolder]:
     """A new run; nothing is written before the model, the folder and every image in it are found to be good.
 
@@ -45,10 +54,10 @@ def begin(
         ProbsceneError: see ``checked_model``, ``ImageFolder`` and ``Run.create``.
     """
     Run.check_free(out)
-    loaded = checked_model(model)
+    loaded = checked_model(model, assets)
     images = open_images(target, loaded, skip_bad, show)
     fit.check_target(images)
-    return fit.create(model, target, out, preset, seed, skip_bad, threads), images
+    return fit.create(model, target, out, preset, seed, skip_bad, threads, assets), images
 
 
 def resume(
@@ -57,13 +66,14 @@ def resume(
     model: str | None = None,
     target: Path | None = None,
     preset: Preset | None = None,
+    assets: Path | None = None,
     **settings: Any,
 ) -> tuple[Run, ImageFolder | None]:
     """A run that was begun, and its images; no images where the fit is finished.
 
     Args:
-        model, target, preset, settings: what the run must have been begun with, where it is not None; the settings are
-            ``seed``, ``skip_bad`` and ``threads``.
+        model, target, preset, assets, settings: what the run must have been begun with, where it is not None; the
+            settings are ``seed``, ``skip_bad`` and ``threads``.
 
     Raises:
         RunError: there is no run, or it was begun with something else.
@@ -73,6 +83,7 @@ def resume(
     given = {
         "model": None if model is None else lasting_reference(model),
         "target": None if target is None else str(target.resolve()),
+        "assets_folder": None if assets is None else os.path.abspath(assets),
         **settings,
     }
     given = {key: value for key, value in given.items() if value is not None}

@@ -13,8 +13,11 @@ from probscene.world import World
 SUFFIXES = (".rrd", ".glb")
 
 
-def view(model_or_run: str, out: Path, num: int = 1, seed: int = 0) -> None:
+def view(model_or_run: str, out: Path, num: int = 1, seed: int = 0, assets: Path | None = None) -> None:
     """Write scenes of a model's prior, or of a run's learnt structures, as ``out`` says by its suffix.
+
+    Args:
+        assets: see ``preview.opened``.
 
     Raises:
         ProbsceneError: a number that is not positive, several scenes in a .glb; see ``load_model`` and ``Run.guide``.
@@ -26,7 +29,7 @@ def view(model_or_run: str, out: Path, num: int = 1, seed: int = 0) -> None:
         raise DataError(f"Expected a file with the suffix {' or '.join(SUFFIXES)}, actual {out}; name one.")
     if num < 1 or (num > 1 and out.suffix == ".glb"):
         raise ProbsceneError(f"Expected a positive number of scenes, one in a .glb, actual {num}.")
-    model, policy = opened(model_or_run)
+    model, policy = opened(model_or_run, assets)
     with chunk_randomness(seed, 0):  # the first scenes of "preview" with this seed
         scenes = sample(model, policy, num)
     make_folder(out.parent)

@@ -267,7 +267,12 @@ FAULTS = {
     "no materials": ("a.obj", "mtllib gone.mtl\n" + CAR_OBJ, "gone.mtl, actual no such file"),
     "no texture": ("a.obj", TEXTURED, "texture my brick.png of .*no such file", "map_Kd -s 1 1 1 my brick.png\n"),
     "a texture that is none": ("a.obj", TEXTURED, r"Expected a picture, actual .*a\.mtl", "map_Kd a.mtl\n"),
-    "a broken texture": ("a.obj", ALL_TEXTURED, r"a picture that decodes, actual .*a\.png, which .*truncated", "map_Kd a.png\n"),
+    "a broken texture": (
+        "a.obj",
+        ALL_TEXTURED,
+        r"a picture that decodes, actual .*a\.png, which .*truncated",
+        "map_Kd a.png\n",
+    ),
     "a polygon with a dent": ("a.obj", DENTED + "f 1 2 3 4 5\n", "one with a dent in line 6 of"),
     "a dent, counted back": (
         "a.obj",
