@@ -238,7 +238,10 @@ def resolve_scene(part: Camera | Light | Photo, num_scenes: int) -> Camera | Lig
             dtype = torch.int64 if field.name == "seed" else torch.float32
             values[field.name] = _full(name, value, (num_scenes, 1), dtype).squeeze(1)
     if isinstance(part, Camera) and not (values["focal"] > 0).all():
-        raise ModelError(f"Expected a positive focal length in pixels, actual {float(values['focal'].min()):g}.")
+        worst = float(values["focal"].min())
+        raise ModelError(
+            f"Expected a positive focal length in pixels, actual {worst:g}; mend Camera.focal of the model."
+        )
     return replace(part, **values)
 
 

@@ -76,7 +76,7 @@ def read_kitti(
 ) -> tuple[Counts, tuple[str, ...], tuple[str, ...]]:
     """The counts ``(L, C)`` of a target's images, the C labelled classes in the model's order, and notes.
 
-    Files of images that are not in the target are not read.
+    Files of images that are not in the target are not read, which the notes say.
 
     Args:
         some: there need not be one for every image; those without are left out.
@@ -115,7 +115,7 @@ def read_kitti(
                 small += 1
             else:
                 row[classes.index(name)] += 1
-    notes = [*_notes(occurring, of_type)]
+    notes = [*_unread(folder, target), *_notes(occurring, of_type)]
     if cut:
         notes.append(f"{cut} objects that lie where images are cut are not counted.")
     if small:
@@ -125,18 +125,25 @@ def read_kitti(
 
 def _object(fields: list[str], where: str) -> Object:
     if len(fields) != len(COLUMNS):
-        raise DataError(f"Expected {len(COLUMNS)} columns ({' '.join(COLUMNS)}) {where}, actual {len(fields)}.")
+        longer = len(fields) == len(COLUMNS) + 1
+        remedy = "a type is one word, and labels have no score" if longer else "mend the line"
+        raise DataError(
+            f"Expected {len(COLUMNS)} columns ({' '.join(COLUMNS)}) {where}, actual {len(fields)}; {remedy}."
+        )
     values = []
     for name, text in zip(COLUMNS[1:], fields[1:], strict=True):
         try:
-            values.append(float(text))
+            values.append(float("nan" if "_" in text else text))  # Python reads 1_0 as 10
         except ValueError:
             values.append(math.nan)
         if not math.isfinite(values[-1]):
-            raise DataError(f"Expected a number for {name} {where}, actual {text!r}.")
+            raise DataError(f"Expected a number for {name} {where}, actual {text!r}; mend the line.")
     found = Object(fields[0], *values[3:7])
     if found.right < found.left or found.bottom < found.top:
-        raise DataError(f"Expected a box from left to right and top to bottom {where}, actual {' '.join(fields[4:8])}.")
+        raise DataError(
+            f"Expected a box from left to right and top to bottom {where}, actual {' '.join(fields[4:8])}; mend the "
+            "line."
+        )
     return found
 
 
@@ -145,6 +152,14 @@ def _class(type: str, classes: tuple[str, ...]) -> str | None:
     own = {name.casefold(): name for name in reversed(classes)}
     names = (type.casefold(), *TYPES.get(type, ()))
     return next((own[name] for name in names if name in own and type != DONT_CARE), None)
+
+
+def _unread(folder: Path, target: ImageFolder) -> list[str]:
+    """Which files are of no image."""
+    images = {path.stem for path in (*target.paths, *target.bad)}
+    others = sorted(file.name for file in folder.glob("*.txt") if file.stem not in images)
+    more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+    return [f"Not read, since {target.path} has no such image: {others[0]}{more}."] if others else []
 
 
 def _notes(occurring: Counter, of_type: dict[str, str | None]) -> list[str]:

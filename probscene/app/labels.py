@@ -15,6 +15,7 @@ A folder of KITTI's label files, see ``kitti_labels``.
 import csv
 import io
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -238,10 +239,9 @@ def _text(path: Path) -> str:
 
 
 def _count(text: str, column: str, name: str, where: str) -> int:
-    try:
-        count = int(text)
-    except ValueError:
-        count = -1
-    if count < 0:
-        raise DataError(f"Expected a count of 0 or more for class {column!r} of {name} {where}, actual {text!r}.")
-    return count
+    if not re.fullmatch(r"\s*\+?[0-9]{1,9}\s*", text):
+        raise DataError(
+            f"Expected a count of 0 or more for class {column!r} of {name} {where}, actual {text!r}; write a whole "
+            "number."
+        )
+    return int(text)

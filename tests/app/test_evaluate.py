@@ -163,6 +163,8 @@ LABELS = {
     "negative": (changed(3, "000002.png,1,-2"), "'blue' of 000002.png in line 4", "'-2'"),
     "a half": (changed(3, "000002.png,1.5,2"), "'red' of 000002.png", "'1.5'"),
     "a word": (changed(3, "000002.png,,2"), "'red' of 000002.png", "''"),
+    "a number with a gap": (changed(3, "000002.png,1_0,2"), "'red' of 000002.png", "'1_0'"),
+    "a huge number": (changed(3, f"000002.png,{10**20},2"), "'red' of 000002.png", "whole number"),
     "a quote": (changed(3, '"000002.png,1,2'), "CSV"),
 }
 

@@ -37,7 +37,7 @@ def line(type, height=30.0, left=10.0) -> str:
 def images(folder, names) -> SimpleNamespace:
     """Of an ``ImageFolder``, the paths, and that nothing is cut."""
     paths = [Path(folder, name) for name in names]
-    return SimpleNamespace(path=Path(folder), paths=paths, windows=[None] * len(names))
+    return SimpleNamespace(path=Path(folder), paths=paths, bad={}, windows=[None] * len(names))
 
 
 @given(st.lists(st.lists(st.sampled_from([*CLASS, *OTHERS])), min_size=1, max_size=9))
@@ -50,6 +50,7 @@ def test_counts_are_those_of_the_lines(tmp_path_factory, frames):
     assert classes == ("car", "pedestrian", "bike", "truck")  # nobody labels trees
     assert counts.tolist() == [[sum(CLASS.get(t) == c for t in types) for c in classes] for types in frames]
     out = Counter(type for types in frames for type in types if type in OTHERS)
+    assert notes[0] == f"Not read, since x has no such image: {len(frames):06d}.txt."
     assert all(f"{number} {type}" in notes[-1] for type, number in out.items())
     assert any("Cyclist as bike" in note for note in notes) == any("Cyclist" in types for types in frames)
 
@@ -92,9 +93,11 @@ def test_images_without_a_file_are_left_out_only_where_some_are_labelled(tmp_pat
 
 
 FAULTS = {
-    "fourteen columns": (line("Car").rsplit(" ", 1)[0], "15 columns", "actual 14"),
-    "a score": (line("Car") + " 0.93", "15 columns", "actual 16"),
+    "fourteen columns": (line("Car").rsplit(" ", 1)[0], "15 columns", "actual 14; mend the line"),
+    "a score": (line("Car") + " 0.93", "15 columns", "actual 16; ", "no score"),
     "two words": (line("Person sitting"), "15 columns", "actual 16"),
+    "seventeen columns": (line("Car") + " 0.93 1", "15 columns", "actual 17; mend the line"),
+    "a number with a gap": (line("Car").replace("12.00", "1_2"), "a number for z", "'1_2'"),
     "a word": (line("Car").replace("12.00", "far"), "a number for z", "'far'"),
     "not a number": (line("Car").replace("130.00", "nan"), "a number for bottom", "'nan'"),
     "without end": (line("Car").replace("1.60", "inf"), "a number for width", "'inf'"),
