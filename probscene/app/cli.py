@@ -167,6 +167,7 @@ def fit(
     """Learn which structures occur in a folder of unlabelled images."""
     from probscene.app import session
     from probscene.app.display import Display
+    from probscene.app.loading import split_reference
 
     if seed is not None:
         _seed(seed)
@@ -176,6 +177,8 @@ def fit(
     if scenarios is not None:
         if model is None:
             raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")
+        if split_reference(model)[1]:
+            raise ProbsceneError(f"Expected scenarios once, actual {model} and {scenarios}; leave out --scenarios.")
         model = f"{model}:{scenarios}"
     with Display() as show:
         if resume:

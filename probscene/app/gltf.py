@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from probscene.app.files import write_whole
+from probscene.app.files import make_folder, write_whole
 from probscene.app.pieces import camera_matrix, intrinsics, pieces
 from probscene.world import World
 
@@ -57,6 +57,7 @@ def write_gltf(path: Path, world: World, scene: int, canvas: tuple[int, int]) ->
     whole.camera = trimesh.scene.Camera("camera", resolution=canvas[::-1], fov=fov)
     whole.camera_transform = UP @ camera_matrix(world, scene) @ LOOK
     data = whole.export(file_type="glb")
+    make_folder(path.parent)
     write_whole(path, lambda temporary: temporary.write_bytes(data))
 
 

@@ -135,13 +135,21 @@ def _exported(names: dict, reference: str, wanted: tuple[str, ...] = ()) -> Scen
     return next(iter(found.values()))
 
 
+def _named(wanted: tuple[str, ...]) -> str:
+    return ",".join(repr(name) if not name.isidentifier() else name for name in wanted)
+
+
 def _joined(scenarios: dict[str, SceneModel], reference: str, wanted: tuple[str, ...]) -> SceneModel:
     if not scenarios:
-        raise ModelError(f"Expected SCENARIOS in {reference}, from which {','.join(wanted)} are chosen, actual none.")
+        raise ModelError(
+            f"Expected SCENARIOS in {reference}, from which {_named(wanted)} are chosen, actual none; name no "
+            "scenarios."
+        )
     unknown = [name for name in wanted if name not in scenarios]
     if unknown or len(set(wanted)) < len(wanted):
         raise ModelError(
-            f"Expected scenarios of {reference} among {', '.join(scenarios)}, each once, actual {', '.join(wanted)}."
+            f"Expected scenarios of {reference} among {', '.join(scenarios)}, each once, actual {_named(wanted)}; name "
+            "them with commas between, or none for all."
         )
     chosen = {name: scenarios[name] for name in wanted or scenarios}
     if len(chosen) == 1:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from probscene.app.files import write_whole
+from probscene.app.files import make_folder, write_whole
 from probscene.app.pieces import camera_matrix, intrinsics, pieces
 from probscene.app.preview import colour_of
 from probscene.batch import RenderBatch
@@ -56,6 +56,7 @@ def write_recording(path: Path, model: SceneModel, derivation: Derivation, drawi
         recording.flush()
         recording.disconnect()
 
+    make_folder(path.parent)
     write_whole(path, write)
 
 

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from probscene.app.files import make_folder
 from probscene.app.loading import renderer_for
 from probscene.app.preview import opened
 from probscene.app.provenance import chunk_randomness
@@ -32,7 +31,6 @@ def view(model_or_run: str, out: Path, num: int = 1, seed: int = 0, assets: Path
     model, policy = opened(model_or_run, assets)
     with chunk_randomness(seed, 0):  # the first scenes of "preview" with this seed
         scenes = sample(model, policy, num)
-    make_folder(out.parent)
     if out.suffix == ".rrd":
         from probscene.app.recording import write_recording
 

@@ -42,12 +42,15 @@ def test_a_reference_names_all_scenarios_some_or_one():
     both = load_model(f"{STREETS}:yard,row")
     assert [name for name, _ in both.scenarios] == ["yard", "row"] and both.name == "streets-yard-row"
     assert load_model(f"{STREETS}:yard").name == "yard" and not load_model(f"{STREETS}:yard").scenarios
-    with pytest.raises(ModelError, match="among row, yard, each once, actual row, lawn"):
+    with pytest.raises(ModelError, match="among row, yard, each once, actual row,lawn; name them"):
         load_model(f"{STREETS}:row,lawn")
     with pytest.raises(ModelError, match="each once"):
         load_model(f"{STREETS}:row,row")
-    with pytest.raises(ModelError, match="SCENARIOS in multi_mnist, from which a are chosen, actual none"):
+    with pytest.raises(ModelError, match="SCENARIOS in multi_mnist, from which a are chosen, actual none; name no"):
         load_model("multi_mnist:a")
+    for names, said in (("", "''"), ("row,", "row,''"), ("row;yard", "'row;yard'")):
+        with pytest.raises(ModelError, match=f"each once, actual {said}; name them with commas"):
+            load_model(f"{STREETS}:{names}")
 
 
 def test_one_guide_a_scenario_is_learnt(joint_run):
@@ -100,3 +103,5 @@ def test_scenarios_that_there_are_not(tmp_path, call, joint_target):
     target = joint_target / "drawn" / "images"
     done = call("fit", STREETS, "--scenarios", "row,lawn", "--target", target, "--out", tmp_path / "run")
     assert done.code == 2 and "among row, yard" in done.err and not (tmp_path / "run").exists()
+    twice = call("fit", f"{STREETS}:row", "--scenarios", "yard", "--target", target, "--out", tmp_path / "run")
+    assert twice.code == 2 and "Expected scenarios once" in twice.err and not (tmp_path / "run").exists()

@@ -14,6 +14,7 @@ import trimesh
 from probscene.app.loading import load_model, renderer_for
 from probscene.app.pieces import camera_matrix, intrinsics, pieces
 from probscene.app.provenance import chunk_randomness
+from probscene.app.run import Run
 from probscene.sampling import sample
 
 LOTS = Path(__file__).with_name("lots.py")
@@ -118,9 +119,27 @@ def test_what_is_projected_from_pieces_is_what_is_rendered(lots):
 def test_views_that_cannot_be(tmp_path, call, discs):
     for words, message in (
         (("--out", tmp_path / "scene.ply"), "suffix .rrd or .glb"),
-        (("--out", tmp_path / "scene.glb"), "a model in 3D"),
+        (("--out", tmp_path / "new" / "scene.glb"), "a model in 3D"),
         (("--out", tmp_path / "scene.glb", "--num", 2), "one in a .glb, actual 2"),
         (("--out", tmp_path / "scene.rrd", "--num", 0), "positive number of scenes"),
     ):
         done = call("view", discs.file, *words)
         assert done.code == 2 and message in done.err and not list(tmp_path.iterdir())
+
+
+def test_without_rerun_the_message_says_how_to_get_it(tmp_path, call, discs, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    done = call("view", discs.file, "--out", tmp_path / "new" / "scene.rrd")
+    assert done.code == 1 and "pip install 'probscene[view]'" in done.err and not list(tmp_path.iterdir())
+
+
+def test_a_folder_is_made(tmp_path, call, lots):
+    for name in ("scene.glb", "scene.rrd"):
+        done = call("view", LOTS, "--out", tmp_path / name.partition(".")[2] / "new" / name)
+        assert done.code == 0 and (tmp_path / name.partition(".")[2] / "new" / name).is_file(), done.err
+
+
+def test_a_fit_that_is_not_finished_cannot_be_seen(tmp_path, call):
+    Run.create(tmp_path / "run", str(LOTS), {"guide": {"hidden": 8}})
+    done = call("view", tmp_path / "run", "--out", tmp_path / "scene.rrd")
+    assert done.code == 2 and "Expected a finished fit" in done.err and not (tmp_path / "scene.rrd").exists()
