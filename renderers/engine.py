@@ -58,6 +58,7 @@ def start() -> None:
             arch=ti.cpu,
             cpu_max_num_threads=available_threads(),
             fast_math=False,
+            cfg_optimization=False,  # takes longer than all other passes where arrays are local; LLVM does as well
             log_level=ti.ERROR,
             **_cache(),
         )

@@ -15,7 +15,7 @@ from probscene.renderers.vertex_kernel import CORNER, transform, vertex
 
 STEEPEST = 1.0  # metres; see record_triangle
 
-i32, f32, f64 = ti.i32, ti.f32, ti.f64
+i32, u64, f32, f64 = ti.i32, ti.u64, ti.f32, ti.f64
 
 
 @ti.func
@@ -44,6 +44,12 @@ def put_plane(at: i32, plane, u: f64, v: f64, records: ti.template()):
 
 
 @ti.func
+def put_number(at: i32, number: f64, records: ti.template()):
+    """What is the same all over a triangle."""
+    records[at], records[at + 1], records[at + 2] = ti.cast(number, f32), f32(0.0), f32(0.0)
+
+
+@ti.func
 def record_triangle(
     k: i32, face: i32, r: i32, m: i32, from_u: f64, from_v: f64, texel: f64, p, q, o,
     whole: ti.template(), real: ti.template(), faces: ti.template(), records: ti.template(), marks: ti.template(),
@@ -64,11 +70,12 @@ def record_triangle(
         put_plane(r + shading.PLANE_SUN, p * sun0 + q * sun1 + o * sun2, from_u, from_v, records)
         put_plane(r + shading.PLANE_UP, p * up0 + q * up1 + o * up2, from_u, from_v, records)
     else:
-        records[r + shading.PLANE_SUN], records[r + shading.PLANE_UP] = ti.cast(sun0, f32), ti.cast(up0, f32)
+        put_number(r + shading.PLANE_SUN, sun0, records)
+        put_number(r + shading.PLANE_UP, up0, records)
     least = high(least, f64(0.01))
     lift = texel * ti.sqrt(high(1 - least * least, f64(0.0))) / least
     records[r + shading.LIFT] = ti.cast(low(lift, f64(STEEPEST)), f32)
-    if texture >= 0:
+    if texture > 0:
         for axis in ti.static(range(2)):
             f = face + atlas.UV + axis
             plane = p * ti.cast(faces[f], f64) + q * ti.cast(faces[f + 2], f64) + o * ti.cast(faces[f + 4], f64)
@@ -85,7 +92,7 @@ def record_triangle(
 
 @ti.func
 def draw_instance(
-    k: i32, mark: i32, count: i32, node: i32, height: i32, width: i32, zooms: i32, base: i32, stamp_base: i32,
+    k: i32, count: i32, node: i32, height: i32, width: i32, zooms: i32, base: i32, stamp_base: i32,
     corner_base: i32, record_base: i32, mark_base: i32, texel: f64,
     whole: ti.template(), real: ti.template(), positions: ti.template(), triangles: ti.template(),
     faces: ti.template(), seen: ti.template(), stamp: ti.template(), corners: ti.template(), records: ti.template(),
@@ -94,7 +101,7 @@ def draw_instance(
     """Draw what faces the camera with records from ``count + 1`` on.
 
     ``zooms`` is 2 where there is a second buffer behind the first, of twice as many columns and rows. Returns the last
-    record, and how many pixels have got the mark.
+    record, and how many pixels of the node were stamped.
     """
     transform(k, tables.TO_IMAGE, 1, corner_base, whole, real, positions, corners)
     first, last, area = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32), count, i32(0)
@@ -148,29 +155,41 @@ def draw_instance(
                 scale = f64(1.0) / a.dot(p)
                 p, q, o = p * scale, q * scale, o * scale
                 w = p + q + o
-                last += i32(1)
-                record_triangle(
-                    k, t * atlas.FACE, record_base + last * shading.RECORD, mark_base + last * shading.MARKS,
-                    ti.cast(ti.min(column, width - 1), f64), ti.cast(ti.min(row, height - 1), f64), texel,
-                    p, q, o,
-                    whole, real, faces, records, marks,
-                )  # fmt: skip
+                visible = i32(0)
                 for piece in range(ti.select(behind == 1, i32(2), i32(1))):
                     if piece == 1:
                         u1, v1, u2, v2 = u2, v2, u3, v3
                     for zoom in range(i32(1), zooms + i32(1)):
                         by, shift = ti.cast(zoom, f64), 0.5 * ti.cast(zoom - 1, f64)
-                        stamped = ti.select(zoom == 1, mark, i32(0))
-                        area += fill(
+                        seen_here, fresh = fill(
                             u0 * by + shift, v0 * by + shift, u1 * by + shift, v1 * by + shift, u2 * by + shift,
-                            v2 * by + shift, w[2] - (w[0] + w[1]) * shift / by, w[0] / by, w[1] / by, last, stamped,
-                            height * zoom, width * zoom, base + (zoom - 1) * height * width, stamp_base, seen, stamp,
+                            v2 * by + shift, w[2] - (w[0] + w[1]) * shift / by, w[0] / by, w[1] / by, last + 1,
+                            ti.cast(node >= 0 and zoom == 1, i32), height * zoom, width * zoom,
+                            base + (zoom - 1) * height * width, stamp_base, seen, stamp,
                         )  # fmt: skip
+                        visible, area = visible | seen_here, area + fresh
+                if visible != 0:
+                    last += i32(1)
+                    record_triangle(
+                        k, t * atlas.FACE, record_base + last * shading.RECORD, mark_base + last * shading.MARKS,
+                        ti.cast(ti.min(column, width - 1), f64), ti.cast(ti.min(row, height - 1), f64), texel, p, q, o,
+                        whole, real, faces, records, marks,
+                    )  # fmt: skip
     if node >= 0 and low_u <= high_u:
         e = node * tables.EXTENT
         extent[e], extent[e + 1] = low(extent[e], low_u + 0.5), low(extent[e + 1], low_v + 0.5)
         extent[e + 2], extent[e + 3] = high(extent[e + 2], high_u + 0.5), high(extent[e + 3], high_v + 0.5)
     return last, area
+
+
+@ti.func
+def unstamp(node: i32, height: i32, width: i32, stamp_base: i32, extent: ti.template(), stamp: ti.template()):
+    """Clear the stamps of a node, which lie within its extent."""
+    e, across = node * tables.EXTENT, (width + 63) >> 6
+    left, right = up(extent[e] - 1, width) >> 6, (up(extent[e + 2], width) + i32(63)) >> 6
+    for row in range(up(extent[e + 1] - 1, height), up(extent[e + 3], height)):
+        for word in range(left, right):
+            stamp[stamp_base + row * across + word] = u64(0)
 
 
 @ti.func
@@ -197,8 +216,9 @@ def lay_ground(
         records[r + shading.W_U], records[r + shading.W_V] = ti.cast(w[0], f32), ti.cast(w[1], f32)
         put_plane(r + shading.PLANE_S, across / -tiles[at + 1], middle_u, middle_v, records)
         put_plane(r + shading.PLANE_T, along / tiles[at], middle_u, middle_v, records)
-        records[r + shading.PLANE_SUN] = ti.cast(scenes[s + tables.SUN_UP], f32)
-        records[r + shading.PLANE_UP], records[r + shading.LIFT] = f32(1.0), f32(0.0)
+        put_number(r + shading.PLANE_SUN, scenes[s + tables.SUN_UP], records)
+        put_number(r + shading.PLANE_UP, 1.0, records)
+        records[r + shading.LIFT] = f32(0.0)
         for channel in ti.static(range(3)):
             records[r + shading.RGB + channel] = f32(1.0)
         marks[m + shading.LABEL], marks[m + shading.CLASS] = i32(0), strip[at + 1]

@@ -11,8 +11,8 @@ from probscene.renderers.texture_atlas import TextureAtlas
 # Columns of a face: sRGB colour in 0..1, whether it takes a tint, whether its corners' normals differ, the normals and
 # texture coordinates of its corners.
 COLOUR, TINTED, SMOOTH, NORMAL, UV, FACE = 0, 3, 4, 5, 14, 20
-# Columns of ``rows``, one row a mesh: where its vertices and triangles begin, how many there are, its texture or -1,
-# whether it is closed.
+# Columns of ``rows``, one row a mesh: where its vertices and triangles begin, how many there are, its texture, 0 for
+# none, whether it is closed.
 VERTEX, VERTICES, TRIANGLE, TRIANGLES, TEXTURE, CLOSED = range(6)
 
 _FACES, _TEXELS = 1 << 20, 1 << 24  # kept between calls, 96 MiB and 128 MiB
@@ -71,7 +71,7 @@ class MeshAtlas:
                 vertices[1:],
                 len(self.corners) // 3 + triangles.cumsum()[:-1],
                 triangles[1:],
-                [texture.get(mesh, -1) for mesh in meshes],
+                [texture.get(mesh, 0) for mesh in meshes],
                 [_closed(mesh) for mesh in meshes],
             ],
             1,

@@ -139,7 +139,7 @@ def scene_table(world: World, sight: View, shadow: tuple[np.ndarray, ...]) -> np
     focal, lights[:, tables.LENS + 1], lights[:, tables.LENS + 2] = numbers(
         world.camera, "focal", "centre_x", "centre_y"
     )
-    lights[:, tables.LENS], lights[:, tables.BLOCK] = 1 / focal, np.clip(focal // 64, 1, 8)
+    lights[:, tables.LENS] = 1 / focal
     exposure, contrast, saturation, noise = numbers(photo, "exposure", "contrast", "saturation", "noise")
     sun, ambient, haze, zenith, horizon = numbers(light, "sun", "ambient", "haze", "zenith", "horizon")
     rows[:, tables.SUN_UP] = sight.sun[:, 2, 2]

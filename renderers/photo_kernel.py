@@ -1,6 +1,7 @@
 """What the camera's electronics make of a colour: saturation and contrast, noise, bytes."""
 
 from probscene.renderers.engine import ti
+from probscene.renderers.lane_kernel import LANES, whole
 from probscene.renderers.mesh_tables import BIAS, DEVELOPED, MATRIX, NOISE
 from probscene.renderers.raster_kernel import high, low
 
@@ -26,34 +27,29 @@ def bell(bits: u64):
 @ti.func
 def byte(value: f32):
     """The nearest whole number of 255ths, by the lowest bits of a number that has no smaller ones."""
-    bits = ti.bit_cast(low(high(value, f32(0.0)), f32(1.0)) * f32(255.0) + f32(8388608.0), u32)
-    return ti.cast(bits & 255, ti.u8)
+    bits = ti.bit_cast(low(high(value, f32(0.0)), f32(1.0)) * f32(255.0) + f32(8388608.0), i32)
+    return bits & i32(255)
 
 
 @ti.func
-def develop(pixel: i32, out: i32, r: f32, g: f32, b: f32, light, seed: i64, image: ti.template()):
-    """A colour to the bytes of pixel ``out`` of all, which is ``pixel`` of its image."""
-    red, green, blue = r, g, b
+def develop(pixel: i32, out: i32, count: i32, light, seed: i64, some: ti.template(), image: ti.template()):
+    """Colours to the bytes of ``count`` pixels from ``out`` of all, which is ``pixel`` of its image."""
     if light[DEVELOPED] != 0:
-        red = light[MATRIX] * r + light[MATRIX + 1] * g + light[MATRIX + 2] * b + light[BIAS]
-        green = light[MATRIX + 3] * r + light[MATRIX + 4] * g + light[MATRIX + 5] * b + light[BIAS]
-        blue = light[MATRIX + 6] * r + light[MATRIX + 7] * g + light[MATRIX + 8] * b + light[BIAS]
+        for i in range(i32(LANES)):
+            r, g, b = some.red[i], some.green[i], some.blue[i]
+            some.red[i] = light[MATRIX] * r + light[MATRIX + 1] * g + light[MATRIX + 2] * b + light[BIAS]
+            some.green[i] = light[MATRIX + 3] * r + light[MATRIX + 4] * g + light[MATRIX + 5] * b + light[BIAS]
+            some.blue[i] = light[MATRIX + 6] * r + light[MATRIX + 7] * g + light[MATRIX + 8] * b + light[BIAS]
     if light[NOISE] > 0:
-        bits = scatter(seed, pixel)
-        red, green = red + light[NOISE] * bell(bits), green + light[NOISE] * bell(bits >> 21)
-        blue += light[NOISE] * bell(bits >> 42)
-    image[3 * out], image[3 * out + 1], image[3 * out + 2] = byte(red), byte(green), byte(blue)
-
-
-@ti.func
-def put(
-    x: i32, pixel: i32, out: i32, red: f32, green: f32, blue: f32, share: f32, light, seed: i64, line_base: i32,
-    tap: ti.template(), line: ti.template(), image: ti.template(),
-):  # fmt: skip
-    """A colour of column ``x`` to the image, or a share of it to the colours that wait in ``line``."""
-    if ti.static(tap):
-        p = line_base + 3 * x
-        line[p], line[p + 1] = line[p] + red * share, line[p + 1] + green * share
-        line[p + 2] = line[p + 2] + blue * share
-    else:
-        develop(pixel + x, out + x, red, green, blue, light, seed, image)
+        for i in range(i32(LANES)):
+            bits = scatter(seed, pixel + i)
+            some.red[i] = some.red[i] + light[NOISE] * bell(bits)
+            some.green[i] = some.green[i] + light[NOISE] * bell(bits >> 21)
+            some.blue[i] = some.blue[i] + light[NOISE] * bell(bits >> 42)
+    red, green, blue = whole(0), whole(0), whole(0)
+    for i in range(i32(LANES)):
+        red[i], green[i], blue[i] = byte(some.red[i]), byte(some.green[i]), byte(some.blue[i])
+    for i in range(count):
+        at = 3 * (out + i)
+        image[at], image[at + 1] = ti.cast(red[i], ti.u8), ti.cast(green[i], ti.u8)
+        image[at + 2] = ti.cast(blue[i], ti.u8)

@@ -7,6 +7,7 @@ The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above 
 
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers.engine import ti
+from probscene.renderers.lane_kernel import LANES, words
 
 i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
 
@@ -59,33 +60,44 @@ def columns(y: f64, u0: f64, v0: f64, v1: f64, u1: f64, whole: f64, upper: f64, 
 
 
 @ti.func
+def stamp_row(first: i32, last: i32, at: i32, stamp: ti.template()):
+    """Set the bits of columns ``first`` to ``last`` of a row of stamps; returns how many were not set."""
+    fresh = i32(0)
+    for word in range(first >> 6, (last + i32(63)) >> 6):
+        begin, end = ti.max(first - (word << 6), i32(0)), ti.min(last - (word << 6), i32(64))
+        bits = (~u64(0) >> ti.cast(64 - end + begin, u64)) << ti.cast(begin, u64)
+        old = stamp[at + word]
+        fresh += ti.cast(ti.math.popcnt(bits & ~old), i32)
+        stamp[at + word] = old | bits
+    return fresh
+
+
+@ti.func
 def fill(
-    a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, w: f64, w_u: f64, w_v: f64, record: i32, mark: i32,
+    a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, w: f64, w_u: f64, w_v: f64, record: i32, stamped: i32,
     height: i32, width: i32, base: i32, stamp_base: i32, seen: ti.template(), stamp: ti.template(),
 ):  # fmt: skip
     """Draw a triangle with corners (a, b) of columns and rows; 1/z is ``w`` at the first sample and linear.
 
-    Where ``mark`` is not 0 it is stamped, and the samples that did not have it are counted.
+    Where it is to be ``stamped`` the samples that were not yet are counted. Returns whether any of it is seen, and the
+    count.
     """
     u0, v0, u1, v1, u2, v2 = by_height(a0, b0, a1, b1, a2, b2)
     whole, upper, lower = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
-    slope, area = ti.cast(w_u, f32), i32(0)
+    slope, visible, area = ti.cast(w_u, f32), i32(0), i32(0)
     for row in range(up(v0, height), up(v2, height)):
         y = ti.cast(row, f64)
         first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, width)
-        start = ti.cast(w + w_v * y + w_u * ti.cast(first, f64), f32)
-        line = base + row * width
-        for column in range(first, last):
-            word = key(start + slope * ti.cast(column - first, f32), record)
-            if word > seen[line + column]:
-                seen[line + column] = word
-        if mark != 0:
-            stamps = stamp_base + row * width
+        if first < last:
+            start = ti.cast(w + w_v * y + w_u * ti.cast(first, f64), f32)
+            line = base + row * width
             for column in range(first, last):
-                if stamp[stamps + column] != mark:
-                    stamp[stamps + column] = mark
-                    area += i32(1)
-    return area
+                word = key(start + slope * ti.cast(column - first, f32), record)
+                if word > seen[line + column]:
+                    seen[line + column], visible = word, i32(1)
+            if stamped != 0:
+                area += stamp_row(first, last, stamp_base + row * ((width + 63) >> 6), stamp)
+    return visible, area
 
 
 @ti.func
@@ -105,41 +117,40 @@ def beyond(start: i32, end: i32, constant: f64, slope: f64):
 
 
 @ti.func
-def fill_ground(
-    scene: i32, strips: i32, height: i32, width: i32, base: i32, zoom: f64, origin: f64,
+def lay_row(
+    scene: i32, strips: i32, row: i32, width: i32, line: i32, zoom: f64, origin: f64,
     scenes: ti.template(), edges: ti.template(), seen: ti.template(),
 ):  # fmt: skip
-    """Clear the buffer, and draw the strips with records 1 to ``strips``; samples are at ``origin + zoom * column``.
+    """Draw a row of the strips with records 1 to ``strips``; samples are at ``origin + zoom * column``.
 
     A column is in the strip above an edge where the ray's y is; that and 1/z are linear along a row.
     """
     s = scene * tables.SCENE
     eye_y, eye_z = scenes[s + tables.EYE + 1], scenes[s + tables.EYE + 2]
     y_u, z_u = scenes[s + tables.RAY + 4] * zoom, scenes[s + tables.RAY + 7] * zoom
-    for row in range(height):
-        v = origin + zoom * ti.cast(row, f64)
-        ray_y = scenes[s + tables.RAY + 3] + scenes[s + tables.RAY + 4] * origin + scenes[s + tables.RAY + 5] * v
-        ray_z = scenes[s + tables.RAY + 6] + scenes[s + tables.RAY + 7] * origin + scenes[s + tables.RAY + 8] * v
-        line = base + row * width
-        first, last = i32(0), i32(0)
-        if strips > 0:
-            first, last = beyond(0, width, -ray_z, -z_u)
-            first, last = beyond(first, last, eye_z / tables.NEAR + ray_z, z_u)
-        for column in range(i32(0), first):
-            seen[line + column] = u64(0)
-        for column in range(ti.max(last, first), width):
-            seen[line + column] = u64(0)
-        left, right = first, last
-        for strip in range(strips):
-            a, b = left, right  # what lies above the edges so far
-            if strip < strips - 1:
-                gap = eye_y - edges[scene * (strips - 1) + strip]
-                constant, slope = gap * ray_z - eye_z * ray_y, gap * z_u - eye_z * y_u
-                a, b = beyond(left, right, constant, slope)
-                if a > left:
-                    right = a
-                else:
-                    left = b
-            w, w_u = ti.cast(-ray_z / eye_z, f32), ti.cast(-z_u / eye_z, f32)
-            for column in range(a, b):
-                seen[line + column] = key(w + w_u * ti.cast(column, f32), strip + 1)
+    v = origin + zoom * ti.cast(row, f64)
+    ray_y = scenes[s + tables.RAY + 3] + scenes[s + tables.RAY + 4] * origin + scenes[s + tables.RAY + 5] * v
+    ray_z = scenes[s + tables.RAY + 6] + scenes[s + tables.RAY + 7] * origin + scenes[s + tables.RAY + 8] * v
+    left, right = beyond(0, width, -ray_z, -z_u)
+    left, right = beyond(left, right, eye_z / tables.NEAR + ray_z, z_u)
+    w, w_u = ti.cast(-ray_z / eye_z, f32), ti.cast(-z_u / eye_z, f32)
+    for strip in range(strips):
+        a, b = left, right  # what lies above the edges so far
+        if strip < strips - 1:
+            gap = eye_y - edges[scene * (strips - 1) + strip]
+            constant, slope = gap * ray_z - eye_z * ray_y, gap * z_u - eye_z * y_u
+            a, b = beyond(left, right, constant, slope)
+            if a > left:
+                right = a
+            else:
+                left = b
+        while a + LANES <= b:
+            nearest = words(0)
+            for i in range(i32(LANES)):
+                here = key(w + w_u * ti.cast(a + i, f32), strip + 1)
+                nearest[i] = high(seen[line + a + i], here)
+            for i in ti.static(range(LANES)):
+                seen[line + a + i] = nearest[i]
+            a += i32(LANES)
+        for column in range(a, b):
+            seen[line + column] = high(key(w + w_u * ti.cast(column, f32), strip + 1), seen[line + column])

@@ -5,6 +5,8 @@ The map is cleared, written and read in tiles of 16 x 16, and only those that so
 
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers.engine import ti
+from probscene.renderers.lane_kernel import LANES, floats
+from probscene.renderers.mesh_tables import ON_MAP
 from probscene.renderers.raster_kernel import by_height, columns, high, low, up
 from probscene.renderers.vertex_kernel import CORNER, transform, vertex
 
@@ -88,17 +90,30 @@ def cast_shadow(
 
 
 @ti.func
-def sunlit(column: f32, row: f32, near: f32, size: i32, base: i32, mark: i32,
-           shadow: ti.template(), opened: ti.template()):  # fmt: skip
-    """Share of the four nearest texels of the shadow map that let the sun through, by their distance; 1 beyond it."""
-    share = f32(1.0)
-    if column >= 0 and row >= 0 and column < ti.cast(size - 1, f32) and row < ti.cast(size - 1, f32):
-        i, j = ti.cast(column, i32), ti.cast(row, i32)
-        if opened[tile_at(i, j, base, size)] == mark:
-            across, down = column - ti.cast(i, f32), row - ti.cast(j, f32)
-            at = base + j * size + i
-            a, b = ti.cast(near >= shadow[at], f32), ti.cast(near >= shadow[at + 1], f32)
-            c, d = ti.cast(near >= shadow[at + size], f32), ti.cast(near >= shadow[at + size + 1], f32)
-            upper, lower = a + (b - a) * across, c + (d - c) * across
-            share = upper + (lower - upper) * down
-    return share
+def sunlit(
+    z: ti.template(), light, size: i32, base: i32, mark: i32, shadow: ti.template(), opened: ti.template(),
+    some: ti.template(), through: ti.template(),
+):  # fmt: skip
+    """Multiply light by the share of the four nearest texels of the shadow map that let it through, by their distance.
+
+    ``z`` are depths of the samples; beyond the map everything is lit.
+    """
+    columns, rows, near = floats(0), floats(0), floats(0)
+    for i in range(i32(LANES)):
+        u, v = some.u[i], some.v[i]
+        columns[i] = light[ON_MAP] + z[i] * (light[ON_MAP + 1] + light[ON_MAP + 2] * u + light[ON_MAP + 3] * v)
+        rows[i] = light[ON_MAP + 4] + z[i] * (light[ON_MAP + 5] + light[ON_MAP + 6] * u + light[ON_MAP + 7] * v)
+        ray = light[ON_MAP + 9] + light[ON_MAP + 10] * u + light[ON_MAP + 11] * v
+        near[i] = some.lift[i] + light[ON_MAP + 8] + z[i] * ray
+    most = ti.cast(size - 1, f32)
+    for i in range(i32(LANES)):
+        column, row = columns[i], rows[i]
+        if through[i] > 0 and column >= 0 and row >= 0 and column < most and row < most:
+            x, y = ti.cast(column, i32), ti.cast(row, i32)
+            if opened[tile_at(x, y, base, size)] == mark:
+                across, down = column - ti.cast(x, f32), row - ti.cast(y, f32)
+                at = base + y * size + x
+                a, b = ti.cast(near[i] >= shadow[at], f32), ti.cast(near[i] >= shadow[at + 1], f32)
+                c, d = ti.cast(near[i] >= shadow[at + size], f32), ti.cast(near[i] >= shadow[at + size + 1], f32)
+                upper, lower = a + (b - a) * across, c + (d - c) * across
+                through[i] = through[i] * (upper + (lower - upper) * down)

@@ -9,9 +9,9 @@ import numpy as np
 from probscene.errors import ModelError
 
 LEVELS = 12
-# Columns of the table, one row a texture: its size, how many levels it has in width and in height, and where the texels
-# of level (x, y) begin: at AT + y * LEVELS + x.
-WIDTH, HEIGHT, LEVELS_X, LEVELS_Y, AT = range(5)
+# Columns of the table, one row a texture: its size, and where the texels of level (x, y) begin: at AT + y * LEVELS + x;
+# beyond the last level those of the last.
+WIDTH, HEIGHT, AT = range(3)
 COLUMNS = AT + LEVELS * LEVELS
 
 _MOST = (1 << 31) - 1  # the kernel's indices are 32-bit
@@ -19,7 +19,7 @@ _LANES = np.array([0, 16, 32], np.uint64)
 
 
 class TextureAtlas:
-    """Textures in the order in which they are added.
+    """Textures in the order in which they are added, after a white one, the first.
 
     Attributes:
         texels: uint64, red, green and blue in 16-bit lanes.
@@ -28,8 +28,8 @@ class TextureAtlas:
     """
 
     def __init__(self):
-        self.texels, self.table = np.zeros(1, np.uint64), np.zeros(COLUMNS, np.int32)  # Taichi takes no empty array
-        self.count = 0
+        self.texels, self.table, self.count = np.zeros(0, np.uint64), np.zeros(0, np.int32), 0
+        self.add([np.full((1, 1, 3), 255, np.uint8)])
 
     def add(self, textures: list[np.ndarray]) -> list[int]:
         """The numbers of new textures, ``(h, w, 3)`` uint8 each.
@@ -39,16 +39,16 @@ class TextureAtlas:
         """
         if not textures:
             return []
-        words, rows, used = [self.texels], [self.table[: self.count * COLUMNS]], self.texels.size
+        words, rows, used = [self.texels], [self.table], self.texels.size
         for texture in textures:
             row = np.zeros(COLUMNS, np.int64)
             across = _halvings(texture.astype(np.float64), 1)
-            row[[WIDTH, HEIGHT, LEVELS_X]] = texture.shape[1], texture.shape[0], len(across)
+            row[[WIDTH, HEIGHT]] = texture.shape[1], texture.shape[0]
+            begins = row[AT:].reshape(LEVELS, LEVELS)
             for x, narrow in enumerate(across):
                 both = _halvings(narrow, 0)
-                row[LEVELS_Y] = len(both)
                 for y, level in enumerate(both):
-                    row[AT + y * LEVELS + x] = used
+                    begins[y:, x:] = used
                     framed = np.pad(np.rint(level).astype(np.uint64), ((1, 1), (1, 1), (0, 0)), mode="wrap")
                     words.append((framed << _LANES).sum(-1, dtype=np.uint64).ravel())
                     used += words[-1].size

@@ -1,0 +1,43 @@
+"""Samples of an image side by side, in local arrays: what a loop over them computes, the compiler does for several at
+once. Arguments' arrays stop it from that, since anything written to one may change where the others lie.
+"""
+
+from probscene.renderers.engine import ti
+
+LANES = 16
+
+i32, f32, u64 = ti.i32, ti.f32, ti.u64
+floats, whole, words = (ti.types.vector(LANES, kind) for kind in (f32, i32, u64))
+
+
+@ti.dataclass
+class Samples:
+    """What is known of samples before they are shaded, and their colours.
+
+    ``u, v`` columns and rows; ``record`` of the visibility buffer, 0 in the sky; ``w`` 1/z and ``w_u, w_v`` its steps;
+    over depth ``s, t`` texture coordinates with their steps and ``sun, up`` cosines; ``lift`` metres by which light
+    finds it nearer to the sun; ``table`` where the texture's row begins, ``wide, high`` its texels; ``red, green,
+    blue`` the surface's colour and then the sample's.
+    """
+
+    u: floats
+    v: floats
+    record: whole
+    w: floats
+    w_u: floats
+    w_v: floats
+    s: floats
+    s_u: floats
+    s_v: floats
+    t: floats
+    t_u: floats
+    t_v: floats
+    sun: floats
+    up: floats
+    lift: floats
+    table: whole
+    wide: floats
+    high: floats
+    red: floats
+    green: floats
+    blue: floats
