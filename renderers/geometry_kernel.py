@@ -29,10 +29,12 @@ def at_near(inside, outside):
 @ti.func
 def cosines(n: i32, m: i32, real: ti.template(), faces: ti.template()):
     """A normal's cosines towards the sun and upward, in an instance that is turned and scaled."""
-    x, y, z = ti.cast(faces[n], f64), ti.cast(faces[n + 1], f64), ti.cast(faces[n + 2], f64)
-    a, b, c = x * real[m + tables.UNSCALE], y * real[m + tables.UNSCALE + 1], z * real[m + tables.UNSCALE + 2]
-    share = 1 / high(ti.sqrt(a * a + b * b + c * c), f64(1e-12))
-    sun = x * real[m + tables.TO_SUN] + y * real[m + tables.TO_SUN + 1] + z * real[m + tables.TO_SUN + 2]
+    x, y, z = faces[n], faces[n + 1], faces[n + 2]
+    a, b = x * ti.cast(real[m + tables.UNSCALE], f32), y * ti.cast(real[m + tables.UNSCALE + 1], f32)
+    c = z * ti.cast(real[m + tables.UNSCALE + 2], f32)
+    share = f32(1.0) / high(ti.sqrt(a * a + b * b + c * c), f32(1e-12))
+    sun = x * ti.cast(real[m + tables.TO_SUN], f32) + y * ti.cast(real[m + tables.TO_SUN + 1], f32)
+    sun += z * ti.cast(real[m + tables.TO_SUN + 2], f32)
     return sun * share, c * share
 
 
@@ -44,9 +46,9 @@ def put_plane(at: i32, plane, u: f64, v: f64, records: ti.template()):
 
 
 @ti.func
-def put_number(at: i32, number: f64, records: ti.template()):
+def put_number(at: i32, number: f32, records: ti.template()):
     """What is the same all over a triangle."""
-    records[at], records[at + 1], records[at + 2] = ti.cast(number, f32), f32(0.0), f32(0.0)
+    records[at], records[at + 1], records[at + 2] = number, f32(0.0), f32(0.0)
 
 
 @ti.func
@@ -67,14 +69,16 @@ def record_triangle(
         sun1, up1 = cosines(face + atlas.NORMAL + 3, s, real, faces)
         sun2, up2 = cosines(face + atlas.NORMAL + 6, s, real, faces)
         least = low(sun0, low(sun1, sun2))
-        put_plane(r + shading.PLANE_SUN, p * sun0 + q * sun1 + o * sun2, from_u, from_v, records)
-        put_plane(r + shading.PLANE_UP, p * up0 + q * up1 + o * up2, from_u, from_v, records)
+        sun = p * ti.cast(sun0, f64) + q * ti.cast(sun1, f64) + o * ti.cast(sun2, f64)
+        put_plane(r + shading.PLANE_SUN, sun, from_u, from_v, records)
+        rise = p * ti.cast(up0, f64) + q * ti.cast(up1, f64) + o * ti.cast(up2, f64)
+        put_plane(r + shading.PLANE_UP, rise, from_u, from_v, records)
     else:
         put_number(r + shading.PLANE_SUN, sun0, records)
         put_number(r + shading.PLANE_UP, up0, records)
-    least = high(least, f64(0.01))
-    lift = texel * ti.sqrt(high(1 - least * least, f64(0.0))) / least
-    records[r + shading.LIFT] = ti.cast(low(lift, f64(STEEPEST)), f32)
+    least = high(least, f32(0.01))
+    lift = ti.cast(texel, f32) * ti.sqrt(high(f32(1.0) - least * least, f32(0.0))) / least
+    records[r + shading.LIFT] = low(lift, f32(STEEPEST))
     if texture > 0:
         for axis in ti.static(range(2)):
             f = face + atlas.UV + axis
@@ -216,7 +220,7 @@ def lay_ground(
         records[r + shading.W_U], records[r + shading.W_V] = ti.cast(w[0], f32), ti.cast(w[1], f32)
         put_plane(r + shading.PLANE_S, across / -tiles[at + 1], middle_u, middle_v, records)
         put_plane(r + shading.PLANE_T, along / tiles[at], middle_u, middle_v, records)
-        put_number(r + shading.PLANE_SUN, scenes[s + tables.SUN_UP], records)
+        put_number(r + shading.PLANE_SUN, ti.cast(scenes[s + tables.SUN_UP], f32), records)
         put_number(r + shading.PLANE_UP, 1.0, records)
         records[r + shading.LIFT] = f32(0.0)
         for channel in ti.static(range(3)):
