@@ -15,7 +15,7 @@ from probscene.errors import ModelError
 from probscene.renderers import meshes as meshes_module
 from probscene.renderers.mesh_reference import MeshReference
 from probscene.renderers.meshes import MeshRenderer
-from probscene.world import Camera, Light, Meshes, Photo, resolve_scene
+from probscene.world import KITTI_CANVAS, Camera, Light, Meshes, Photo, resolve_scene
 
 CANVAS = (40, 66)
 RENDERER, SMOOTH = (MeshRenderer(CANVAS, threads=1, samples=samples) for samples in (1, 4))
@@ -91,6 +91,17 @@ def agrees(ours, twin):
     torch.testing.assert_close(ours.space.truncated, twin.space.truncated, rtol=0, atol=1e-3)
     torch.testing.assert_close(ours.space.box, twin.space.box, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(ours.space.intrinsics, twin.space.intrinsics)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_agrees_with_the_numpy_twin_at_full_size(shapes, seed):
+    """As large as KITTI's images; lines are as long as 78 times what is shaded at once."""
+    (height, width), world = KITTI_CANVAS, random_world(shapes, seed)[:1]
+    camera = Camera.kitti(KITTI_CANVAS, z=2.0, pitch=0.1, roll=0.2)
+    world = replace(world, camera=resolve_scene(camera, 1))
+    ours = MeshRenderer(KITTI_CANVAS, threads=1)(world)
+    assert ours.image.shape == (1, 3, height, width) and ours.pixels.any()
+    agrees(ours, MeshReference(KITTI_CANVAS, colours=False)(world))
 
 
 @settings(max_examples=6)
@@ -201,6 +212,18 @@ def test_empty_worlds(shapes, shape, layers, samples):
         assert ground is not None or torch.isinf(batch.space.depth).all()
 
 
+def test_where_nothing_is_visible_there_is_the_background(shapes):
+    """A node behind the camera, one below the ground, and one too far to cover a pixel."""
+    kind = torch.zeros(1, 3, dtype=torch.int64)
+    x, z = torch.tensor([[-9.0, 9.0, 9e5]]), torch.tensor([[0.0, -3.0, 0.0]])
+    hidden = shapes.world(Meshes("car", (shapes.box(1, 1, 1),), 0, x, 0.0, z), kind=kind, ground=shapes.road())
+    batch, empty = RENDERER(hidden), RENDERER(shapes.world(ground=shapes.road()))
+    assert torch.equal(batch.image, empty.image) and torch.equal(batch.space.depth, empty.space.depth)
+    assert batch.kind.tolist() == [[0, 0, 0]] and not batch.pixels.any() and not batch.box.any()
+    for labels in (batch.amodal_box, batch.visible, batch.space.truncated, batch.space.box):
+        assert torch.isfinite(labels).all()
+
+
 def test_what_is_behind_the_camera_has_an_empty_label(shapes):
     world = shapes.world(Meshes("car", (shapes.box(2, 1, 1),), 0, -9.0, 0.0))
     batch = RENDERER(world)
@@ -257,8 +280,12 @@ def test_worlds_that_cannot_be_are_named(shapes):
     world = shapes.world(Meshes("car", (shapes.box(1, 1, 1),), 0, 9.0, 0.0))
     with pytest.raises(ModelError, match="layer 0 as"):
         RENDERER(replace(world, kind=torch.zeros(1, 2, dtype=torch.int64)))
-    with pytest.raises(ModelError, match="positive focal length"):
-        RENDERER(replace(world, camera=replace(world.camera, focal=torch.tensor([-1.0]))))
+    for focal in (-1.0, 0.0):
+        with pytest.raises(ModelError, match="positive focal length"):
+            RENDERER(replace(world, camera=replace(world.camera, focal=torch.tensor([focal]))))
+    for focal in (np.nan, np.inf):
+        with pytest.raises(ModelError, match="finite cameras"):
+            RENDERER(replace(world, camera=replace(world.camera, focal=torch.tensor([focal]))))
     with pytest.raises(ModelError, match="finite cameras"):
         RENDERER(replace(world, camera=replace(world.camera, yaw=torch.tensor([np.inf]))))
     with pytest.raises(ModelError, match="at most 256 classes"):
@@ -278,7 +305,7 @@ def test_a_users_own_taichi_is_left_alone():
 import torch
 from probscene.renderers import engine
 from probscene.renderers.meshes import MeshRenderer
-from probscene.world import Camera, Light, Photo, World, resolve_scene
+from probscene.world import KITTI_CANVAS, Camera, Light, Photo, World, resolve_scene
 engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)
 parts = {k: resolve_scene(v, 1) for k, v in dict(camera=Camera(), light=Light(), photo=Photo()).items()}
 batch = MeshRenderer((20, 20), threads=1)(World(torch.zeros(1, 0, dtype=torch.int64), (), (), ground=None, **parts))
