@@ -12,7 +12,7 @@ import tempfile
 import warnings
 from pathlib import Path
 
-from probscene.errors import ProbsceneError
+from probscene.errors import ModelError, ProbsceneError
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # otherwise the import asks a server for the latest version
@@ -21,7 +21,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # deprecations inside Taichi must not fail a run under -W error
     import taichi as ti
 
-__all__ = ["available_threads", "started", "start", "ti"]
+__all__ = ["available_threads", "check_canvas", "started", "start", "ti"]
 
 _forked_after_start = False
 
@@ -31,6 +31,20 @@ def available_threads() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def check_canvas(canvas: tuple[int, int], threads: int | None, most: int) -> tuple[tuple[int, int], int]:
+    """Height and width, pixels, and how many threads render: one for every core where None.
+
+    Raises:
+        ModelError: a canvas that is empty or of more than ``most`` pixels, or fewer than one thread.
+    """
+    height, width = canvas
+    if min(height, width) < 1 or height * width > most:
+        raise ModelError(f"Expected a canvas of 1 to {most} pixels, actual {height} by {width}; choose another size.")
+    if threads is not None and threads < 1:
+        raise ModelError(f"Expected at least one thread, actual {threads}; leave it out to use every core.")
+    return (int(height), int(width)), threads or available_threads()
 
 
 def started() -> bool:

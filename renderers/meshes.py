@@ -51,18 +51,10 @@ class MeshRenderer:
     """
 
     def __init__(self, canvas: tuple[int, int], threads: int | None = None, samples: int = 1):
-        height, width = canvas
-        if min(height, width) < 1 or height * width > _MAX_CANVAS:
-            raise ModelError(
-                f"Expected a canvas of 1 to {_MAX_CANVAS} pixels, actual {height} by {width}; choose another size."
-            )
-        if threads is not None and threads < 1:
-            raise ModelError(f"Expected at least one thread, actual {threads}; leave it out to use every core.")
         if samples not in (1, 4):
             raise ModelError(f"Expected 1 or 4 samples a pixel, actual {samples}.")
-        self.canvas, self.samples = (int(height), int(width)), samples
-        self.threads = threads or engine.available_threads()
-        self.map_size = min(2048, max(256, 5 * int(width) // 96 * 16))
+        self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
+        self.samples, self.map_size = samples, min(2048, max(256, 5 * self.canvas[1] // 96 * 16))
         self._atlas = MeshAtlas()
         self._scratch: dict[str, np.ndarray] = {}
 

@@ -12,7 +12,6 @@ import torch
 
 from probscene.batch import RenderBatch
 from probscene.drawing import Drawing
-from probscene.errors import ModelError
 from probscene.renderers import engine
 from probscene.renderers import sprite_kernel as kernel
 from probscene.renderers.instances import Instances, instances
@@ -37,15 +36,7 @@ class SpriteRenderer:
     """
 
     def __init__(self, canvas: tuple[int, int], threads: int | None = None):
-        height, width = canvas
-        if min(height, width) < 1 or height * width > _MAX_CANVAS:
-            raise ModelError(
-                f"Expected a canvas of 1 to {_MAX_CANVAS} pixels, actual {height} by {width}; choose another size."
-            )
-        if threads is not None and threads < 1:
-            raise ModelError(f"Expected at least one thread, actual {threads}; leave it out to use every core.")
-        self.canvas = (int(height), int(width))
-        self.threads = threads or engine.available_threads()
+        self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
         self._sheet = Sheet()
 
     def __call__(self, drawing: Drawing) -> RenderBatch:
