@@ -4,6 +4,8 @@ A texture that is seen at a slant is small along one axis only, so it is kept at
 wide or half as high as the one before. A level has a frame of one texel, copied from its other side.
 """
 
+import hashlib
+
 import numpy as np
 
 from probscene.errors import ModelError
@@ -19,28 +21,28 @@ _LANES = np.array([0, 16, 32], np.uint64)
 
 
 class TextureAtlas:
-    """Textures in the order in which they are added, after a white one, the first.
+    """Textures in the order in which they are added, after a white one, the first; those that are equal once.
 
     Attributes:
         texels: uint64, red, green and blue in 16-bit lanes.
         table: int32, ``COLUMNS`` for each texture.
-        count: how many there are.
     """
 
     def __init__(self):
-        self.texels, self.table, self.count = np.zeros(0, np.uint64), np.zeros(0, np.int32), 0
+        self.texels, self.table = np.zeros(0, np.uint64), np.zeros(0, np.int32)
+        self._known: dict[tuple[tuple[int, ...], bytes], int] = {}  # by shape and digest
         self.add([np.full((1, 1, 3), 255, np.uint8)])
 
     def add(self, textures: list[np.ndarray]) -> list[int]:
-        """The numbers of new textures, ``(h, w, 3)`` uint8 each.
+        """The numbers of textures, ``(h, w, 3)`` uint8 each.
 
         Raises:
             ModelError: more texels than 31 bits can count.
         """
-        if not textures:
-            return []
         words, rows, used = [self.texels], [self.table], self.texels.size
-        for texture in textures:
+        keys = [(texture.shape, hashlib.sha256(texture.tobytes()).digest()) for texture in textures]
+        new = {key: texture for key, texture in zip(keys, textures, strict=True) if key not in self._known}
+        for texture in new.values():
             row = np.zeros(COLUMNS, np.int64)
             across = _halvings(texture.astype(np.float64), 1)
             row[[WIDTH, HEIGHT]] = texture.shape[1], texture.shape[0]
@@ -55,9 +57,10 @@ class TextureAtlas:
             if used > _MOST:
                 raise ModelError(f"Expected textures of at most {_MOST} texels in all, actual more; make them smaller.")
             rows.append(row.astype(np.int32))
-        self.texels, self.table = np.concatenate(words), np.concatenate(rows)
-        first, self.count = self.count, self.count + len(textures)
-        return list(range(first, self.count))
+        if new:
+            self.texels, self.table = np.concatenate(words), np.concatenate(rows)
+            self._known |= {key: len(self._known) + i for i, key in enumerate(new)}
+        return [self._known[key] for key in keys]
 
 
 def _halvings(texture: np.ndarray, axis: int) -> list[np.ndarray]:

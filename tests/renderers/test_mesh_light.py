@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from probscene.mesh import Surface
 from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.texture_atlas import TextureAtlas
 from probscene.world import Camera, Ground, Light, Meshes, Photo
 
 CANVAS = (188, 300)
@@ -192,3 +193,29 @@ def test_noise_is_normal_and_of_its_seed(shapes):
     rows = torch.cat([noise.flatten(0, 1), noise.flatten(0, 1).roll(1, 1), noise.flatten(0, 1).roll(CANVAS[1], 1)])
     apart = torch.corrcoef(rows) - torch.eye(18)
     assert apart.abs().max() < 0.02
+
+
+def test_equal_textures_are_kept_once(shapes):
+    """By what they hold: of meshes and surfaces alike, new objects at every call."""
+
+    def textures(*colours):
+        return [np.full((4, 8, 3), colour, np.uint8) for colour in colours]
+
+    atlas = TextureAtlas()
+    first, second, again, other = atlas.add(textures(10, 20, 10, 30))
+    size = atlas.texels.size, atlas.table.size
+    assert again == first and len({first, second, other}) == 3
+    assert atlas.add(textures(30, 10)) == [other, first] and (atlas.texels.size, atlas.table.size) == size
+    assert atlas.add([textures(10)[0].reshape(8, 4, 3)])[0] not in (first, second, other)
+    world, renderer = covered_world(shapes), MeshRenderer(CANVAS, threads=1)
+    image = renderer(world).image
+    size = renderer._atlas.textures.texels.size
+    assert torch.equal(renderer(covered_world(shapes)).image, image)
+    assert renderer._atlas.textures.texels.size == size
+
+
+def covered_world(shapes):
+    """A box and the ground with one texture."""
+    texture = np.random.default_rng(0).integers(0, 256, (16, 16, 3)).astype(np.uint8)
+    cube = Meshes("car", (shapes.box(1, 1, 1, texture=texture),), 0, 8.0, 0.0)
+    return shapes.world(cube, ground=covered(texture), camera=Camera(300.0, 150.0, 94.0))
