@@ -20,6 +20,7 @@ from probscene.app.files import write_json
 from probscene.app.fit import create, fit
 from probscene.app.generate import generate_scenes
 from probscene.app.loading import load_model
+from probscene.app.memory import keep_freed_memory
 from probscene.app.run import Run
 from probscene.derive import derive_complete
 from probscene.inference.metrics import total_variation, wasserstein
@@ -50,12 +51,13 @@ def main():
     parser.add_argument("--images", type=int, default=3000)
     parser.add_argument("--batches", type=int)
     args = parser.parse_args()
+    keep_freed_memory()
     model, rows = load_model(args.model), []
     for seed in args.seeds:
         target = model.target(seed)
         folder = args.out / f"target-{seed}"
         generate_scenes(target, target.prior, args.images, folder, seed=1000 + seed, format="images")
-        chosen = replace(preset(args.preset), candidates=1)
+        chosen = replace(preset(args.preset).toward("js"), variance=30.0, candidates=1)
         chosen = replace(chosen, batches=args.batches or chosen.batches)
         path = args.out / f"run-{seed}"
         began = path.exists()

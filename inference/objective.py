@@ -12,6 +12,11 @@ with the exact marginal over latent vectors in log q; parameters keep their prio
 A derivation longer than T_max is redrawn, and a scene that took more than ``reject_threshold`` failed attempts pays
 ``reject_weight`` more; the paper's supplement adds that outside the score function, where it has no gradient.
 
+Nothing of that keeps probability from leaking to derivations that do not end in time, since only those that do are
+scored. So half the squared number f of failed attempts a scene is descended, too (not in the paper). With Z the
+probability to end, f is (1 - Z) / Z and grad Z is Z E grad log q(T) over derivations that do, so its gradient is
+``-f (1 + f) E grad log q(T)``: all advantages less the same number, which is 0 where nothing fails.
+
 Departures that an argument turns on: ``updates`` takes several steps on one rendered batch with the clipped importance
 ratio of [3]; ``baseline="leave_one_out"`` uses the mean of the other scenes' costs [4] instead of the moving average
 [1, 2].
@@ -47,7 +52,7 @@ class Batch(NamedTuple):
         derivation: structures, N.
         features: ``(N, D)``.
         cost: ``(N,)``.
-        advantage: ``(N,)`` cost less baseline, scaled.
+        advantage: ``(N,)`` cost less baseline and leak, scaled.
         rejections: mean failed attempts a scene.
     """
 
@@ -70,6 +75,7 @@ class ScoreFunction:
         clip: the importance ratio of those steps stays within ``1 +- clip``.
         scale: of the whole cost; under Adam it changes nothing but the weight of the rejections.
         reject_weight, reject_threshold: lambda and epsilon of section 3.3.
+        leak_weight: of half the squared number of failed attempts.
         strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
             several guides learn together; all have one where None.
 
@@ -91,6 +97,7 @@ class ScoreFunction:
         scale: float = 1.0,
         reject_weight: float = 1e-2,
         reject_threshold: float = 1.0,
+        leak_weight: float = 1.0,
         strata: Callable[[Derivation], Tensor] | None = None,
     ):
         if baseline not in BASELINES:
@@ -102,6 +109,7 @@ class ScoreFunction:
         self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
         self.updates, self.clip, self.scale = updates, clip, scale
         self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
+        self.leak_weight = leak_weight
         self.strata = strata
         self.averages: dict[int, float] = {}  # moving, by stratum
         self.batch: Batch | None = None
@@ -131,8 +139,10 @@ class ScoreFunction:
             cost = self.divergence(features, real)
             cost = cost + self.reject_weight * (failures > self.reject_threshold)
             strata = torch.zeros(len(cost), dtype=torch.int64) if self.strata is None else self.strata(derivation)
-            advantage = self.scale * (cost - self._baseline(cost, strata))
-            return Batch(derivation, features, cost, advantage, failures.float().mean().item())
+            failed = failures.float().mean().item()
+            leak = self.leak_weight * failed * (1 + failed)
+            advantage = self.scale * (cost - self._baseline(cost, strata) - leak)
+            return Batch(derivation, features, cost, advantage, failed)
 
     def _baseline(self, cost: Tensor, strata: Tensor) -> Tensor:
         baseline = torch.zeros_like(cost)

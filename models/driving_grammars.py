@@ -16,6 +16,7 @@ from functools import cache, reduce
 from types import MappingProxyType
 
 import numpy as np
+from scipy.stats import poisson
 
 from probscene.grammar import Grammar
 from probscene.structure import Counts, StructurePrior, counts, weights
@@ -86,21 +87,23 @@ def pretraining(scenario: str, name: str = "tuned", vehicles: tuple[str, ...] = 
 
 
 def target(scenario: str, seed: int, vehicles: tuple[str, ...] = VEHICLES) -> StructurePrior:
-    """A truth to be found: random probabilities of every list's lengths, of the streets and of what stands in a list.
+    """A truth to be found: lists of Poisson lengths with random means, and random shares of the streets and of what
+    stands in a list.
 
-    Lists are no longer than those of pretraining. The probabilities are Dirichlet draws of ``seed``, those of vehicles
-    and streets drawn again until the number of vehicles differs from either prior's by ``FAR``.
+    Lists are no longer than those of pretraining. Means are uniform up to one more than the tuned prior's most, shares
+    Dirichlet draws of ``seed``; those of vehicles and streets are drawn again until the number of vehicles differs from
+    either prior's by ``FAR``.
     """
     rng = np.random.default_rng([seed, *scenario.encode()])
     limits = bounds(scenario, "tuned")
-    lists = {key: rng.dirichlet(np.full(most + 2, 0.5)) for key, (_, most) in limits.items()}
+    lists = {key: _poisson(rng, key, most) for key, (_, most) in limits.items()}
     kinds = {"Walk": rng.dirichlet(np.ones(len(WALK))), "Planting": rng.dirichlet(np.ones(len(PLANTS)))}
     known = [
         vehicle_numbers(scenario, _uniform(*bounds(scenario, name)["Cars"]), _lane_weights(scenario))
         for name in ("tuned", "simple")
     ]
     while True:
-        lists["Cars"] = rng.dirichlet(np.full(limits["Cars"][1] + 2, 0.5))
+        lists["Cars"] = _poisson(rng, "Cars", limits["Cars"][1])
         streets = rng.dirichlet(np.ones(len(_streets(scenario))))
         numbers = vehicle_numbers(scenario, lists["Cars"], streets)
         if min(np.abs(numbers - other).sum() / 2 for other in known) >= FAR:
@@ -145,6 +148,11 @@ def _lane_weights(scenario: str) -> list[float]:
     """Of the productions, so that every number of lanes is as probable."""
     lanes = [STREETS[symbols] for symbols in _streets(scenario)]
     return [1 / lanes.count(number) for number in lanes]
+
+
+def _poisson(rng: np.random.Generator, key: str, most: int) -> np.ndarray:
+    """Probabilities of a list's lengths, of a random mean."""
+    return poisson.pmf(np.arange(LONGEST[key] + 1), rng.uniform(0, most + 1))
 
 
 def _uniform(fewest: int, most: int) -> list[float]:

@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 import probscene
+from probscene.app.memory import keep_freed_memory
 from probscene.errors import ModelError, ProbsceneError
 
 if TYPE_CHECKING:
@@ -378,6 +379,7 @@ def main() -> None:
     sys.stdout.reconfigure(errors="replace")  # a grammar's ε on a terminal that has none
     # Torch's threads wait for one another spinning, which on a machine that has other work takes six times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_freed_memory()
     try:
         app(prog_name="probscene")
     except KeyboardInterrupt:  # before or after a command's work

@@ -8,6 +8,7 @@ import torch
 from pyro.infer import SVI
 from pyro.optim import Adam
 
+from probscene.enumeration import enumerate_derivations
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guide import LSTMGuide
@@ -151,6 +152,25 @@ def test_scenes_that_were_redrawn_pay(small, dots):
     assert failures.max() > 1
     assert torch.equal(loss.batch.cost, 0.25 * (failures > 1))
     assert loss.batch.rejections == pytest.approx(failures.mean().item())
+
+
+def test_leaked_probability_is_drawn_back(dots):
+    """The gradient of half the squared number of failed attempts, exactly: of a truncated grammar's complete part."""
+    pyro.set_rng_seed(3)
+    guide = LSTMGuide(dots.grammar, 6, hidden=8)
+    complete = guide.log_prob(enumerate_derivations(dots.grammar, 6)).exp().sum()
+    failures = (1 - complete) / complete
+    assert failures > 0.05
+    exact = gradients(0.5 * 3.0 * failures**2, guide)
+    loss = ScoreFunction(
+        lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
+        reject_weight=0.0, leak_weight=3.0,
+    )  # fmt: skip
+    runs = torch.stack([gradients(loss(dots, guide, 4000, real=None), guide) for _ in range(8)])
+    mean, error = runs.mean(0), runs.std(0) / 8**0.5
+    away = exact.abs() > 1e-3
+    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
+    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
 
 
 def test_bad_arguments_are_named(small):
