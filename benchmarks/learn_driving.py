@@ -57,7 +57,7 @@ def main():
         target = model.target(seed)
         folder = args.out / f"target-{seed}"
         generate_scenes(target, target.prior, args.images, folder, seed=1000 + seed, format="images")
-        chosen = replace(preset(args.preset).toward("js"), variance=30.0, candidates=1)
+        chosen = replace(preset(args.preset).toward("js"), variance=30.0, anchor=0.1, candidates=1)
         chosen = replace(chosen, batches=args.batches or chosen.batches)
         path = args.out / f"run-{seed}"
         began = path.exists()

@@ -40,8 +40,10 @@ from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import Divergence
+from probscene.policy import Policy
 from probscene.sampling import Scenes, realise
 
+FAR = 20.0  # nats
 BASELINES = ("moving_average", "leave_one_out", "none")
 
 
@@ -76,6 +78,9 @@ class ScoreFunction:
         scale: of the whole cost; under Adam it changes nothing but the weight of the rejections.
         reject_weight, reject_threshold: lambda and epsilon of section 3.3.
         leak_weight: of half the squared number of failed attempts.
+        anchor, anchor_weight: a policy, and the weight of the reverse KL from it: ``log q(T) - log p(T)`` nats, at most
+            ``FAR``, are added to what a scene costs. What images cannot tell then stays as there, where it would drift:
+            cars behind cars are free (not in the paper).
         strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
             several guides learn together; all have one where None.
 
@@ -98,6 +103,8 @@ class ScoreFunction:
         reject_weight: float = 1e-2,
         reject_threshold: float = 1.0,
         leak_weight: float = 1.0,
+        anchor: Policy | None = None,
+        anchor_weight: float = 0.0,
         strata: Callable[[Derivation], Tensor] | None = None,
     ):
         if baseline not in BASELINES:
@@ -110,6 +117,7 @@ class ScoreFunction:
         self.updates, self.clip, self.scale = updates, clip, scale
         self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
         self.leak_weight = leak_weight
+        self.anchor, self.anchor_weight = anchor, anchor_weight
         self.strata = strata
         self.averages: dict[int, float] = {}  # moving, by stratum
         self.batch: Batch | None = None
@@ -139,6 +147,9 @@ class ScoreFunction:
             cost = self.divergence(features, real)
             cost = cost + self.reject_weight * (failures > self.reject_threshold)
             strata = torch.zeros(len(cost), dtype=torch.int64) if self.strata is None else self.strata(derivation)
+            if self.anchor is not None and self.anchor_weight:
+                away = guide.log_prob(derivation) - self.anchor.log_prob(derivation)
+                cost = cost + self.anchor_weight * away.clamp(max=FAR)
             failed = failures.float().mean().item()
             leak = self.leak_weight * failed * (1 + failed)
             advantage = self.scale * (cost - self._baseline(cost, strata) - leak)

@@ -44,7 +44,8 @@ class Preset:
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Learner`` and ``ScoreFunction``.
         candidates: drawings of each structure, of which the clearest is looked at.
-        baseline, scale: see ``ScoreFunction``.
+        baseline, scale, anchor: see ``ScoreFunction``; the last is the weight of the KL from what a guide is pretrained
+            on.
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
     """
 
@@ -75,6 +76,7 @@ class Preset:
     cosine: bool = True
     baseline: str = "leave_one_out"
     scale: float = 1.0
+    anchor: float = 0.0
     hidden: int = 50
     num_latents: int = 1
     index: bool = True

@@ -251,6 +251,8 @@ def _learn(
         updates=preset.updates,
         scale=preset.scale,
         strata=guide.strata,
+        anchor=model.pretraining_policy,
+        anchor_weight=preset.anchor,
     )
     learner = Learner(
         model,

@@ -13,8 +13,9 @@ from probscene.errors import ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guide import LSTMGuide
 from probscene.inference.learn import Learner
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import FAR, ScoreFunction
 from probscene.inference.presets import QUICK
+from probscene.structure import StructurePrior, counts
 
 
 def structure_features(small):
@@ -171,6 +172,33 @@ def test_leaked_probability_is_drawn_back(dots):
     away = exact.abs() > 1e-3
     assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
     assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
+
+
+def test_an_anchor_draws_toward_its_policy(small):
+    """The gradient of the weighted KL from the anchor, exactly."""
+    pyro.set_rng_seed(4)
+    guide, anchor = LSTMGuide(small.grammar, 4, hidden=8), StructurePrior(small.grammar)
+    log_q = guide.log_prob(small.derivations)
+    exact = gradients(0.5 * (log_q.exp() * (log_q - anchor.log_prob(small.derivations))).sum(), guide)
+    loss = ScoreFunction(
+        structure_features(small), lambda g, r: torch.zeros(len(g)), anchor=anchor, anchor_weight=0.5
+    )  # fmt: skip
+    runs = torch.stack([gradients(loss(small.program, guide, 4000, real=None), guide) for _ in range(8)])
+    mean, error = runs.mean(0), runs.std(0) / 8**0.5
+    away = exact.abs() > 1e-3
+    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
+    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
+
+
+def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
+    loss = ScoreFunction(
+        lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
+        anchor=StructurePrior(dots.grammar, Things=counts(1.0)), anchor_weight=0.1,
+    )  # fmt: skip
+    pyro.set_rng_seed(5)
+    loss(dots, LSTMGuide(dots.grammar, 12, hidden=8), 200, real=None)
+    something = loss.batch.derivation.lengths > 2
+    assert something.any() and (loss.batch.cost[something] == 0.1 * FAR).all()
 
 
 def test_bad_arguments_are_named(small):
