@@ -11,7 +11,6 @@ prior and for what was learnt; FOLDER holds the runs, ``results.json`` and a his
 import argparse
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -78,7 +77,7 @@ def main():
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = replace(preset("quick").toward("js").seeing("efficientnet"), projection="counts")
+        chosen = preset("quick").seeing("efficientnet")
         run = Run.open(path) if path.exists() else create(args.model, args.images, path, chosen, seed)
         start = time.monotonic()
         fit(run, lambda *_: None)
