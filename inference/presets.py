@@ -12,7 +12,6 @@ from probscene.inference.guide import GUIDES
 TRAINED = ("count", "presence")  # on the prior's renders
 PRETRAINED = {"efficientnet": "efficientnet-lite0", "inception": "inception-v3", "resnet50": "resnet-50"}
 CHOICES = "efficientnet, inception, inception=FILE, resnet50 or resnet50=FILE"
-PROJECTIONS = ("structure", "counts")
 OBJECTIVES = ("kde", "js", "witness", "mmd")
 
 
@@ -26,10 +25,7 @@ class Preset:
         count: the count network's schedule.
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
-        projection: of a pretrained network's features: ``"structure"``, the directions that structure moves and
-            parameters do not; ``"counts"``, those in which the classes' counts can be read.
-        pairs, directions: of the projection: structures that are drawn twice, or twice as many that are drawn once
-            where counts are read; and features, as many as classes where counts are.
+        pairs, directions: of a pretrained network's projection: structures that are drawn twice, and features.
         views: of each real image in the density of their features, the image itself and parts of it
             (``ImageFolder.load``). Among few images they take some noise out: of 81 KITTI frames under EfficientNet's
             projected features, 4 views lower the standard deviation between the log densities that two halves of the
@@ -55,7 +51,6 @@ class Preset:
     blocks: tuple[int, int] = (1, 1)
     presence_images: int = 5000
     presence_epochs: int = 10
-    projection: str = "structure"
     pairs: int = 500
     directions: int = 8
     views: int = 1

@@ -7,11 +7,6 @@ they share is the structure's. The projection is Fisher's linear discriminant [1
 generalised eigenvectors of the total and the within-structure covariance, largest ratio first. No label is needed, and
 no real image: a direction in which photographs differ and scenes do not cannot be learnt from.
 
-Or the labels of renders are used, which cost nothing: the directions then are those in which counts can be read
-(``regression``). From 1,024 renders of driving scenes under the simple prior, EfficientNet's read 0.64 of the variance
-of the cars that can be seen, held out; and of those in KITTI's frames, which it never saw, a mean of 2.6 where labels
-say 2.5, with a correlation of 0.65.
-
 The unit of the projected features is the bandwidth of their density: the least at which a scene's own kernel has on
 average no more than ``SHARE`` of the estimated density at its place, which is to say that about ten others have the
 rest. Axis letters: N structures, D features, d directions.
@@ -31,9 +26,6 @@ from probscene.inference.features import FeatureNet
 SHARE = 0.1  # of the density at a scene that is its own kernel's
 LEADING = 100  # principal components that the discriminant is sought in, and no more than a quarter of the pairs
 SHRINK = 1e-6  # of the mean within-structure variance, added to each direction's
-
-
-STEPS = tuple(10.0**-k for k in range(6))  # of the ridge, in units of the largest eigenvalue
 
 
 class Projection(NamedTuple):
@@ -85,45 +77,6 @@ def discriminant(one: Tensor, other: Tensor, directions: int, scenes: int) -> Pr
     weight = axes @ (whiten.T @ turn.flip(1)[:, :directions])
     weight = weight / bandwidth((other[:scenes] - mean) @ weight)
     return Projection(mean.float(), weight.float(), ratio.flip(0)[:directions].float())
-
-
-def regression(features: Tensor, counts: Tensor, scenes: int) -> Projection:
-    """The projection that reads counts: a ridge regression of each, its penalty and its error by leave-one-out, in
-    units of that error, so that what the features hardly say weighs little. Its ``ratio`` is 1 where they say nothing.
-
-    Args:
-        features: ``(N, D)`` of renders.
-        counts: ``(N, d)`` of what can be seen in them, by class.
-        scenes: in a batch of the fit, for which the bandwidth is chosen.
-
-    Raises:
-        ProbsceneError: features that are not finite, or counts that are all the same.
-    """
-    x, y = features.double(), counts.double()
-    if not torch.isfinite(x).all():
-        raise ProbsceneError("Expected finite features of the prior's renders, actual NaN or infinity.")
-    if len(x) < 3 or (y == y[:1]).all():
-        raise ProbsceneError(
-            "Expected renders of the prior with counts that vary, actual the same in all of them; take more pairs, or "
-            "a prior that varies."
-        )
-    mean = x.mean(0)
-    u, size, v = torch.linalg.svd(x - mean, full_matrices=False)
-    away = y - y.mean(0)
-    best, weight = torch.full((y.shape[1],), torch.inf, dtype=y.dtype), x.new_zeros(x.shape[1], y.shape[1])
-    for step in STEPS:
-        shrink = size.square() / (size.square() + step * size[0].square())
-        leverage = (u.square() * shrink).sum(1) + 1 / len(x)
-        missed = (away - u @ (shrink[:, None] * (u.T @ away))) / (1 - leverage).clamp(min=1e-6)[:, None]
-        error = missed.square().mean(0)
-        found = v.T @ ((shrink / size.clamp(min=1e-12 * size[0]))[:, None] * (u.T @ away))
-        weight = torch.where(error < best, found, weight)
-        best = torch.minimum(error, best)
-    varies = y.var(0) > 0
-    weight = (weight / best.clamp(min=1e-12).sqrt()).where(varies, 0.0)
-    ratio = (y.var(0) / best.clamp(min=1e-12)).clamp(min=1.0).where(varies, 1.0)
-    weight = weight / bandwidth((x[:scenes] - mean) @ weight)
-    return Projection(mean.float(), weight.float(), ratio.float())
 
 
 def self_share(points: Tensor) -> float:

@@ -31,7 +31,7 @@ from probscene.inference.objective import ScoreFunction
 from probscene.inference.presence_net import PresenceNet, PresenceTraining
 from probscene.inference.presets import TRAINED, Preset
 from probscene.inference.pretrain import pretrain
-from probscene.inference.projection import Projected, discriminant, regression, self_share
+from probscene.inference.projection import Projected, discriminant, self_share
 from probscene.inference.resume import batch_seed
 from probscene.inference.two_sample import NEEDED, check_features
 from probscene.model import SceneModel
@@ -115,37 +115,23 @@ def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> Co
 
 
 def _project(run: Run, preset: Preset, view: View, net: Projected, progress: Progress) -> None:
-    """In a minute or so; what is interrupted begins again."""
+    """Two renders of each of some structures, in a minute or so; what is interrupted begins again."""
     seed_everything(batch_seed(run.record["seed"], 1))
-    draw = _counted if preset.projection == "counts" else _twice
-    parts = []
+    model, observe, parts = view.model, view.observe(net.pretrained), []
+    policy = model.pretraining_policy
     for first in range(0, preset.pairs, RENDERED_AT_ONCE):
         progress("features", first, preset.pairs, "")
-        parts.append(draw(view, net.pretrained, min(RENDERED_AT_ONCE, preset.pairs - first)))
+        scenes = sample(model, policy, min(RENDERED_AT_ONCE, preset.pairs - first))
+        parts.append((observe(scenes), observe(realise(model, scenes.derivation))))
     one, other = (torch.cat(part) for part in zip(*parts, strict=True))
-    if preset.projection == "counts":
-        net.projection = regression(one, other, preset.num_scenes)
-    else:
-        net.projection = discriminant(one, other, preset.directions, preset.num_scenes)
-    share = self_share(net.projection((one if preset.projection == "counts" else other)[: preset.num_scenes]))
+    net.projection = discriminant(one, other, preset.directions, preset.num_scenes)
+    share = self_share(net.projection(other[: preset.num_scenes]))
     ratio = net.ratio.tolist()
-    note = f"variance over noise {max(ratio):.1f} to {min(ratio):.1f}, own kernel's share {share:.2f}"
+    note = f"variance over noise {ratio[0]:.1f} to {ratio[-1]:.1f}, own kernel's share {share:.2f}"
     progress("features", preset.pairs, preset.pairs, note)
     line = json.dumps({"stage": "projection", "ratio": ratio, "self_share": share})
     write_text(run.path / "log.jsonl", f"{line}\n")
     run.save("features", net.state_dict())
-
-
-def _twice(view: View, net: FeatureNet, num: int) -> tuple[Tensor, Tensor]:
-    """Features of two renders of each of ``num`` structures."""
-    observe = view.observe(net)
-    scenes = sample(view.model, view.model.pretraining_policy, num)
-    return observe(scenes), observe(realise(view.model, scenes.derivation))
-
-
-def _counted(view: View, net: FeatureNet, num: int) -> tuple[Tensor, Tensor]:
-    """Features of renders of twice ``num`` structures, and what can be counted in them."""
-    return view.read(net, 2 * num)
 
 
 def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, progress: Progress) -> None:

@@ -8,14 +8,13 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from probscene.errors import ProbsceneError
 from probscene.inference.guide import GUIDES
 from probscene.inference.objective import BASELINES
-from probscene.inference.presets import OBJECTIVES, PROJECTIONS, Preset
+from probscene.inference.presets import OBJECTIVES, Preset
 
 CHOICES = {
     "features": ("count", "presence"),
     "objective": OBJECTIVES,
     "baseline": BASELINES,
     "guide": GUIDES,
-    "projection": PROJECTIONS,
 }
 LEAST = {"num_scenes": 2}
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate")

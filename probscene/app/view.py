@@ -24,7 +24,6 @@ from probscene.relations import relations
 from probscene.sampling import Scenes, realise, sample
 
 RENDERED_AT_ONCE = 64  # images in memory
-LEAST_VISIBLE = 0.25  # of an object that is counted
 
 
 class View:
@@ -54,16 +53,6 @@ class View:
         seen = (self.classes[batch.kind] >= 0) & (batch.pixels > 0)
         size = (batch.amodal_box[..., 2:] - batch.amodal_box[..., :2]).prod(-1)[seen].sqrt()
         return float(size.quantile(0.1)) if len(size) else math.inf
-
-    def read(self, net: FeatureNet, num: int) -> tuple[Tensor, Tensor]:
-        """Features ``(num, D)`` of renders of what a guide is pretrained on, and how many of each class can be seen in
-        them ``(num, C)``."""
-        torch.set_num_threads(self.threads)
-        batch = self.render(sample(self.model, self.model.pretraining_policy, num).drawing)
-        features = net.embed(self._as_read(batch.image))
-        torch.set_num_threads(1)
-        seen = self.classes[batch.kind].where(batch.visible >= LEAST_VISIBLE, -1)
-        return features, torch.stack([(seen == c).sum(1) for c in range(len(self.model.classes))], 1)
 
     def observe(self, net: FeatureNet, candidates: int = 1) -> Callable[[Scenes], Tensor]:
         """Render and embed, a few images at a time.
@@ -119,5 +108,5 @@ def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet | P
 
         net, file = pretrained(preset.features), weights_file(preset.features)
         digest = bytes(32) if file is None else hashlib.sha256(file.read_bytes()).digest()
-        return Projected(net, len(model.classes) if preset.projection == "counts" else preset.directions, digest)
+        return Projected(net, preset.directions, digest)
     return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)

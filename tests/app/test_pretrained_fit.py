@@ -9,13 +9,12 @@ from torchvision.models import inception_v3
 
 from probscene.app.run import Run
 from probscene.app.seen import own_net
-from probscene.app.view import View, feature_net
+from probscene.app.view import feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import RunError
 from probscene.inference.features import embed_all
 from probscene.inference.presets import QUICK, preset
 from probscene.inference.projection import SHARE
-from probscene.sampling import seed_everything
 
 FEW = {"pairs": 40, "directions": 3, "batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
 WORDS = ["--preset", "quick", "--threads", "1", *(w for k, v in FEW.items() for w in ("--set", f"{k}={v}"))]
@@ -45,25 +44,6 @@ def test_the_log_says_how_the_projection_came_out(run):
     assert first["stage"] == "projection" and first["ratio"] == sorted(first["ratio"], reverse=True)
     assert first["self_share"] == pytest.approx(SHARE, rel=0.05) and first["ratio"][0] > 2
     assert [line["stage"] for line in rest] == ["structure"] * 2
-
-
-def test_counts_are_read_where_the_projection_says_so(call, discs, target, tmp_path):
-    """A feature a class, and of what the network sees of the discs most is their number."""
-    out = tmp_path / "run"
-    words = ["fit", discs.file, "--target", target.images, "--out", out, "--features", "efficientnet", *WORDS]
-    done = call(*words, "--set", "projection=counts")
-    assert done.code == 0, done.err
-    run = Run.open(out)
-    line = json.loads((out / "log.jsonl").read_text().splitlines()[0])
-    assert len(line["ratio"]) == len(run.model.classes) and max(line["ratio"]) > 1.5
-    assert line["self_share"] == pytest.approx(SHARE, rel=0.05)
-    net, view = own_net(run), View(run.model, 1)
-    seed_everything(5)
-    features, counts = view.read(net, 128)
-    clear = int(torch.tensor(line["ratio"]).argmax())
-    assert torch.corrcoef(torch.stack([features[:, clear], counts[:, clear]]))[0, 1] > 0.5
-    done = call(*words, "--set", "projection=words")
-    assert done.code == 2 and "structure, counts" in done.err
 
 
 def test_it_goes_on_to_the_same_result(run, call, tmp_path, discs, target):

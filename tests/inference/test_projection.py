@@ -7,11 +7,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-from sklearn.linear_model import RidgeCV
 
 from probscene.errors import ProbsceneError, RunError
 from probscene.inference.divergence import KDELogRatio
-from probscene.inference.projection import SHARE, STEPS, Projected, bandwidth, discriminant, regression, self_share
+from probscene.inference.projection import SHARE, Projected, bandwidth, discriminant, self_share
 
 
 def pairs(number, dimensions=12, structures=3, noise=0.3, seed=0):
@@ -110,47 +109,6 @@ def test_what_cannot_be_projected_is_refused(spoil, part):
     one, other, _ = pairs(40)
     with pytest.raises(ProbsceneError, match=rf"^Expected .*{part}"):
         discriminant(spoil(one), spoil(other), 3, 40)
-
-
-def read(num=200, seed=0, noise=1.0):
-    """Features that counts of three classes move, the last one not at all, and the counts."""
-    generator = torch.Generator().manual_seed(seed)
-    counts = torch.poisson(torch.tensor([3.0, 1.0, 2.0]).expand(num, 3), generator=generator)
-    into = torch.randn(3, 12, generator=torch.Generator().manual_seed(1))
-    into[2] = 0
-    return counts @ into + noise * torch.randn(num, 12, generator=generator) + 5, counts
-
-
-def test_counts_are_read_as_scikit_learns_ridge_reads_them():
-    """With the penalty that leave-one-out chooses for each count, and in units of its leave-one-out error."""
-    features, counts = read()
-    found = regression(features, counts, 100)
-    largest = np.linalg.eigvalsh(np.cov(features.T.numpy(), bias=True)).max() * len(features)
-    ridge = RidgeCV([step * largest for step in STEPS], alpha_per_target=True).fit(features.double(), counts.double())
-    error = np.sqrt(-ridge.best_score_)
-    expected = ridge.coef_.T / error
-    unit = bandwidth((features.double() - features.double().mean(0))[:100] @ torch.from_numpy(expected))
-    assert np.allclose(found.weight, expected / unit, rtol=1e-3, atol=1e-6)
-    assert np.allclose(found.ratio, (counts.var(0).numpy() / error**2).clip(1), rtol=1e-3)
-    assert self_share(found(features[:100])) == pytest.approx(SHARE, rel=1e-3)
-
-
-def test_what_features_hardly_say_weighs_little():
-    features, counts = read(400)
-    found = regression(features, counts, 100)
-    spread = found(read(400, seed=2)[0]).std(0)
-    assert spread[2] < 0.2 * spread[0] and found.ratio[2] < 1.1 < 2 < found.ratio[0]
-
-
-def test_a_class_that_is_never_seen_is_nothing():
-    features, counts = read()
-    found = regression(features, counts * torch.tensor([1, 0, 1]), 100)
-    assert (found.weight[:, 1] == 0).all() and found.ratio[1] == 1 and torch.isfinite(found.weight).all()
-    for bad in (counts * 0, counts[:2]):
-        with pytest.raises(ProbsceneError, match="counts that vary"):
-            regression(features[: len(bad)], bad, 100)
-    with pytest.raises(ProbsceneError, match="finite"):
-        regression(features * torch.nan, counts, 100)
 
 
 class Means:
