@@ -237,6 +237,7 @@ def _learn(
         updates=preset.updates,
         scale=preset.scale,
         strata=guide.strata,
+        leak_weight=preset.leak,
         anchor=model.pretraining_policy,
         anchor_weight=preset.anchor,
     )
