@@ -28,6 +28,7 @@ from probscene.inference.presets import preset
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import MaxNLocator
 
 
 def cars(found: Evaluation) -> dict[str, np.ndarray]:
@@ -60,6 +61,7 @@ def picture(histograms: list[dict[str, np.ndarray]], path: Path) -> None:
     for i, found in enumerate(histograms):
         axes.plot(found["learnt"], "o-", color="tab:blue", alpha=0.6, label="learnt" if i == 0 else None)
     axes.set(xlabel="cars in an image", ylabel="share of images", xlim=(-0.6, most - 0.4))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
     figure.savefig(path, dpi=130)
 
