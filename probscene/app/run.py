@@ -1,12 +1,14 @@
 """The run folder: what ``fit`` writes and every other command reads.
 
-run.json               the configuration, the model, the target, the version that wrote it
-model.py               a copy of the model's file, where it is not a built-in one
-guide.safetensors      the learnt guide; there once the fit is finished
-features.safetensors   the feature network
-real.safetensors       features of the target images
-log.jsonl              one line an update
-checkpoint.safetensors what ``--resume`` goes on from
+    run.json               the configuration, the model, the target, the version that wrote it
+    model.py               a copy of the model's file, where it is not a built-in one
+    guide.safetensors      the learnt guide; there once the fit is finished
+    features.safetensors   the feature network
+    real.safetensors       features of the target images
+    log.jsonl              one line an update
+    checkpoint.safetensors what ``--resume`` goes on from
+
+All are written aside and renamed.
 """
 
 import hashlib
