@@ -39,6 +39,15 @@ def gradients(loss, guide):
     return torch.cat([torch.zeros(p.numel()) if p.grad is None else p.grad.flatten() for p in guide.parameters()])
 
 
+def assert_estimates(draw, exact):
+    """The mean of eight estimates is the exact gradient, but for their error."""
+    runs = torch.stack([draw() for _ in range(8)])
+    mean, error = runs.mean(0), runs.std(0) / 8**0.5
+    away = exact.abs() > 1e-3
+    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
+    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
+
+
 @pytest.mark.parametrize("latents", [1, 3])
 @pytest.mark.parametrize("baseline", ["leave_one_out", "moving_average", "none"])
 def test_gradient_is_the_exact_one(small, baseline, latents):
@@ -48,11 +57,7 @@ def test_gradient_is_the_exact_one(small, baseline, latents):
     log_q = guide.log_prob(small.derivations)
     exact = gradients((log_q.exp() * cost(small.features, None)).sum(), guide)
     loss = ScoreFunction(structure_features(small), cost, baseline=baseline)
-    runs = torch.stack([gradients(loss(small.program, guide, 4000, real=None), guide) for _ in range(8)])
-    mean, error = runs.mean(0), runs.std(0) / 8**0.5
-    away = exact.abs() > 1e-3
-    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
-    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
+    assert_estimates(lambda: gradients(loss(small.program, guide, 4000, real=None), guide), exact)
 
 
 def test_kde_gradient_tends_to_the_enumerated_one(small):
@@ -167,11 +172,7 @@ def test_leaked_probability_is_drawn_back(dots):
         lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
         reject_weight=0.0, leak_weight=3.0,
     )  # fmt: skip
-    runs = torch.stack([gradients(loss(dots, guide, 4000, real=None), guide) for _ in range(8)])
-    mean, error = runs.mean(0), runs.std(0) / 8**0.5
-    away = exact.abs() > 1e-3
-    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
-    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
+    assert_estimates(lambda: gradients(loss(dots, guide, 4000, real=None), guide), exact)
 
 
 def test_an_anchor_draws_toward_its_policy(small):
@@ -183,11 +184,7 @@ def test_an_anchor_draws_toward_its_policy(small):
     loss = ScoreFunction(
         structure_features(small), lambda g, r: torch.zeros(len(g)), anchor=anchor, anchor_weight=0.5
     )  # fmt: skip
-    runs = torch.stack([gradients(loss(small.program, guide, 4000, real=None), guide) for _ in range(8)])
-    mean, error = runs.mean(0), runs.std(0) / 8**0.5
-    away = exact.abs() > 1e-3
-    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
-    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
+    assert_estimates(lambda: gradients(loss(small.program, guide, 4000, real=None), guide), exact)
 
 
 def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
