@@ -23,7 +23,7 @@ from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.app.run import Run
 from probscene.derive import derive_complete
-from probscene.inference.metrics import total_variation, wasserstein
+from probscene.inference.metrics import histogram, total_variation, wasserstein
 from probscene.inference.presets import preset
 from probscene.model import SceneModel
 from probscene.policy import Policy
@@ -35,11 +35,6 @@ def counted(model: SceneModel, policy: Policy, num: int = 20_000) -> np.ndarray:
     seed_everything(99)
     derivation, _ = derive_complete(model.grammar, policy, num, model.max_steps)
     return derivation.counts(len(model.grammar.kinds))[:, [model.grammar.kind(name) for name in model.classes]].numpy()
-
-
-def histogram(counts: np.ndarray) -> np.ndarray:
-    """Shares of scenes with 0, 1, 2, ... objects."""
-    return np.bincount(counts) / len(counts)
 
 
 def main():
