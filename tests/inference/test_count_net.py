@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene.errors import ProbsceneError
-from probscene.inference.count_batches import CountSchedule, cells
+from probscene.inference.count_batches import FEWEST, FULL, CountBatches, CountSchedule, cells
 from probscene.inference.count_net import STRIDE, CountNet, toward_whole
 from probscene.inference.count_training import CountTraining, count_loss
 from probscene.inference.features import enter
@@ -168,3 +168,14 @@ def test_small_objects_are_reduced_less(dots):
         assert again.reduce == reduce
         image = torch.zeros(1, 3, 188, 621, dtype=torch.uint8)
         assert again.enter(image).shape[-1] >= 621 / reduce and again.eval().embed(image).shape == (1, len(net.names))
+
+
+@given(st.integers(16, 1300), st.integers(16, 1300), st.integers(1, 24))
+def test_a_step_takes_no_more_pixels_of_large_images(height, width, images):
+    """Than of 128 x 128 reduced ones, but for a few images at least; of those it takes what the schedule says."""
+    net = CountNet(("a",), 1, (height, width), (2, 2, 2))
+    taken = CountBatches(net, None, CountSchedule(images=images), 0).images
+    area = height * width / net.reduce**2
+    assert 1 <= taken <= images
+    assert taken == images or area > FULL
+    assert taken <= FEWEST or taken * area <= images * FULL + area / 2
