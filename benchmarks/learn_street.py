@@ -21,6 +21,7 @@ from probscene.app.files import write_json
 from probscene.app.fit import create, fit
 from probscene.app.labels import read_labels
 from probscene.app.memory import keep_freed_memory
+from probscene.app.overrides import override
 from probscene.app.run import Run
 from probscene.dataset import ImageFolder
 from probscene.inference.metrics import histogram, total_variation, wasserstein
@@ -73,13 +74,15 @@ def main():
     parser.add_argument("--out", type=Path, required=True, help="folder for the runs")
     parser.add_argument("--model", default="driving_simple")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--features", default="count=efficientnet", help="as of probscene fit")
+    parser.add_argument("--set", action="append", default=[], dest="settings", help="as of probscene fit")
     parser.add_argument("--min-height", type=float, default=0.0, help="of KITTI's boxes that are counted, pixels")
     args = parser.parse_args()
     keep_freed_memory()
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = preset("quick").seeing("efficientnet")
+        chosen = override(preset("quick").seeing(args.features), args.settings)
         run = Run.open(path) if path.exists() else create(args.model, args.images, path, chosen, seed)
         start = time.monotonic()
         fit(run, lambda *_: None)

@@ -35,7 +35,12 @@ class CountNet(nn.Module):
         width: channels at strides 2, 4 and 8.
         blocks: residual blocks at strides 4 and 8.
         groups: by what objects are counted; over the whole image where None.
+
+    Attributes:
+        unit: objects that 1 in a feature stands for.
     """
+
+    unit = 1.0
 
     def __init__(
         self,

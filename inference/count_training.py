@@ -114,12 +114,24 @@ def count_loss(logits: Tensor, target: Tensor, margin: int, count_weight: float)
         logits, target: ``(N, 1 + classes, h, w)``.
         margin: cells at the border that do not count.
     """
+    entropy, error, _ = _errors(logits, target, margin)
+    return (entropy + count_weight * (error.square().sum(1) + error.sum(1).square())).mean()
+
+
+def relative_count_loss(logits: Tensor, target: Tensor) -> Tensor:
+    """``count_loss`` with each class's squared error over one more than its count, as counts vary with their size, and
+    without the total: where there are twenty trees, the others' errors are as nothing beside theirs."""
+    entropy, error, count = _errors(logits, target, 0)
+    return (entropy + (error.square() / (1 + count)).sum(1)).mean()
+
+
+def _errors(logits: Tensor, target: Tensor, margin: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Cross-entropy of the cells ``(N,)``, errors of the soft counts and the true counts, each ``(N, classes)``."""
     h, w = logits.shape[-2:]
     inner = (..., slice(margin, h - margin), slice(margin, w - margin))
     log_prob, target = F.log_softmax(logits[inner], 1), target[inner]
-    entropy = -(target * log_prob).sum((1, 2, 3))
     error = (log_prob.exp() - target)[:, 1:].sum((2, 3))
-    return (entropy + count_weight * (error.square().sum(1) + error.sum(1).square())).mean()
+    return -(target * log_prob).sum((1, 2, 3)), error, target[:, 1:].sum((2, 3))
 
 
 def group_loss(votes: Tensor, target: Votes, margin: int) -> Tensor:

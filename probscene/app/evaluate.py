@@ -197,7 +197,9 @@ def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> 
         features = None if kept is None else kept["features"]
     else:
         features = features_in(run, target, own_net(run), each)
-    return None if features is None else Source(*estimated(model, names, features), seed=1)
+    if features is None:
+        return None
+    return Source(*estimated(model, names, features * own_net(run).unit), seed=1)
 
 
 def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:

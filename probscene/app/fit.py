@@ -9,6 +9,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -22,14 +23,13 @@ from probscene.app.run import Run
 from probscene.app.view import RENDERED_AT_ONCE, View, feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, RunError
-from probscene.inference.count_net import CountNet
 from probscene.inference.count_training import CountTraining
 from probscene.inference.features import FeatureNet, embed_all
 from probscene.inference.latent import Guide
 from probscene.inference.learn import Learner
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.presence_net import PresenceNet, PresenceTraining
-from probscene.inference.presets import TRAINED, Preset
+from probscene.inference.presets import COUNT_ON_PRETRAINED, TRAINED, Preset
 from probscene.inference.pretrain import pretrain
 from probscene.inference.projection import Projected, discriminant, self_share
 from probscene.inference.resume import batch_seed
@@ -101,7 +101,7 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     return guide
 
 
-def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> CountNet | PresenceNet | Projected:
+def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> FeatureNet:
     seed_everything(batch_seed(run.record["seed"], 0))
     net = feature_net(preset, view.model)
     tensors = run.load("features")
@@ -134,15 +134,21 @@ def _project(run: Run, preset: Preset, view: View, net: Projected, progress: Pro
     run.save("features", net.state_dict())
 
 
-def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, progress: Progress) -> None:
+def _train(run: Run, preset: Preset, view: View, net: FeatureNet, progress: Progress) -> None:
     seed = batch_seed(run.record["seed"], 1)
-    if isinstance(net, CountNet):
-        seed_everything(batch_seed(run.record["seed"], 4))
-        net.fit_to(view.object_size())
-    if isinstance(net, PresenceNet):
+    if preset.features == COUNT_ON_PRETRAINED:
+        from probscene.inference.pretrained_count_training import PretrainedCountTraining  # torchvision takes seconds
+
+        # Of the prior's few cars a head learns that there are few: in photographs it must read many.
+        draw = partial(view.draw_twice, policy=view.model.pretraining_policy)
+        training = PretrainedCountTraining(net, draw, preset.pairs, preset.head_epochs, preset.num_scenes, seed=seed)
+        steps = preset.head_epochs
+    elif isinstance(net, PresenceNet):
         training = PresenceTraining(net, view.draw, preset.presence_images, preset.presence_epochs, seed=seed)
         steps = preset.presence_epochs
     else:
+        seed_everything(batch_seed(run.record["seed"], 4))
+        net.fit_to(view.object_size())
         training = CountTraining(net, view.draw, preset.count, seed=seed)
         steps = preset.count.steps
         torch.set_num_threads(1)  # its images are drawn on another core meanwhile
@@ -152,8 +158,13 @@ def _train(run: Run, preset: Preset, view: View, net: CountNet | PresenceNet, pr
         keep({"stage": "features", "step": training.done, "loss": loss})
         progress("features", training.done, steps, f"loss {loss:.3f}")
 
-    progress("features", training.done, steps, "")
-    training.run(each)
+    if preset.features == COUNT_ON_PRETRAINED:
+        found = training.run(each, lambda done, total: progress("renders", done, total, ""))
+        seen = {name: [x if x == x else None for x in part.tolist()] for name, part in found._asdict().items()}
+        keep.lines.append(json.dumps({"stage": "counts", **seen}))
+    else:
+        progress("features", training.done, steps, "")
+        training.run(each)
     torch.set_num_threads(run.record["threads"])
     keep.finish()
     run.save("features", net.state_dict())

@@ -8,10 +8,10 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from probscene.errors import ProbsceneError
 from probscene.inference.guide import GUIDES
 from probscene.inference.objective import BASELINES
-from probscene.inference.presets import OBJECTIVES, Preset
+from probscene.inference.presets import OBJECTIVES, TRAINED, Preset
 
 CHOICES = {
-    "features": ("count", "presence"),
+    "features": TRAINED,
     "objective": OBJECTIVES,
     "baseline": BASELINES,
     "guide": GUIDES,

@@ -109,10 +109,9 @@ def carry_out(run: Run, target: ImageFolder | None, show: Display) -> None:
         ProbsceneError: see ``fit.fit``.
     """
     before = timing(run)
-    if run.record["preset"]["features"] == "presence":
-        show.units["features"] = "epochs"
-    elif run.record["preset"]["features"] not in TRAINED:
-        show.units["features"] = "structures"
+    features = run.record["preset"]["features"]
+    if features != "count":
+        show.units["features"] = "epochs" if features in TRAINED else "structures"
     try:
         fit.fit(run, show, target)
     finally:

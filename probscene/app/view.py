@@ -17,9 +17,10 @@ from probscene.inference.count_net import CountNet
 from probscene.inference.features import Examples, FeatureNet, class_table, examples
 from probscene.inference.grouping import group_of
 from probscene.inference.presence_net import PresenceNet
-from probscene.inference.presets import Preset
+from probscene.inference.presets import COUNT_ON_PRETRAINED, Preset
 from probscene.inference.projection import Projected
 from probscene.model import SceneModel
+from probscene.policy import Policy
 from probscene.relations import relations
 from probscene.sampling import Scenes, realise, sample
 
@@ -38,7 +39,15 @@ class View:
 
     def draw(self, num: int) -> Examples:
         """``num`` labelled renders of the prior."""
-        scenes = sample(self.model, self.model.prior, num)
+        return self._labelled(sample(self.model, self.model.prior, num))
+
+    def draw_twice(self, num: int, policy: Policy) -> Examples:
+        """Labelled renders of ``num`` structures, and as many more of the same structures, their parameters anew."""
+        scenes = sample(self.model, policy, num)
+        both = self._labelled(scenes), self._labelled(realise(self.model, scenes.derivation))
+        return Examples(*(torch.cat(parts) for parts in zip(*both, strict=True)))
+
+    def _labelled(self, scenes: Scenes) -> Examples:
         groups, grammar = self.model.groups, self.model.grammar
         by = ()
         if groups is not None:
@@ -95,14 +104,18 @@ class View:
         return batch.visible.where(~self.covered[batch.kind], 1.0).amin(1)
 
 
-def feature_net(preset: Preset, model: SceneModel) -> CountNet | PresenceNet | Projected:
-    """The feature network of a preset, untrained, or pretrained with an empty projection.
+def feature_net(preset: Preset, model: SceneModel) -> FeatureNet:
+    """The feature network of a preset, untrained, or pretrained with an empty projection or head.
 
     Raises:
         DataError: see ``pretrained``.
     """
     if preset.features == "presence":
         return PresenceNet(model.classes)
+    if preset.features == COUNT_ON_PRETRAINED:
+        from probscene.inference.pretrained_count import PretrainedCountNet  # torchvision takes seconds to import
+
+        return PretrainedCountNet(model.classes, preset.directions)
     if preset.features != "count":
         from probscene.inference.pretrained import pretrained, weights_file  # torchvision takes seconds to import
 

@@ -1,0 +1,112 @@
+"""Counts read from the maps of a network that was trained on photographs, and what else structure moves in them.
+
+A count network that is trained on renders alone learns what renders look like, and reads photographs less well than
+its own kind; the frozen maps of a pretrained network change less between the two. Only a small head is trained
+(``pretrained_count_training``): every place of the map, 16 pixels apart, holds a distribution over background and
+classes, as in ``count_net``, and the sums of the map and their total are the counts. Groups of a model are counted as
+any class is. Beside them stand the directions of ``projection``, from the same pass: counts say how many cars there
+are, and nothing of how a wood differs from five trees.
+
+The unit of the counts is the bandwidth of their density, as it is of the projection's directions, and both together
+are divided by the bandwidth of their joint density: how many kernels away one object is depends on how well objects can
+be counted. Axis letters: N images, C channels of the maps, h w places, P pooled features, d directions.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from probscene.inference.pretrained import AT_ONCE, EfficientNetLite
+from probscene.inference.projection import Projection, bandwidth
+
+SIZE = 342  # a frame of 621 x 188 enters as 608 x 192
+HIDDEN = 64
+DROPPED = 0.2  # of the channels, so that none is relied upon
+
+
+class PretrainedCountNet(nn.Module):
+    """A ``FeatureNet``: soft counts of the classes, their total and directions, D = classes + 1 + d, in bandwidths.
+
+    Args:
+        classes: the kinds that are counted.
+        directions: d.
+        size: of the square whose area images enter with, pixels.
+
+    Attributes:
+        unit: ``(D,)``, what 1 in each feature stands for: objects, or parts of the projection's directions.
+    """
+
+    def __init__(self, classes: tuple[str, ...], directions: int, size: int = SIZE):
+        super().__init__()
+        frozen = EfficientNetLite(size)
+        self.frozen = (frozen,)  # not a submodule: its weights are in no state
+        self.names = (*classes, "total", *(f"direction_{i}" for i in range(1, directions + 1)))
+        self.register_buffer("mean", torch.zeros(frozen.channels, 1, 1))
+        self.register_buffer("scale", torch.ones(frozen.channels, 1, 1))
+        self.register_buffer("unit", torch.ones(len(self.names)))
+        self.register_buffer("projected_mean", torch.zeros(len(frozen.names)))
+        self.register_buffer("projected_weight", torch.zeros(len(frozen.names), directions))
+        self.head = nn.Sequential(
+            nn.Dropout2d(DROPPED),
+            nn.Conv2d(frozen.channels, HIDDEN, 1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(HIDDEN, HIDDEN, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(HIDDEN, 1 + len(classes), 1),
+        )
+        with torch.no_grad():
+            self.head[-1].weight.mul_(0.3)
+
+    @torch.no_grad()
+    def begin(self, maps: Tensor, target: Tensor) -> None:
+        """Take over channels' means and scales, and start from what places hold in the mean: from anywhere else the
+        first steps, which only mend the counts, leave a head that tells no class from another for long.
+
+        Args:
+            maps: ``(N, C, h, w)`` of some renders.
+            target: ``(N, 1 + classes, h, w)``, what their places hold, see ``count_batches.cells``.
+        """
+        self.mean.copy_(maps.mean((0, 2, 3)).view(-1, 1, 1))
+        self.scale.copy_(maps.std((0, 2, 3)).view(-1, 1, 1) + 1e-3)
+        self.head[-1].bias.copy_(target.mean((0, 2, 3)).clamp(min=1e-6).log())
+
+    @torch.no_grad()
+    def finish(self, projection: Projection, maps: Tensor, pooled: Tensor) -> None:
+        """Take over a projection and choose the units.
+
+        Args:
+            projection: of pooled features.
+            maps, pooled: ``look`` of renders that nothing was trained on, as many as a batch of the fit has.
+        """
+        self.projected_mean.copy_(projection.mean), self.projected_weight.copy_(projection.weight)
+        counts, directions = self.counts(maps), projection(pooled)
+        single = bandwidth(counts)
+        joint = bandwidth(torch.cat([counts / single, directions], 1))
+        self.unit.fill_(joint)[: counts.shape[1]] *= single
+
+    @torch.no_grad()
+    def look(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps ``(N, C, h, w)`` and pooled features ``(N, P)`` of ``(N, 1 or 3, H, W)`` uint8 images."""
+        net = self.frozen[0]
+        parts = [net.places(net.enter(some)) for some in images.split(AT_ONCE)]
+        return tuple(torch.cat(part) for part in zip(*parts, strict=True))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Logits of the places, ``(N, 1 + classes, h, w)``."""
+        return self.head((maps - self.mean) / self.scale)
+
+    @torch.no_grad()
+    def counts(self, maps: Tensor) -> Tensor:
+        """Soft counts and their total, ``(N, classes + 1)``, objects."""
+        parts = [self(some.float()).softmax(1)[:, 1:].sum((2, 3)) for some in maps.split(64)]
+        counts = torch.cat(parts)
+        return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
+
+    @torch.no_grad()
+    def embed(self, images: Tensor) -> Tensor:
+        """``(N, D)`` features of ``(N, 1 or 3, H, W)`` uint8 images."""
+        out = [torch.zeros(0, len(self.names))]
+        for some in images.split(AT_ONCE):
+            maps, pooled = self.look(some)
+            directions = (pooled - self.projected_mean) @ self.projected_weight
+            out.append(torch.cat([self.counts(maps), directions], 1) / self.unit)
+        return torch.cat(out)

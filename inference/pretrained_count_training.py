@@ -1,0 +1,164 @@
+"""Training ``PretrainedCountNet`` on renders with their free labels, each structure drawn twice.
+
+The frozen network sees each render once; its maps stay in memory as half-precision numbers, 0.4 MB a frame of 621 x
+188, and the head takes many epochs on them. Photographs' maps are unlike renders' channel by channel, so the head is
+kept from relying on any: channels are left out (``pretrained_count.DROPPED``) and shifted at random. The pairs give the
+projection. Axis letters: N images, M nodes.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from probscene.errors import ProbsceneError
+from probscene.inference.count_batches import STRIDE, cells
+from probscene.inference.count_training import relative_count_loss
+from probscene.inference.features import Draw, Examples
+from probscene.inference.pretrained_count import PretrainedCountNet
+from probscene.inference.projection import discriminant
+from probscene.inference.resume import batch_seed, restore_training, training_state
+from probscene.sampling import seed_everything
+
+DRAWN_AT_ONCE = 32  # structures
+SMALLEST = 1.0  # places that the longer side of an object spans; what is smaller is not counted
+SHIFT = 0.2  # of a channel over a whole image, in its standard deviations
+
+
+class Found(NamedTuple):
+    """How well structure is seen, on renders held out.
+
+    Attributes:
+        correlation: of the soft counts with the true ones, ``(classes,)``; NaN where one of them does not vary.
+        ratio: of the projection, see there.
+    """
+
+    correlation: Tensor
+    ratio: Tensor
+
+
+class PretrainedCountTraining:
+    """Resumable training; after an interruption the renders are drawn and looked at again.
+
+    Args:
+        net: trained in place.
+        draw_twice: labelled renders of so many structures, then as many of the same structures.
+        pairs: structures.
+        epochs: of the head.
+        held_out: further renders, as many as a batch of the fit has scenes, by which the features' units are chosen.
+        batch_size, learning_rate: of AdamW, along a cosine.
+        min_visible: objects less visible than this are not counted.
+        seed: of everything random.
+
+    Attributes:
+        done: epochs taken.
+    """
+
+    def __init__(
+        self,
+        net: PretrainedCountNet,
+        draw_twice: Draw,
+        pairs: int = 750,
+        epochs: int = 12,
+        held_out: int = 150,
+        batch_size: int = 32,
+        learning_rate: float = 5e-3,
+        min_visible: float = 0.25,
+        seed: int = 0,
+    ):
+        self.net, self.draw_twice, self.pairs, self.epochs, self.held_out = net, draw_twice, pairs, epochs, held_out
+        self.batch_size, self.min_visible, self.seed = batch_size, min_visible, seed
+        self.learning_rate, self.done = learning_rate, 0
+        self.optimiser = torch.optim.AdamW(net.head.parameters(), lr=learning_rate, weight_decay=5e-2)
+
+    def run(
+        self,
+        each: Callable[["PretrainedCountTraining", float], None] | None = None,
+        drawn: Callable[[int, int], None] | None = None,
+    ) -> Found:
+        """Take the epochs that are left.
+
+        Args:
+            each: sees the training and the mean loss after every epoch.
+            drawn: is told how many renders have been looked at, of how many.
+
+        Raises:
+            ProbsceneError: the loss is no longer finite; see also ``discriminant``.
+        """
+        maps, pooled, target = self._look(drawn)
+        n = 2 * self.pairs
+        if self.done == 0:
+            self.net.begin(maps[: min(n, 512)].float(), target[: min(n, 512)].float())
+        self.net.train()
+        while self.done < self.epochs:
+            seed_everything(batch_seed(self.seed, 1, self.done))
+            batches = torch.randperm(n).split(self.batch_size)
+            losses = [self._step(maps[rows], target[rows], i / len(batches)) for i, rows in enumerate(batches)]
+            self.done += 1
+            loss = sum(losses) / len(losses)
+            if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
+                raise ProbsceneError(
+                    f"Expected a finite loss of the count head, actual {loss} in epoch {self.done}; begin again with "
+                    "features=count."
+                )
+            if each is not None:
+                each(self, loss)
+        self.net.eval()
+        projection = discriminant(*pooled[:n].chunk(2), len(self.net.unit) - target.shape[1], self.held_out)
+        self.net.finish(projection, maps[n:], pooled[n:])
+        seen, true = self.net.counts(maps[n:]), target[n:, 1:].float().sum((2, 3))
+        each_class = zip(seen.T, true.T, strict=False)  # the total is not among the true ones
+        return Found(torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class]), projection.ratio)
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        return training_state(self.net, {"adam": self.optimiser}, done=self.done)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        self.done = int(restore_training(self.net, {"adam": self.optimiser}, tensors)["done"])
+
+    def _look(self, drawn: Callable[[int, int], None] | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Maps ``(N, C, h, w)`` float16, pooled features ``(N, P)`` and what the places should hold
+        ``(N, 1 + classes, h, w)`` float16: all first drawings, all second ones, then what is held out."""
+        seed_everything(batch_seed(self.seed, 0))
+        total, done, parts = self.pairs + (self.held_out + 1) // 2, 0, ([], [], [])
+        for number in [*_parts(self.pairs), *_parts(total - self.pairs)]:
+            drawings = self.draw_twice(number)
+            maps, pooled = self.net.look(drawings.image)
+            target = self._target(drawings, *maps.shape[2:])
+            for part, of_drawings in zip(parts, (maps.half(), pooled, target.half()), strict=True):
+                part.append(of_drawings.chunk(2))
+            done += number
+            if drawn is not None:
+                drawn(2 * done, 2 * total)
+        cut = len(_parts(self.pairs))
+        return tuple(
+            torch.cat([both[i] for some in (part[:cut], part[cut:]) for i in (0, 1) for both in some]) for part in parts
+        )
+
+    def _target(self, drawings: Examples, height: int, width: int) -> Tensor:
+        places = torch.tensor([width / drawings.image.shape[-1], height / drawings.image.shape[-2]])
+        size = (drawings.size * places).amax(-1)
+        label = drawings.label.masked_fill((drawings.visible < self.min_visible) | (size < SMALLEST), -1)
+        classes = self.net.head[-1].out_channels - 1
+        return cells(drawings.centre * places * STRIDE, label, classes, height, width)
+
+    def _step(self, maps: Tensor, target: Tensor, part: float) -> float:
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate * 0.5 * (1 + math.cos(math.pi * (self.done + part) / self.epochs))
+        flipped = torch.rand(len(maps)) < 0.5
+        maps, target = maps.float(), target.float()
+        maps[flipped], target[flipped] = maps[flipped].flip(3), target[flipped].flip(3)
+        maps += self.net.scale * (SHIFT * torch.randn(*maps.shape[:2], 1, 1))
+        loss = relative_count_loss(self.net(maps), target)
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+        return loss.item()
+
+
+def _parts(number: int) -> list[int]:
+    return [min(DRAWN_AT_ONCE, number - start) for start in range(0, number, DRAWN_AT_ONCE)]

