@@ -1,17 +1,15 @@
 """Whether a fit finds a hidden distribution of street structures from images alone.
 
-    python benchmarks/learn_driving.py --out FOLDER [--seeds 0 1 2] [--preset quick] [--model driving]
+    python benchmarks/learn_driving.py --out FOLDER [--seeds 0 1 2] [--preset street] [--model driving]
 
 Each seed's target is drawn by the driving models themselves with another, random distribution of structures
 (``SceneModel.target``); fits see its images. Printed for each seed is the total variation of the number of cars in a
 scene, 20,000 structures of the prior and of the learnt guide against 20,000 of the target's, and how long the fit took.
-A target's images are not chosen for what they hide, so that each structure is drawn once (``candidates=1``).
 """
 
 import argparse
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,7 @@ from probscene.app.fit import create, fit
 from probscene.app.generate import generate_scenes
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
+from probscene.app.overrides import override
 from probscene.app.run import Run
 from probscene.derive import derive_complete
 from probscene.inference.metrics import histogram, total_variation, wasserstein
@@ -41,10 +40,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
     parser.add_argument("--model", default="driving")
-    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--preset", default="street")
+    parser.add_argument("--set", action="append", default=[], dest="settings", help="as of probscene fit")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--images", type=int, default=3000)
-    parser.add_argument("--batches", type=int)
     args = parser.parse_args()
     keep_freed_memory()
     model, rows = load_model(args.model), []
@@ -52,8 +51,7 @@ def main():
         target = model.target(seed)
         folder = args.out / f"target-{seed}"
         generate_scenes(target, target.prior, args.images, folder, seed=1000 + seed, format="images")
-        chosen = replace(preset(args.preset).toward("js"), variance=30.0, anchor=0.1, candidates=1)
-        chosen = replace(chosen, batches=args.batches or chosen.batches)
+        chosen = override(preset(args.preset), args.settings)
         path = args.out / f"run-{seed}"
         began = path.exists()
         run = Run.open(path) if began else create(args.model, folder / "images", path, chosen, seed)

@@ -82,7 +82,7 @@ def main():
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = override(preset("quick").seeing(args.features), args.settings)
+        chosen = override(preset("street").seeing(args.features), args.settings)
         run = Run.open(path) if path.exists() else create(args.model, args.images, path, chosen, seed)
         start = time.monotonic()
         fit(run, lambda *_: None)

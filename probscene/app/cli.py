@@ -83,7 +83,7 @@ Assets = Annotated[
     Path | None, typer.Option(metavar="DIR", help="A folder of meshes (driving) or pictures (aerial2d) to draw with.")
 ]
 MinHeight = Annotated[float, typer.Option(min=0, help="Of objects that KITTI's labels count, pixels of their boxes.")]
-PresetName = StrEnum("PresetName", ["quick", "default", "paper"])
+PresetName = StrEnum("PresetName", ["quick", "default", "paper", "street"])
 Objective = StrEnum("Objective", ["kde", "js", "witness", "mmd"])
 GuideName = StrEnum("GuideName", {"lstm": "lstm", "pcfg": "pcfg", "grammar_vae": "grammar-vae"})
 

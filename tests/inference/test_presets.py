@@ -47,6 +47,16 @@ def test_objectives_and_their_settings():
         assert (chosen.updates == QUICK.updates) == (chosen.baseline == QUICK.baseline) == (name != "mmd")
 
 
+def test_pretrained_features_bring_their_own_unit():
+    """A kernel that was chosen for counts is none for features in units of their bandwidth."""
+    street = preset("street")
+    assert street.divergence() == JensenShannon(street.variance, 0.1) and street.variance != 1
+    for features in ("efficientnet", "count=efficientnet"):
+        assert street.seeing(features).divergence() == JensenShannon(1.0, None)
+        assert preset("paper").seeing(features).variance is None
+    assert street.seeing("count").divergence() == street.divergence()
+
+
 def test_guides_and_their_settings():
     assert QUICK.guided("lstm") == QUICK
     for kind in ("pcfg", "grammar-vae"):
