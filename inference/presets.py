@@ -156,8 +156,8 @@ class Preset:
 QUICK = Preset()
 DEFAULT = replace(QUICK, count=CountSchedule(steps=12000), batches=120)
 # Ten counts, of which some spread over tens, leave each of 500 scenes alone under a kernel of variance 1 (a self share
-# of 0.5; at 5 it is 0.05 to 0.1), and the log ratio of a density there is anything. What stands behind others is counted
-# as far as it can be seen at all, and the anchor holds what cannot.
+# of 0.5; at 5 it is 0.05 to 0.1), and the log ratio of a density there is anything. What stands behind others is
+# counted as far as it can be seen at all, and the anchor holds what cannot.
 STREET = replace(
     QUICK,
     objective="js",
