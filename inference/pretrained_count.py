@@ -12,13 +12,15 @@ are divided by the bandwidth of their joint density: how many kernels away one o
 be counted. Axis letters: N images, C channels of the maps, h w places, P pooled features, d directions.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from probscene.inference.pretrained import AT_ONCE, EfficientNetLite
 from probscene.inference.projection import Projection, bandwidth
 
-SIZE = 342  # a frame of 621 x 188 enters as 608 x 192
+SIZES = 224, 342  # least and largest square whose area images enter with; a frame of 621 x 188 enters as 608 x 192
 HIDDEN = 64
 DROPPED = 0.2  # of the channels, so that none is relied upon
 
@@ -29,15 +31,18 @@ class PretrainedCountNet(nn.Module):
     Args:
         classes: the kinds that are counted.
         directions: d.
-        size: of the square whose area images enter with, pixels.
+        canvas: height and width of the images, which enter in about that size.
+        sizes: see ``SIZES``.
 
     Attributes:
         unit: ``(D,)``, what 1 in each feature stands for: objects, or parts of the projection's directions.
     """
 
-    def __init__(self, classes: tuple[str, ...], directions: int, size: int = SIZE):
+    def __init__(
+        self, classes: tuple[str, ...], directions: int, canvas: tuple[int, int], sizes: tuple[int, int] = SIZES
+    ):
         super().__init__()
-        frozen = EfficientNetLite(size)
+        frozen = EfficientNetLite(min(max(round(math.sqrt(math.prod(canvas))), sizes[0]), sizes[1]))
         self.frozen = (frozen,)  # not a submodule: its weights are in no state
         self.names = (*classes, "total", *(f"direction_{i}" for i in range(1, directions + 1)))
         self.register_buffer("mean", torch.zeros(frozen.channels, 1, 1))

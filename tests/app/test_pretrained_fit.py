@@ -137,7 +137,7 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
 
 
 def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call, discs, target, tmp_path):
-    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=40", "--set", "head_epochs=2"]
+    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=2"]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
     assert done.code == 0 and "Prior's renders" in done.err and "epochs" in done.err, done.err
     run = Run.open(tmp_path / "run")
@@ -153,6 +153,11 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
         (run.path / f"{name}.safetensors").unlink()
     assert call("fit", "--out", run.path, "--resume").code == 0
     assert (run.path / "guide.safetensors").read_bytes() == guide
-    done = call("evaluate", run.path, "--target", target.images, "--num", 50, "--scenes", 40)
+    words = ["--target", target.images, "--num", 50, "--scenes", 40, "--json", tmp_path / "e.json"]
+    done = call("evaluate", run.path, *words)
     assert done.code == 0, done.err
+    estimate = json.loads((tmp_path / "e.json").read_text())["sources"]["estimate"]
+    total = run.load("real")["features"][:, 2] * net.unit[2]  # objects, whatever the unit of the features is
+    assert estimate["mean_number"] == pytest.approx(total.round().mean().item(), abs=1e-6)
+    assert not torch.equal(total.round(), run.load("real")["features"][:, 2].round())
     assert call("report", run.path, "--num", 50, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
