@@ -134,6 +134,27 @@ class MMD:
         return (discrepancy + real_term.sum() / max(1, len(some) * (len(some) - 1))).expand(N)
 
 
+@dataclass(frozen=True)
+class Blockwise:
+    """The sum of one divergence over blocks of features, each by its own density.
+
+    Where one block's real features lie far from all generated ones, a joint density at a scene is that of the one or
+    two real images that are nearest in that block, and the others' features say nothing any more.
+
+    Args:
+        divergence: of each block.
+        sizes: how many features each has, in their order.
+    """
+
+    divergence: Divergence
+    sizes: tuple[int, ...]
+
+    def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
+        _check(generated, real)
+        blocks = zip(generated.split(self.sizes, 1), real.split(self.sizes, 1), strict=True)
+        return sum(self.divergence(*block) for block in blocks)
+
+
 def _centred(points: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:
     """Features ``(B, N, d)`` and ``(B, L, d)`` less the mean of ``data``: far from the origin they lose precision."""
     centre = data.mean(1, keepdim=True)

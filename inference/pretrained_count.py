@@ -1,15 +1,17 @@
 """Counts read from the maps of a network that was trained on photographs, and what else structure moves in them.
 
 A count network that is trained on renders alone learns what renders look like, and reads photographs less well than
-its own kind; the frozen maps of a pretrained network change less between the two. Only a small head is trained
+its own kind; the frozen maps of a pretrained network change less between the two. Only small heads are trained
 (``pretrained_count_training``): every place of the map, 16 pixels apart, holds a distribution over background and
-classes, as in ``count_net``, and the sums of the map and their total are the counts. Groups of a model are counted as
-any class is. Beside them stand the directions of ``projection``, from the same pass: counts say how many cars there
+classes, as in ``count_net``, and the sums of the map and their total are the counts. Heads that agree on renders differ
+by a quarter in how many cars they read in photographs, so the mean of several is taken. Groups of a model are counted
+as any class is. Beside them stand the directions of ``projection``, from the same pass: counts say how many cars there
 are, and nothing of how a wood differs from five trees.
 
-The unit of the counts is the bandwidth of their density, as it is of the projection's directions, and both together
-are divided by the bandwidth of their joint density: how many kernels away one object is depends on how well objects can
-be counted. Axis letters: N images, C channels of the maps, h w places, P pooled features, d directions.
+The unit of the counts is the bandwidth of their density, as it is of the projection's directions: how many kernels away
+one object is depends on how well objects can be counted. The two are blocks with a density each: photographs lie far
+from all renders in some direction, and in a joint density whichever lies nearest there would be all that is known of
+their counts. Axis letters: N images, C channels of the maps, h w places, P pooled features, d directions.
 """
 
 import math
@@ -21,7 +23,7 @@ from probscene.inference.pretrained import AT_ONCE, EfficientNetLite
 from probscene.inference.projection import Projection, bandwidth
 
 SIZES = 224, 342  # least and largest square whose area images enter with; a frame of 621 x 188 enters as 608 x 192
-HIDDEN = 64
+HEADS, HIDDEN = 4, 64
 DROPPED = 0.2  # of the channels, so that none is relied upon
 
 
@@ -35,7 +37,8 @@ class PretrainedCountNet(nn.Module):
         sizes: see ``SIZES``.
 
     Attributes:
-        unit: ``(D,)``, what 1 in each feature stands for: objects, or parts of the projection's directions.
+        unit: ``(D,)``, what 1 in each feature stands for: objects, or the projection's own unit.
+        blocks: how many features are counts, and how many directions.
     """
 
     def __init__(
@@ -44,22 +47,14 @@ class PretrainedCountNet(nn.Module):
         super().__init__()
         frozen = EfficientNetLite(min(max(round(math.sqrt(math.prod(canvas))), sizes[0]), sizes[1]))
         self.frozen = (frozen,)  # not a submodule: its weights are in no state
+        self.blocks = len(classes) + 1, directions
         self.names = (*classes, "total", *(f"direction_{i}" for i in range(1, directions + 1)))
         self.register_buffer("mean", torch.zeros(frozen.channels, 1, 1))
         self.register_buffer("scale", torch.ones(frozen.channels, 1, 1))
         self.register_buffer("unit", torch.ones(len(self.names)))
         self.register_buffer("projected_mean", torch.zeros(len(frozen.names)))
         self.register_buffer("projected_weight", torch.zeros(len(frozen.names), directions))
-        self.head = nn.Sequential(
-            nn.Dropout2d(DROPPED),
-            nn.Conv2d(frozen.channels, HIDDEN, 1),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(HIDDEN, HIDDEN, 3, padding=1),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(HIDDEN, 1 + len(classes), 1),
-        )
-        with torch.no_grad():
-            self.head[-1].weight.mul_(0.3)
+        self.heads = nn.ModuleList(_head(frozen.channels, 1 + len(classes)) for _ in range(HEADS))
 
     @torch.no_grad()
     def begin(self, maps: Tensor, target: Tensor) -> None:
@@ -72,21 +67,15 @@ class PretrainedCountNet(nn.Module):
         """
         self.mean.copy_(maps.mean((0, 2, 3)).view(-1, 1, 1))
         self.scale.copy_(maps.std((0, 2, 3)).view(-1, 1, 1) + 1e-3)
-        self.head[-1].bias.copy_(target.mean((0, 2, 3)).clamp(min=1e-6).log())
+        for head in self.heads:
+            head[-1].bias.copy_(target.mean((0, 2, 3)).clamp(min=1e-6).log())
 
     @torch.no_grad()
-    def finish(self, projection: Projection, maps: Tensor, pooled: Tensor) -> None:
-        """Take over a projection and choose the units.
-
-        Args:
-            projection: of pooled features.
-            maps, pooled: ``look`` of renders that nothing was trained on, as many as a batch of the fit has.
-        """
+    def finish(self, projection: Projection, maps: Tensor) -> None:
+        """Take over a projection of pooled features, and choose the unit of the counts by the maps of renders that
+        nothing was trained on, as many as a batch of the fit has."""
         self.projected_mean.copy_(projection.mean), self.projected_weight.copy_(projection.weight)
-        counts, directions = self.counts(maps), projection(pooled)
-        single = bandwidth(counts)
-        joint = bandwidth(torch.cat([counts / single, directions], 1))
-        self.unit.fill_(joint)[: counts.shape[1]] *= single
+        self.unit[: self.blocks[0]] = bandwidth(self.counts(maps))
 
     @torch.no_grad()
     def look(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,13 +85,14 @@ class PretrainedCountNet(nn.Module):
         return tuple(torch.cat(part) for part in zip(*parts, strict=True))
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Logits of the places, ``(N, 1 + classes, h, w)``."""
-        return self.head((maps - self.mean) / self.scale)
+        """Logits of the places by each head, ``(HEADS, N, 1 + classes, h, w)``."""
+        x = (maps - self.mean) / self.scale
+        return torch.stack([head(x) for head in self.heads])
 
     @torch.no_grad()
     def counts(self, maps: Tensor) -> Tensor:
         """Soft counts and their total, ``(N, classes + 1)``, objects."""
-        parts = [self(some.float()).softmax(1)[:, 1:].sum((2, 3)) for some in maps.split(64)]
+        parts = [self(some.float()).softmax(2)[:, :, 1:].sum((3, 4)).mean(0) for some in maps.split(64)]
         counts = torch.cat(parts)
         return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
 
@@ -115,3 +105,17 @@ class PretrainedCountNet(nn.Module):
             directions = (pooled - self.projected_mean) @ self.projected_weight
             out.append(torch.cat([self.counts(maps), directions], 1) / self.unit)
         return torch.cat(out)
+
+
+def _head(channels: int, out: int) -> nn.Sequential:
+    head = nn.Sequential(
+        nn.Dropout2d(DROPPED),
+        nn.Conv2d(channels, HIDDEN, 1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(HIDDEN, HIDDEN, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(HIDDEN, out, 1),
+    )
+    with torch.no_grad():
+        head[-1].weight.mul_(0.3)
+    return head

@@ -1,7 +1,7 @@
 """Training ``PretrainedCountNet`` on renders with their free labels, each structure drawn twice.
 
 The frozen network sees each render once; its maps stay in memory as half-precision numbers, 0.4 MB a frame of 621 x
-188, and the head takes many epochs on them. Photographs' maps are unlike renders' channel by channel, so the head is
+188, and the heads take many epochs on them. Photographs' maps are unlike renders' channel by channel, so the heads are
 kept from relying on any: channels are left out (``pretrained_count.DROPPED``) and shifted at random. The pairs give the
 projection. Axis letters: N images, M nodes.
 """
@@ -46,8 +46,8 @@ class PretrainedCountTraining:
         net: trained in place.
         draw_twice: labelled renders of so many structures, then as many of the same structures.
         pairs: structures.
-        epochs: of the head.
-        held_out: further renders, as many as a batch of the fit has scenes, by which the features' units are chosen.
+        epochs: of the heads.
+        held_out: further renders, as many as a batch of the fit has scenes, by which the unit of the counts is chosen.
         batch_size, learning_rate: of AdamW, along a cosine.
         min_visible: objects less visible than this are not counted.
         seed: of everything random.
@@ -71,7 +71,7 @@ class PretrainedCountTraining:
         self.net, self.draw_twice, self.pairs, self.epochs, self.held_out = net, draw_twice, pairs, epochs, held_out
         self.batch_size, self.min_visible, self.seed = batch_size, min_visible, seed
         self.learning_rate, self.done = learning_rate, 0
-        self.optimiser = torch.optim.AdamW(net.head.parameters(), lr=learning_rate, weight_decay=5e-2)
+        self.optimiser = torch.optim.AdamW(net.heads.parameters(), lr=learning_rate, weight_decay=5e-2)
 
     def run(
         self,
@@ -100,14 +100,14 @@ class PretrainedCountTraining:
             loss = sum(losses) / len(losses)
             if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
                 raise ProbsceneError(
-                    f"Expected a finite loss of the count head, actual {loss} in epoch {self.done}; begin again with "
+                    f"Expected a finite loss of the count heads, actual {loss} in epoch {self.done}; begin again with "
                     "features=count."
                 )
             if each is not None:
                 each(self, loss)
         self.net.eval()
-        projection = discriminant(*pooled[:n].chunk(2), len(self.net.unit) - target.shape[1], self.held_out)
-        self.net.finish(projection, maps[n:], pooled[n:])
+        projection = discriminant(*pooled[:n].chunk(2), self.net.blocks[1], self.held_out)
+        self.net.finish(projection, maps[n:])
         seen, true = self.net.counts(maps[n:]), target[n:, 1:].float().sum((2, 3))
         each_class = zip(seen.T, true.T, strict=False)  # the total is not among the true ones
         return Found(torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class]), projection.ratio)
@@ -143,8 +143,7 @@ class PretrainedCountTraining:
         places = torch.tensor([width / drawings.image.shape[-1], height / drawings.image.shape[-2]])
         size = (drawings.size * places).amax(-1)
         label = drawings.label.masked_fill((drawings.visible < self.min_visible) | (size < SMALLEST), -1)
-        classes = self.net.head[-1].out_channels - 1
-        return cells(drawings.centre * places * STRIDE, label, classes, height, width)
+        return cells(drawings.centre * places * STRIDE, label, self.net.blocks[0] - 1, height, width)
 
     def _step(self, maps: Tensor, target: Tensor, part: float) -> float:
         for group in self.optimiser.param_groups:
@@ -153,7 +152,8 @@ class PretrainedCountTraining:
         maps, target = maps.float(), target.float()
         maps[flipped], target[flipped] = maps[flipped].flip(3), target[flipped].flip(3)
         maps += self.net.scale * (SHIFT * torch.randn(*maps.shape[:2], 1, 1))
-        loss = relative_count_loss(self.net(maps), target)
+        logits = self.net(maps).flatten(0, 1)
+        loss = relative_count_loss(logits, target.repeat(len(logits) // len(target), 1, 1, 1))
         self.optimiser.zero_grad()
         loss.backward()
         self.optimiser.step()

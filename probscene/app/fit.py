@@ -24,6 +24,7 @@ from probscene.app.view import RENDERED_AT_ONCE, View, feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, RunError
 from probscene.inference.count_training import CountTraining
+from probscene.inference.divergence import Blockwise, Divergence
 from probscene.inference.features import FeatureNet, embed_all
 from probscene.inference.latent import Guide
 from probscene.inference.learn import Learner
@@ -95,7 +96,10 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     net = _feature_net(run, preset, view, progress)
     real = _real_features(run, net, model, progress, target)
     torch.set_num_threads(1)  # the guide's tensors are tiny: a second thread only waits
-    guide = _learn(run, preset, model, view.observe(net, preset.candidates), real, progress)
+    divergence = preset.divergence()
+    if preset.features == COUNT_ON_PRETRAINED:
+        divergence = Blockwise(divergence, net.blocks)
+    guide = _learn(run, preset, model, view.observe(net, preset.candidates), divergence, real, progress)
     run.save("guide", guide.state_dict())
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
     return guide
@@ -236,14 +240,20 @@ def open_target(run: Run, progress: Progress) -> ImageFolder:
 
 
 def _learn(
-    run: Run, preset: Preset, model: SceneModel, observe: Callable[[Scenes], Tensor], real: Tensor, progress: Progress
+    run: Run,
+    preset: Preset,
+    model: SceneModel,
+    observe: Callable[[Scenes], Tensor],
+    divergence: Divergence,
+    real: Tensor,
+    progress: Progress,
 ) -> Guide:
     seed = run.record["seed"]
     seed_everything(batch_seed(seed, 2))
     guide = run.new_guide()
     objective = ScoreFunction(
         observe,
-        preset.divergence(),
+        divergence,
         baseline=preset.baseline,
         updates=preset.updates,
         scale=preset.scale,

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from scipy.stats import gaussian_kde as scipy_kde
 
 from probscene.errors import ProbsceneError
 from probscene.inference import divergence as module
-from probscene.inference.divergence import MMD, JensenShannon, KDELogRatio, gaussian_kde
+from probscene.inference.divergence import MMD, Blockwise, JensenShannon, KDELogRatio, gaussian_kde
 from probscene.inference.guide import LSTMGuide
 
 
@@ -159,3 +161,15 @@ def test_bad_features_are_named(generated, real, says):
     for divergence in (KDELogRatio(), JensenShannon(), MMD()):
         with pytest.raises(ProbsceneError, match=says):
             divergence(generated, real)
+
+
+def test_blocks_have_densities_of_their_own():
+    """A block in which the two sides have nothing in common leaves the other's costs as they are, up to a constant."""
+    one, real = torch.randn(40, 2), torch.randn(30, 2)
+    other, far = torch.randn(40, 3), torch.randn(30, 3) + 100
+    found = Blockwise(JensenShannon(0.5, None), (2, 3))(torch.cat([one, other], 1), torch.cat([real, far], 1))
+    assert torch.allclose(found, JensenShannon(0.5, None)(one, real) + math.log(2), atol=1e-5)
+    joint = JensenShannon(0.5, None)(torch.cat([one, other], 1), torch.cat([real, far], 1))
+    assert joint.std() < 1e-5 < found.std()
+    with pytest.raises(ProbsceneError, match="Expected generated"):
+        Blockwise(JensenShannon(), (2, 3))(one, torch.cat([real, far], 1))

@@ -70,14 +70,14 @@ def test_features_are_the_map_summed_and_the_projection_in_units(dots):
     images = torch.randint(0, 256, (5, 3, 64, 96), dtype=torch.uint8)
     maps, pooled = net.look(images)
     share = net(maps).double().exp()
-    counts = (share / share.sum(1, keepdim=True))[:, 1:].sum((2, 3))
+    counts = (share / share.sum(2, keepdim=True))[:, :, 1:].sum((3, 4)).mean(0)
     directions = (pooled - net.projected_mean).double() @ net.projected_weight.double()
     expected = torch.cat([counts, counts.sum(1, keepdim=True), directions], 1) / net.unit
     assert torch.allclose(net.embed(images).double(), expected, rtol=1e-4, atol=1e-4)
     assert len(net.names) == expected.shape[1] == 5 and net.embed(images[:0]).shape == (0, 5)
     one = torch.cat([net.embed(image[None]) for image in images])
     assert torch.allclose(one, net.embed(images), rtol=1e-4, atol=1e-4)
-    assert sum(value.numel() for value in net.state_dict().values()) < 100_000  # none of the frozen network's
+    assert sum(value.numel() for value in net.state_dict().values()) < 400_000  # none of the frozen network's
 
 
 def test_it_learns_to_count(dots, draw_twice):
@@ -90,7 +90,8 @@ def test_it_learns_to_count(dots, draw_twice):
     counts = torch.stack([(fresh.label == c).sum(1) for c in range(2)], 1).float()
     features = fit.net.embed(fresh.image)
     assert ((features[:, :2] * fit.net.unit[:2] - counts).square().mean(0) < 0.2 * counts.var(0)).all()
-    assert self_share(features[:64]) == pytest.approx(SHARE, rel=0.5)
+    for block in features[:64].split(fit.net.blocks, 1):
+        assert self_share(block) == pytest.approx(SHARE, rel=0.5)
 
 
 def test_the_projection_is_that_of_the_pairs(dots, draw_twice):
