@@ -17,14 +17,14 @@ WIDTH, HEIGHT, AT = range(3)
 COLUMNS = AT + LEVELS * LEVELS
 
 _MOST = (1 << 31) - 1  # the kernel's indices are 32-bit
-_LANES = np.array([0, 16, 32], np.uint64)
+_BITS = np.array([0, 8, 16], np.uint64)
 
 
 class TextureAtlas:
     """Textures in the order in which they are added, after a white one, the first; those that are equal once.
 
     Attributes:
-        texels: uint64, red, green and blue in 16-bit lanes.
+        texels: uint64, red, green and blue in bytes from the lowest on, and 32 bits up those of the one to the right.
         table: int32, ``COLUMNS`` for each texture.
     """
 
@@ -52,7 +52,8 @@ class TextureAtlas:
                 for y, level in enumerate(both):
                     begins[y:, x:] = used
                     framed = np.pad(np.rint(level).astype(np.uint64), ((1, 1), (1, 1), (0, 0)), mode="wrap")
-                    words.append((framed << _LANES).sum(-1, dtype=np.uint64).ravel())
+                    word = (framed << _BITS).sum(-1, dtype=np.uint64)
+                    words.append((word | np.roll(word, -1, 1) << np.uint64(32)).ravel())
                     used += words[-1].size
             if used > _MOST:
                 raise ModelError(f"Expected textures of at most {_MOST} texels in all, actual more; make them smaller.")

@@ -5,7 +5,8 @@ from probscene.renderers.lane_kernel import LANES, whole, words
 from probscene.renderers.raster_kernel import high, low
 from probscene.renderers.texture_atlas import AT, LEVELS
 
-i32, u64, f32 = ti.i32, ti.u64, ti.f32
+i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
+PAIR = 0x00FF00FF  # red and blue of a texel
 FAR = 1e9  # whole numbers beyond this have no fraction in f32, and none beyond 2^31 is an i32
 
 
@@ -25,9 +26,17 @@ def place(coordinate: f32, size: i32):
 
 
 @ti.func
+def mixed(near: u32, beside: u32, below: u32, opposite: u32, right: u32, low_share: u32, twisted: u32):
+    """Bytes 16 bits apart by shares of 256: 255 times 256 of them, which fit."""
+    return (near << 8) + (beside - near) * right + (below - near) * low_share + (
+        opposite - below - beside + near) * twisted  # fmt: skip
+
+
+@ti.func
 def texture_samples(z: ti.template(), some: ti.template(), table: ti.template(), texels: ti.template()):
     """Multiply the colours by the textures'; ``z`` are depths."""
-    at, stride, across, down, mixed = whole(0), whole(0), whole(0), whole(0), words(0)
+    at, place_in, stride, across, down = whole(0), whole(0), whole(0), whole(0), whole(0)
+    upper, lower = words(0), words(0)
     for i in range(i32(LANES)):
         s, t = some.s[i] * z[i], some.t[i] * z[i]
         step_s = high(ti.abs(some.s_u[i] - s * some.w_u[i]), ti.abs(some.s_v[i] - s * some.w_v[i])) * z[i]
@@ -36,17 +45,19 @@ def texture_samples(z: ti.template(), some: ti.template(), table: ti.template(),
         width = ti.max(ti.cast(some.wide[i], i32) >> level_s, i32(1))
         height = ti.max(ti.cast(some.high[i], i32) >> level_t, i32(1))
         at[i], stride[i] = some.table[i] + level_t * i32(LEVELS) + level_s + i32(AT), width + i32(2)
-        across[i], down[i] = place(s, width), place(t, height)
+        column, row = place(s, width), place(t, height)
+        across[i], down[i], place_in[i] = column & 255, row & 255, (row >> 8) * stride[i] + (column >> 8)
     for i in range(i32(LANES)):
-        j = table[at[i]] + (down[i] >> 8) * stride[i] + (across[i] >> 8)
-        k = j + stride[i]
-        right, low_share = ti.cast(across[i] & 255, u64), ti.cast(down[i] & 255, u64)
-        near, below = texels[j], texels[k]
-        beside, twist = texels[j + 1] - near, texels[k + 1] - below
-        below -= near
-        twist -= beside
-        mixed[i] = (near << 8) + beside * right + below * low_share + twist * ((right * low_share + 128) >> 8)
+        j = table[at[i]] + place_in[i]
+        upper[i], lower[i] = texels[j], texels[j + stride[i]]
     for i in range(i32(LANES)):
-        some.red[i] = some.red[i] * (ti.cast(ti.cast(mixed[i] & 0xFFFF, i32), f32) * f32(1 / 65280))
-        some.green[i] = some.green[i] * (ti.cast(ti.cast((mixed[i] >> 16) & 0xFFFF, i32), f32) * f32(1 / 65280))
-        some.blue[i] = some.blue[i] * (ti.cast(ti.cast((mixed[i] >> 32) & 0xFFFF, i32), f32) * f32(1 / 65280))
+        right, low_share = ti.cast(across[i], u32), ti.cast(down[i], u32)
+        twisted = (right * low_share + 128) >> 8
+        near, beside = ti.cast(upper[i], u32), ti.cast(upper[i] >> 32, u32)
+        below, opposite = ti.cast(lower[i], u32), ti.cast(lower[i] >> 32, u32)
+        pair = mixed(near & PAIR, beside & PAIR, below & PAIR, opposite & PAIR, right, low_share, twisted)
+        near, beside, below, opposite = near >> 8, beside >> 8, below >> 8, opposite >> 8
+        green = mixed(near & 255, beside & 255, below & 255, opposite & 255, right, low_share, twisted)
+        some.red[i] = some.red[i] * (ti.cast(ti.cast(pair & 0xFFFF, i32), f32) * f32(1 / 65280))
+        some.green[i] = some.green[i] * (ti.cast(ti.cast(green, i32), f32) * f32(1 / 65280))
+        some.blue[i] = some.blue[i] * (ti.cast(ti.cast(pair >> 16, i32), f32) * f32(1 / 65280))
