@@ -1,10 +1,12 @@
 """Samples of an image side by side, in local arrays: what a loop over them computes, the compiler does for several at
-once. Arguments' arrays stop it from that, since anything written to one may change where the others lie.
+once. Arguments' arrays stop it from that, since anything written to one may change where the others lie: after each
+write it asks again. So where all ``LANES`` pixels of a block are written, whole words of 64 bits are, and blocks begin
+where these do: at multiples of ``LANES`` of all the images' pixels.
 """
 
 from probscene.renderers.engine import ti
 
-LANES = 16
+LANES, SHIFT = 16, 4  # SHIFT: bits of a place within a block
 
 i32, f32, u64 = ti.i32, ti.f32, ti.u64
 floats, whole, words = (ti.types.vector(LANES, kind) for kind in (f32, i32, u64))
@@ -14,12 +16,13 @@ floats, whole, words = (ti.types.vector(LANES, kind) for kind in (f32, i32, u64)
 class Samples:
     """What is known of samples before they are shaded, and their colours.
 
-    ``u, v`` columns and rows; ``record`` of the visibility buffer, 0 in the sky; ``w`` 1/z and ``w_u, w_v`` its steps;
-    over depth ``s, t`` texture coordinates with their steps and ``sun, up`` cosines; ``lift`` metres by which light
-    finds it nearer to the sun; ``table`` where the texture's row begins, ``wide, high`` its texels; ``red, green,
-    blue`` the surface's colour and then the sample's.
+    ``alone`` whether all are of one record; ``u, v`` columns and rows; ``record`` of the visibility buffer, 0 in the
+    sky; ``w`` 1/z and ``w_u, w_v`` its steps; over depth ``s, t`` texture coordinates with their steps and ``sun, up``
+    cosines; ``lift`` metres by which light finds it nearer to the sun; ``table`` where the texture's row begins,
+    ``wide, high`` its texels; ``red, green, blue`` the surface's colour and then the sample's.
     """
 
+    alone: i32
     u: floats
     v: floats
     record: whole

@@ -8,14 +8,16 @@ from probscene.renderers import mesh_tables as tables
 from probscene.renderers import shading_kernel as shading
 from probscene.renderers.engine import ti
 from probscene.renderers.geometry_kernel import draw_instance, lay_ground, unstamp
-from probscene.renderers.lane_kernel import LANES, Samples, floats
+from probscene.renderers.lane_kernel import LANES, SHIFT, Samples, floats
 from probscene.renderers.photo_kernel import develop
-from probscene.renderers.raster_kernel import lay_row
+from probscene.renderers.raster_kernel import lay_row, strip_row
 from probscene.renderers.row_kernel import (
     add_colours,
     add_samples,
     clear,
+    compare,
     label,
+    read_ground,
     read_pixels,
     repeat_last,
     take_colours,
@@ -60,29 +62,36 @@ def render(
     records: ti.types.ndarray(ti.f32, 1),
     marks: ti.types.ndarray(ti.i32, 1),
     line: ti.types.ndarray(ti.f32, 1),
+    bounds: ti.types.ndarray(ti.i32, 1),
     image: ti.types.ndarray(ti.u8, 1),
     instance: ti.types.ndarray(ti.i16, 1),
     semantic: ti.types.ndarray(ti.u8, 1),
     depth: ti.types.ndarray(ti.f32, 1),
+    shadow_words: ti.types.ndarray(ti.u64, 1),
+    image_words: ti.types.ndarray(ti.u64, 1),
+    instance_words: ti.types.ndarray(ti.u64, 1),
+    semantic_words: ti.types.ndarray(ti.u64, 1),
+    depth_words: ti.types.ndarray(ti.u64, 1),
     result: ti.types.ndarray(ti.i32, 1),
     extent: ti.types.ndarray(ti.f64, 1),
 ):
     """Render every scene.
 
     ``fine`` is whether there are four samples a pixel, kept behind the visibility buffer's first part. ``first (scenes
-    + 1)`` says where the instances of each scene begin; ``seen`` to ``line`` are scratch, as much for each worker, of
+    + 1)`` says where the instances of each scene begin; ``seen`` to ``bounds`` are scratch, as much for each worker, of
     which ``seen``, ``stamp``, ``opened`` and ``line`` hold zeros, as ``queue`` does; ``result`` and ``extent``
-    empty extents.
+    empty extents. Those named words are the same memory as what they are words of.
     """
     for j in range(workers * ti.i32(512)):
         if j % 512 == 0:
             worker = ti.cast(j // 512, i32)
             pixels = height * width
-            base = worker * pixels * ti.static(5 if fine else 1)
+            room = ((pixels + i32(2 * LANES - 1)) >> SHIFT) << SHIFT
+            seen_base = worker * room * ti.static(5 if fine else 1)
             stamp_base = worker * height * ((width + 63) >> 6)
             map_base, corner_base = worker * map_size * map_size, worker * most_vertices * 5
             record_base, mark_base = worker * most_records * shading.RECORD, worker * most_records * shading.MARKS
-            line_base = worker * width * 3
+            line_base, bounds_base = worker * width * 3, worker * 2 * ti.max(strips, 1)
             some, share = Samples(), floats(0)
             scene = ti.atomic_add(queue[0], i32(1))
             while scene < scenes:
@@ -91,6 +100,7 @@ def render(
                     scene, laid, record_base, mark_base, 0.5 * ti.cast(width, f64), 0.5 * ti.cast(height, f64),
                     scene_table, strip, tiles, records, marks,
                 )  # fmt: skip
+                base = seen_base + (scene * pixels & i32(LANES - 1))  # blocks begin where the images' do
                 texel = scene_table[scene * tables.SCENE + tables.TEXEL]
                 last, stamped = laid, i32(-1)
                 for k in range(first[scene], first[scene + 1]):
@@ -102,9 +112,9 @@ def render(
                         stamped = target
                     if node >= 0 or whole[k * tables.INTEGERS + tables.SEEN] != 0:
                         last, area = draw_instance(
-                            k, last, target, height, width, ti.static(2 if fine else 1), base, stamp_base, corner_base,
-                            record_base, mark_base, texel, whole, real, positions, triangles, faces, seen, stamp,
-                            corners, records, marks, extent,
+                            k, last, target, height, width, ti.static(2 if fine else 1), base, seen_base + room,
+                            stamp_base, corner_base, record_base, mark_base, texel, whole, real, positions, triangles,
+                            faces, seen, stamp, corners, records, marks, extent,
                         )  # fmt: skip
                         if node >= 0:
                             total = target * tables.RESULTS + tables.WHOLE
@@ -113,7 +123,7 @@ def render(
                     unstamp(stamped, height, width, stamp_base, extent, stamp)
                 if scene_table[scene * tables.SCENE + tables.LIGHT + tables.SHADOWED] != 0:
                     for k in range(first[scene], first[scene + 1]):
-                        open_tiles(k, scene + 1, map_size, map_base, whole, shadow, opened)
+                        open_tiles(k, scene + 1, map_size, map_base, whole, shadow, shadow_words, opened)
                     for k in range(first[scene], first[scene + 1]):
                         if whole[k * tables.INTEGERS + tables.CASTS] != 0:
                             cast_shadow(
@@ -122,34 +132,39 @@ def render(
                 light = shading.lights(scene, scene_table)
                 for row in range(height):
                     pixel, line_at = row * width, base + row * width
-                    out, fine_at = scene * pixels + pixel, base + pixels + i32(4) * pixel
-                    if laid > 0:
-                        lay_row(scene, laid, row, width, line_at, 1.0, 0.0, scene_table, edges, seen)
-                        if ti.static(fine):
-                            for half in range(2):
-                                lay_row(
-                                    scene, laid, 2 * row + half, 2 * width, fine_at + 2 * width * half, 0.5, -0.25,
-                                    scene_table, edges, seen,
-                                )  # fmt: skip
+                    out, fine_at = scene * pixels + pixel, seen_base + room + i32(4) * pixel
                     if ti.static(fine):
+                        lay_row(
+                            scene, laid, row, width, line_at, 1.0, 0.0, bounds_base, scene_table, edges, bounds, seen
+                        )
+                        for half in range(2):
+                            lay_row(
+                                scene, laid, 2 * row + half, 2 * width, fine_at + 2 * width * half, 0.5, -0.25,
+                                bounds_base, scene_table, edges, bounds, seen,
+                            )  # fmt: skip
                         filled = i32(0)
                         for x in range(width):
                             filled = add_samples(x, row, filled, width, line_at, fine_at, seen, some, share)
                             if filled > LANES - 4 or x == width - 1:
                                 repeat_last(filled, some)
+                                compare(some)
                                 shade(
                                     light, map_size, map_base, scene + 1, record_base, mark_base, records, marks,
                                     textures, texels, shadow, opened, some,
                                 )  # fmt: skip
                                 add_colours(filled, line_base, some, share, line)
                                 filled = i32(0)
+                        clear(fine_at, 4 * width, seen)
                     column = i32(0)
+                    w, w_u = strip_row(scene, laid, row, width, 1.0, 0.0, bounds_base, scene_table, edges, bounds)
                     while column < width:
-                        count = ti.min(width - column, i32(LANES))
+                        count = ti.min(width - column, i32(LANES) - (line_at + column & i32(LANES - 1)))
                         read_pixels(column, row, count, line_at + column, seen, some)
+                        read_ground(column, count, laid, w, w_u, bounds_base, bounds, some)
+                        compare(some)
                         label(
                             column, row, count, out + column, scene * nodes, mark_base, some, marks, instance, semantic,
-                            depth, result,
+                            depth, instance_words, semantic_words, depth_words, result,
                         )  # fmt: skip
                         if ti.static(fine):
                             take_colours(column, count, line_base, some, line)
@@ -158,9 +173,6 @@ def render(
                                 light, map_size, map_base, scene + 1, record_base, mark_base, records, marks, textures,
                                 texels, shadow, opened, some,
                             )  # fmt: skip
-                        develop(pixel + column, out + column, count, light, seeds[scene], some, image)
-                        column += i32(LANES)
-                    clear(line_at, width, seen)
-                    if ti.static(fine):
-                        clear(fine_at, 4 * width, seen)
+                        develop(pixel + column, out + column, count, light, seeds[scene], some, image, image_words)
+                        column += count
                 scene = ti.atomic_add(queue[0], i32(1))

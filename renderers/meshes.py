@@ -23,6 +23,7 @@ from probscene.errors import ModelError
 from probscene.renderers import engine, shading_kernel
 from probscene.renderers import mesh_kernel as kernel
 from probscene.renderers import mesh_tables as tables
+from probscene.renderers.lane_kernel import LANES
 from probscene.renderers.mesh_atlas import MeshAtlas
 from probscene.renderers.mesh_instances import Instances, instances, names
 from probscene.renderers.vertex_kernel import CORNER
@@ -73,17 +74,17 @@ class MeshRenderer:
         self._atlas.trim()
         (N, M), (height, width) = world.kind.shape, self.canvas
         pixels = height * width
-        image, instance = np.empty(max(1, 3 * N * pixels), np.uint8), np.empty(max(1, N * pixels), np.int16)
-        semantic, depth = np.empty(max(1, N * pixels), np.uint8), np.empty(max(1, N * pixels), np.float32)
+        room, types = N * pixels + LANES, ((np.uint8, 3), (np.int16, 1), (np.uint8, 1), (np.float32, 1))
+        image, instance, semantic, depth = (np.empty(each * room, dtype) for dtype, each in types)
         nodes = max(1, N), max(1, M)
         result = np.tile(np.array([width, height, 0, 0, 0, 0], np.int32), (*nodes, 1))
         extent = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (*nodes, 1))
         drawn, box = np.zeros((N, M), bool), np.zeros((N, M, 7))
-        step = min(_SCENES, max(1, _CHUNK // pixels))
+        step = min(_SCENES, max(1, _CHUNK // pixels // 8 * 8))  # images begin at whole words
         for start in range(0, N, step):
             part = slice(start, min(start + step, N))
             table = instances(world[part], self._atlas, self.canvas, self.map_size)
-            here = slice(start * pixels, part.stop * pixels)
+            here = slice(start * pixels, part.stop * pixels + LANES)
             self._render(
                 world[part], table, image[3 * here.start : 3 * here.stop], instance[here], semantic[here],
                 depth[here], result[part].reshape(-1), extent[part].reshape(-1),
@@ -113,7 +114,8 @@ class MeshRenderer:
                 "use coarser meshes or fewer."
             )
         strips = 0 if world.ground is None else world.ground.surface.shape[1]
-        most_records, seen = triangles + strips + 1, height * width * (1 if self.samples == 1 else 5)
+        room = (height * width + 2 * LANES - 1) // LANES * LANES
+        most_records, seen = triangles + strips + 1, room * (1 if self.samples == 1 else 5)
         each = {
             "seen": (seen, np.uint64),
             "stamp": (height * ((width + 63) // 64), np.uint64),
@@ -123,6 +125,7 @@ class MeshRenderer:
             "records": (most_records * shading_kernel.RECORD, np.float32),
             "marks": (most_records * shading_kernel.MARKS, np.int32),
             "line": (3 * width, np.float32),
+            "bounds": (2 * max(1, strips), np.int32),
         }
         largest = max(size for size, _ in each.values())
         workers = max(1, min(self.threads, N, ((1 << 31) - 1) // largest))
@@ -137,8 +140,13 @@ class MeshRenderer:
             world.photo.seed.cpu().numpy().astype(np.int64), table.edges, table.strips, table.tiles,
             atlas.positions, atlas.corners, atlas.faces, atlas.textures.table, atlas.textures.texels,
             *(self._scratch[name] for name in each), image, instance, semantic, depth,
-            result, extent,
+            *(_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)), result, extent,
         )  # fmt: skip
+
+
+def _words(flat: np.ndarray) -> np.ndarray:
+    """A view of as much of a flat array as is whole words of 64 bits."""
+    return flat[: flat.nbytes // 8 * 8 // flat.itemsize].view(np.uint64)
 
 
 def _labels(result: np.ndarray, extent: np.ndarray, canvas: tuple[int, int]) -> dict[str, torch.Tensor]:

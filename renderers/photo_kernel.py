@@ -1,7 +1,7 @@
 """What the camera's electronics make of a colour: saturation and contrast, noise, bytes."""
 
 from probscene.renderers.engine import ti
-from probscene.renderers.lane_kernel import LANES, whole
+from probscene.renderers.lane_kernel import LANES, SHIFT, whole
 from probscene.renderers.mesh_tables import BIAS, DEVELOPED, MATRIX, NOISE
 from probscene.renderers.raster_kernel import high, low
 
@@ -32,7 +32,8 @@ def byte(value: f32):
 
 
 @ti.func
-def develop(pixel: i32, out: i32, count: i32, light, seed: i64, some: ti.template(), image: ti.template()):
+def develop(pixel: i32, out: i32, count: i32, light, seed: i64, some: ti.template(), image: ti.template(),
+            image_words: ti.template()):  # fmt: skip
     """Colours to the bytes of ``count`` pixels from ``out`` of all, which is ``pixel`` of its image."""
     if light[DEVELOPED] != 0:
         for i in range(i32(LANES)):
@@ -46,10 +47,17 @@ def develop(pixel: i32, out: i32, count: i32, light, seed: i64, some: ti.templat
             some.red[i] = some.red[i] + light[NOISE] * bell(bits)
             some.green[i] = some.green[i] + light[NOISE] * bell(bits >> 21)
             some.blue[i] = some.blue[i] + light[NOISE] * bell(bits >> 42)
-    red, green, blue = whole(0), whole(0), whole(0)
+    colours = whole(0)
     for i in range(i32(LANES)):
-        red[i], green[i], blue[i] = byte(some.red[i]), byte(some.green[i]), byte(some.blue[i])
-    for i in range(count):
-        at = 3 * (out + i)
-        image[at], image[at + 1] = ti.cast(red[i], ti.u8), ti.cast(green[i], ti.u8)
-        image[at + 2] = ti.cast(blue[i], ti.u8)
+        colours[i] = byte(some.red[i]) | (byte(some.green[i]) << 8) | (byte(some.blue[i]) << 16)
+    if count == LANES:
+        for eight in ti.static(range(LANES // 8)):
+            c = [ti.cast(colours[8 * eight + i], u64) for i in range(8)]
+            at = (out >> SHIFT) * (LANES * 3 // 8) + 3 * eight
+            image_words[at] = c[0] | (c[1] << 24) | (c[2] << 48)
+            image_words[at + 1] = (c[2] >> 16) | (c[3] << 8) | (c[4] << 32) | (c[5] << 56)
+            image_words[at + 2] = (c[5] >> 8) | (c[6] << 16) | (c[7] << 40)
+    else:
+        for i in range(count):
+            for channel in ti.static(range(3)):
+                image[3 * (out + i) + channel] = ti.cast(colours[i] >> (8 * channel), ti.u8)

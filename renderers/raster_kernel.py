@@ -7,7 +7,8 @@ The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above 
 
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers.engine import ti
-from probscene.renderers.lane_kernel import LANES, words
+
+LEAST = 1e-9  # of 1/z, which rounding may not take to 0 or below
 
 i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
 
@@ -34,8 +35,8 @@ def up(value: f64, most: i32):
 
 @ti.func
 def key(w: f32, record: i32):
-    """A word of the visibility buffer; rounding may not take 1/z to 0 or below."""
-    return (ti.cast(ti.bit_cast(high(w, f32(1e-9)), u32), u64) << 32) | ti.cast(record, u64)
+    """A word of the visibility buffer."""
+    return (ti.cast(ti.bit_cast(high(w, f32(LEAST)), u32), u64) << 32) | ti.cast(record, u64)
 
 
 @ti.func
@@ -117,13 +118,14 @@ def beyond(start: i32, end: i32, constant: f64, slope: f64):
 
 
 @ti.func
-def lay_row(
-    scene: i32, strips: i32, row: i32, width: i32, line: i32, zoom: f64, origin: f64,
-    scenes: ti.template(), edges: ti.template(), seen: ti.template(),
+def strip_row(
+    scene: i32, strips: i32, row: i32, width: i32, zoom: f64, origin: f64, bounds_base: i32,
+    scenes: ti.template(), edges: ti.template(), bounds: ti.template(),
 ):  # fmt: skip
-    """Draw a row of the strips with records 1 to ``strips``; samples are at ``origin + zoom * column``.
+    """First and last column, exclusive, of each strip in a row; samples are at ``origin + zoom * column``.
 
-    A column is in the strip above an edge where the ray's y is; that and 1/z are linear along a row.
+    A column is in the strip above an edge where the ray's y is; that and 1/z, which is returned, are linear along a
+    row.
     """
     s = scene * tables.SCENE
     eye_y, eye_z = scenes[s + tables.EYE + 1], scenes[s + tables.EYE + 2]
@@ -133,7 +135,6 @@ def lay_row(
     ray_z = scenes[s + tables.RAY + 6] + scenes[s + tables.RAY + 7] * origin + scenes[s + tables.RAY + 8] * v
     left, right = beyond(0, width, -ray_z, -z_u)
     left, right = beyond(left, right, eye_z / tables.NEAR + ray_z, z_u)
-    w, w_u = ti.cast(-ray_z / eye_z, f32), ti.cast(-z_u / eye_z, f32)
     for strip in range(strips):
         a, b = left, right  # what lies above the edges so far
         if strip < strips - 1:
@@ -144,13 +145,17 @@ def lay_row(
                 right = a
             else:
                 left = b
-        while a + LANES <= b:
-            nearest = words(0)
-            for i in range(i32(LANES)):
-                here = key(w + w_u * ti.cast(a + i, f32), strip + 1)
-                nearest[i] = high(seen[line + a + i], here)
-            for i in ti.static(range(LANES)):
-                seen[line + a + i] = nearest[i]
-            a += i32(LANES)
-        for column in range(a, b):
+        bounds[bounds_base + 2 * strip], bounds[bounds_base + 2 * strip + 1] = a, b
+    return ti.cast(-ray_z / eye_z, f32), ti.cast(-z_u / eye_z, f32)
+
+
+@ti.func
+def lay_row(
+    scene: i32, strips: i32, row: i32, width: i32, line: i32, zoom: f64, origin: f64, bounds_base: i32,
+    scenes: ti.template(), edges: ti.template(), bounds: ti.template(), seen: ti.template(),
+):  # fmt: skip
+    """Draw a row of the strips with records 1 to ``strips``."""
+    w, w_u = strip_row(scene, strips, row, width, zoom, origin, bounds_base, scenes, edges, bounds)
+    for strip in range(strips):
+        for column in range(bounds[bounds_base + 2 * strip], bounds[bounds_base + 2 * strip + 1]):
             seen[line + column] = high(key(w + w_u * ti.cast(column, f32), strip + 1), seen[line + column])

@@ -3,71 +3,118 @@
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers import shading_kernel as shading
 from probscene.renderers.engine import ti
-from probscene.renderers.lane_kernel import LANES, whole
+from probscene.renderers.lane_kernel import LANES, SHIFT, floats
+from probscene.renderers.raster_kernel import LEAST, high
 from probscene.renderers.shading_kernel import nearness, record_of, run_end
 
-i32, u64, f32 = ti.i32, ti.u64, ti.f32
+i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
 
 
 @ti.func
 def read_pixels(column: i32, row: i32, count: i32, at: i32, seen: ti.template(), some: ti.template()):
-    """``count`` pixels from a column on; samples beyond them are like the last."""
+    """``count`` pixels from a column on, of which nothing is seen any more; samples beyond them are like the last."""
     for i in range(i32(LANES)):
         some.u[i], some.v[i] = ti.cast(column + i, f32), ti.cast(row, f32)
     if count == LANES:
+        block, drawn = (at >> SHIFT) << SHIFT, i32(0)
         for i in range(i32(LANES)):
-            some.record[i], some.w[i] = record_of(seen[at + i]), nearness(seen[at + i])
+            some.record[i], some.w[i] = record_of(seen[block + i]), nearness(seen[block + i])
+        for i in range(i32(LANES)):
+            drawn |= some.record[i]
+        if drawn != 0:
+            for i in ti.static(range(LANES)):
+                seen[block + i] = u64(0)
     else:
         for i in range(i32(LANES)):
             word = seen[at + ti.min(i, count - 1)]
             some.record[i], some.w[i] = record_of(word), nearness(word)
+        for i in range(count):
+            seen[at + i] = u64(0)
+
+
+@ti.func
+def read_ground(
+    column: i32, count: i32, strips: i32, w: f32, w_u: f32, bounds_base: i32, bounds: ti.template(), some: ti.template()
+):
+    """Strips where they are nearer than what is drawn; 1/z is ``w`` at column 0 of the row and linear."""
+    for strip in range(strips):
+        start, end = bounds[bounds_base + 2 * strip], bounds[bounds_base + 2 * strip + 1]
+        if start < column + count and end > column:
+            for i in range(i32(LANES)):
+                here = ti.min(column + i, column + count - 1)
+                near = high(w + w_u * ti.cast(here, f32), f32(LEAST))
+                covers = (here >= start) & (here < end) & (near > some.w[i])
+                some.record[i] = ti.select(covers, strip + 1, some.record[i])
+                some.w[i] = ti.select(covers, near, some.w[i])
+
+
+@ti.func
+def compare(some: ti.template()):
+    """Note whether all samples are of one record."""
+    other = i32(0)
+    for i in range(i32(LANES)):
+        other |= some.record[i] ^ some.record[0]
+    some.alone = ti.cast(other == 0, i32)
 
 
 @ti.func
 def clear(at: i32, count: i32, seen: ti.template()):
     """Nothing is seen any more from a place of the visibility buffer on."""
-    i = i32(0)
-    while i + LANES <= count:
-        for lane in ti.static(range(LANES)):
-            seen[at + i + lane] = u64(0)
-        i += i32(LANES)
-    for rest in range(i, count):
-        seen[at + rest] = u64(0)
+    for i in range(count):
+        seen[at + i] = u64(0)
+
+
+@ti.func
+def name_run(first: i32, last: i32, column: i32, row: i32, node: i32, result: ti.template()):
+    """Pixels ``first`` to ``last`` from a column on are a node's."""
+    t = node * tables.RESULTS
+    result[t + tables.BOX] = ti.min(result[t + tables.BOX], column + first)
+    result[t + tables.BOX + 1] = ti.min(result[t + tables.BOX + 1], row)
+    result[t + tables.BOX + 2] = ti.max(result[t + tables.BOX + 2], column + last)
+    result[t + tables.BOX + 3] = row + i32(1)
+    result[t + tables.PIXELS] = result[t + tables.PIXELS] + last - first
 
 
 @ti.func
 def label(
     column: i32, row: i32, count: i32, out: i32, first_node: i32, mark_base: i32, some: ti.template(),
-    marks: ti.template(), instance: ti.template(), semantic: ti.template(), depth: ti.template(), result: ti.template(),
+    marks: ti.template(), instance: ti.template(), semantic: ti.template(), depth: ti.template(),
+    instance_words: ti.template(), semantic_words: ti.template(), depth_words: ti.template(), result: ti.template(),
 ):  # fmt: skip
     """Ids, classes and depths of ``count`` pixels from a column on, and their nodes' extents and counts."""
-    ids, kinds, first = whole(0), whole(0), i32(0)
-    while first < count:
-        end, record = run_end(first, some), some.record[first]
-        if record > 0:
-            m = mark_base + record * shading.MARKS
-            name, kind = marks[m + shading.LABEL], marks[m + shading.CLASS]
-            for i in range(first, end):
-                ids[i], kinds[i] = name, kind
-            if name > 0:
-                last, t = ti.min(end, count), (first_node + name - 1) * tables.RESULTS
-                result[t + tables.BOX] = ti.min(result[t + tables.BOX], column + first)
-                result[t + tables.BOX + 1] = ti.min(result[t + tables.BOX + 1], row)
-                result[t + tables.BOX + 2] = ti.max(result[t + tables.BOX + 2], column + last)
-                result[t + tables.BOX + 3] = row + i32(1)
-                result[t + tables.PIXELS] = result[t + tables.PIXELS] + last - first
-        first = end
+    z, block = floats(0), out >> SHIFT
+    for i in range(i32(LANES)):
+        z[i] = f32(1.0) / some.w[i]  # infinity in the sky
     if count == LANES:
-        for i in ti.static(range(LANES)):
-            instance[out + i] = ti.cast(ids[i], ti.i16)
-        for i in ti.static(range(LANES)):
-            semantic[out + i] = ti.cast(kinds[i], ti.u8)
-        for i in ti.static(range(LANES)):
-            depth[out + i] = f32(1.0) / some.w[i]  # infinity in the sky
+        for i in ti.static(range(LANES // 2)):
+            near, far = ti.bit_cast(z[2 * i], u32), ti.bit_cast(z[2 * i + 1], u32)
+            depth_words[block * (LANES // 2) + i] = ti.cast(near, u64) | (ti.cast(far, u64) << 32)
     else:
         for i in range(count):
-            instance[out + i], semantic[out + i] = ti.cast(ids[i], ti.i16), ti.cast(kinds[i], ti.u8)
-            depth[out + i] = f32(1.0) / some.w[i]
+            depth[out + i] = z[i]
+    if some.alone != 0 and count == LANES:
+        name, kind = u64(0), u64(0)
+        if some.record[0] > 0:
+            m = mark_base + some.record[0] * shading.MARKS
+            name, kind = ti.cast(marks[m + shading.LABEL], u64), ti.cast(marks[m + shading.CLASS], u64)
+        for i in ti.static(range(LANES // 4)):
+            instance_words[block * (LANES // 4) + i] = name * u64(0x0001000100010001)
+        for i in ti.static(range(LANES // 8)):
+            semantic_words[block * (LANES // 8) + i] = kind * u64(0x0101010101010101)
+        if name > 0:
+            name_run(0, LANES, column, row, first_node + ti.cast(name, i32) - 1, result)
+    else:
+        first = i32(0)
+        while first < count:
+            end, record, name, kind = ti.min(run_end(first, some), count), some.record[first], i32(0), i32(0)
+            if record > 0:
+                m = mark_base + record * shading.MARKS
+                name, kind = marks[m + shading.LABEL], marks[m + shading.CLASS]
+            for i in range(first, end):
+                instance[out + i], semantic[out + i] = ti.cast(name, ti.i16), ti.cast(kind, ti.u8)
+            if name > 0:
+                name_run(first, end, column, row, first_node + name - 1, result)
+            first = end
 
 
 @ti.func

@@ -62,11 +62,6 @@ def clear_air(optical: f32):
 
 
 @ti.func
-def plane(at: i32, left: f32, down: f32, records: ti.template()):
-    return records[at] + records[at + 2] * down + records[at + 1] * left
-
-
-@ti.func
 def run_end(first: i32, some: ti.template()):
     """The first sample after ``first`` of another record."""
     end = first + i32(1)
@@ -121,7 +116,9 @@ def shade(
     """The samples' colours."""
     textured, sky, first = i32(0), i32(0), i32(0)
     while first < LANES:
-        end = run_end(first, some)
+        end = i32(LANES)
+        if some.alone == 0:
+            end = run_end(first, some)
         if some.record[first] == 0:
             sky += end - first
         else:

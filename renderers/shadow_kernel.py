@@ -5,7 +5,7 @@ The map is cleared, written and read in tiles of 16 x 16, and only those that so
 
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers.engine import ti
-from probscene.renderers.lane_kernel import LANES, floats
+from probscene.renderers.lane_kernel import LANES, floats, whole
 from probscene.renderers.mesh_tables import ON_MAP
 from probscene.renderers.raster_kernel import by_height, columns, high, low, up
 from probscene.renderers.vertex_kernel import CORNER, transform, vertex
@@ -25,12 +25,14 @@ def tile_at(column: i32, row: i32, base: i32, size: i32):
 
 @ti.func
 def open_tiles(k: i32, mark: i32, size: i32, base: i32, whole: ti.template(), shadow: ti.template(),
-               opened: ti.template()):  # fmt: skip
+               shadow_words: ti.template(), opened: ti.template()):  # fmt: skip
     """Clear the tiles of the shadow map that an instance may reach, and one texel beyond; to be done for all at first.
 
     Where no tile is opened nothing casts a shadow, and the map is never read.
     """
     at = k * tables.INTEGERS + tables.MAP_BOX
+    nothing = ti.cast(ti.bit_cast(f32(NOTHING), ti.u32), ti.u64)
+    two = (nothing << 32) | nothing
     left, top = ti.cast(whole[at], i32) >> TILE, ti.cast(whole[at + 1], i32) >> TILE
     right, bottom = ti.cast(whole[at + 2], i32) >> TILE, ti.cast(whole[at + 3], i32) >> TILE
     for row in range(top, bottom + i32(1)):
@@ -39,10 +41,12 @@ def open_tiles(k: i32, mark: i32, size: i32, base: i32, whole: ti.template(), sh
             if opened[tile] != mark:
                 opened[tile] = mark
                 from_x, from_y = column << TILE, row << TILE
-                to_x, to_y = ti.min(from_x + i32(17), size), ti.min(from_y + i32(17), size)
-                for y in range(from_y, to_y):
-                    for x in range(base + y * size + from_x, base + y * size + to_x):
-                        shadow[x] = f32(NOTHING)
+                for y in range(from_y, ti.min(from_y + i32(17), size)):
+                    line = base + y * size + from_x
+                    for i in ti.static(range(8)):
+                        shadow_words[(line >> TILE) * 8 + i] = two
+                    if from_x + i32(16) < size:
+                        shadow[line + 16] = f32(NOTHING)
 
 
 @ti.func
@@ -90,6 +94,12 @@ def cast_shadow(
 
 
 @ti.func
+def let(shadow: f32, near: f32):
+    """Whether light gets to what is so near to the sun."""
+    return ti.select(near >= shadow, f32(1.0), f32(0.0))
+
+
+@ti.func
 def sunlit(
     z: ti.template(), light, size: i32, base: i32, mark: i32, shadow: ti.template(), opened: ti.template(),
     some: ti.template(), through: ti.template(),
@@ -105,15 +115,25 @@ def sunlit(
         rows[i] = light[ON_MAP + 4] + z[i] * (light[ON_MAP + 5] + light[ON_MAP + 6] * u + light[ON_MAP + 7] * v)
         ray = light[ON_MAP + 9] + light[ON_MAP + 10] * u + light[ON_MAP + 11] * v
         near[i] = some.lift[i] + light[ON_MAP + 8] + z[i] * ray
+    tile, place, across, down = whole(0), whole(0), floats(0), floats(0)
     most = ti.cast(size - 1, f32)
     for i in range(i32(LANES)):
-        column, row = columns[i], rows[i]
-        if through[i] > 0 and column >= 0 and row >= 0 and column < most and row < most:
-            x, y = ti.cast(column, i32), ti.cast(row, i32)
-            if opened[tile_at(x, y, base, size)] == mark:
-                across, down = column - ti.cast(x, f32), row - ti.cast(y, f32)
-                at = base + y * size + x
-                a, b = ti.cast(near[i] >= shadow[at], f32), ti.cast(near[i] >= shadow[at + 1], f32)
-                c, d = ti.cast(near[i] >= shadow[at + size], f32), ti.cast(near[i] >= shadow[at + size + 1], f32)
-                upper, lower = a + (b - a) * across, c + (d - c) * across
-                through[i] = through[i] * (upper + (lower - upper) * down)
+        column, row = low(high(columns[i], f32(0.0)), most), low(high(rows[i], f32(0.0)), most)
+        x, y = ti.cast(column, i32), ti.cast(row, i32)
+        across[i], down[i] = column - ti.cast(x, f32), row - ti.cast(y, f32)
+        tile[i] = (y >> TILE) * (size >> TILE) + (x >> TILE)
+        on = (columns[i] >= 0) & (rows[i] >= 0) & (columns[i] < most) & (rows[i] < most) & (through[i] > 0)
+        place[i] = ti.select(on, y * size + x, i32(-1))
+    first_tile, a, b, c, d = base >> 2 * TILE, floats(NOTHING), floats(NOTHING), floats(NOTHING), floats(NOTHING)
+    shaded = i32(0)
+    for i in range(i32(LANES)):
+        if opened[first_tile + tile[i]] == mark and place[i] >= 0:
+            at = base + place[i]
+            under, shaded = at + size, i32(1)
+            a[i], b[i], c[i], d[i] = shadow[at], shadow[at + 1], shadow[under], shadow[under + 1]
+    if shaded != 0:
+        for i in range(i32(LANES)):
+            upper, lower = let(a[i], near[i]), let(c[i], near[i])
+            upper += (let(b[i], near[i]) - upper) * across[i]
+            lower += (let(d[i], near[i]) - lower) * across[i]
+            through[i] = through[i] * (upper + (lower - upper) * down[i])
