@@ -57,7 +57,7 @@ class Preset:
     presence_epochs: int = 10
     pairs: int = 500
     directions: int = 8
-    head_epochs: int = 12
+    head_epochs: int = 8
     views: int = 1
     guide: str = "lstm"
     objective: str = "kde"
@@ -120,7 +120,9 @@ class Preset:
         few = {"batches": 40, "num_scenes": 150, "candidates": 1, "learning_rate": min(self.learning_rate, 5e-3)}
         few |= {"marginal_variance": None, "variance": None if self.variance is None else 1.0}
         if features == COUNT_ON_PRETRAINED:
-            return replace(self, features=features, pairs=750, **few)
+            # Photographs' counts are noisy, and few: an anchor, where there is one, holds them more.
+            anchor = max(self.anchor, 0.1) if self.anchor else 0.0
+            return replace(self, features=features, pairs=1000, anchor=anchor, **few)
         name, file = known(features, TRAINED), features.partition("=")[2]
         features = f"{name}={Path(file).resolve()}" if file else features
         return replace(self, features=features, **few)

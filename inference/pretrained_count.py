@@ -3,7 +3,8 @@
 A count network that is trained on renders alone learns what renders look like, and reads photographs less well than
 its own kind; the frozen maps of a pretrained network change less between the two. Only small heads are trained
 (``pretrained_count_training``): every place of the map, 16 pixels apart, holds a distribution over background and
-classes, as in ``count_net``, and the sums of the map and their total are the counts. Heads that agree on renders differ
+classes, as in ``count_net``, and the sums of the map, every object taken to whole (``believed``), and their total are
+the counts. Heads that agree on renders differ
 by a quarter in how many cars they read in photographs, so the mean of several is taken. Groups of a model are counted
 as any class is. Beside them stand the directions of ``projection``, from the same pass: counts say how many cars there
 are, and nothing of how a wood differs from five trees.
@@ -17,12 +18,14 @@ their counts. Axis letters: N images, C channels of the maps, h w places, P pool
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from probscene.inference.pretrained import AT_ONCE, EfficientNetLite
 from probscene.inference.projection import Projection, bandwidth
 
 SIZES = 224, 342  # least and largest square whose area images enter with; a frame of 621 x 188 enters as 608 x 192
+NOTHING, WHOLE = 0.1, 0.5  # probability of an object that counts as none and as one
 HEADS, HIDDEN = 4, 64
 DROPPED = 0.2  # of the channels, so that none is relied upon
 
@@ -91,9 +94,9 @@ class PretrainedCountNet(nn.Module):
 
     @torch.no_grad()
     def counts(self, maps: Tensor) -> Tensor:
-        """Soft counts and their total, ``(N, classes + 1)``, objects."""
-        parts = [self(some.float()).softmax(2)[:, :, 1:].sum((3, 4)).mean(0) for some in maps.split(64)]
-        counts = torch.cat(parts)
+        """Counts and their total, ``(N, classes + 1)``, objects."""
+        parts = [believed(self(some.float()).softmax(2).mean(0)[:, 1:]) for some in maps.split(64)]
+        counts = torch.cat(parts).sum((2, 3))
         return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
 
     @torch.no_grad()
@@ -105,6 +108,19 @@ class PretrainedCountNet(nn.Module):
             directions = (pooled - self.projected_mean) @ self.projected_weight
             out.append(torch.cat([self.counts(maps), directions], 1) / self.unit)
         return torch.cat(out)
+
+
+def believed(probability: Tensor) -> Tensor:
+    """Maps of probabilities, each object's taken to whole: of the same shape, ``(N, classes, h, w)``.
+
+    In photographs heads believe less in the cars that there are, and a little in many that are not. An object's
+    probability is what it has in the 3 x 3 places around: where that is ``NOTHING`` or less it counts as none, from
+    ``WHOLE`` on as one, in between smoothly. Of 81 KITTI frames the spread of counts comes to 1.8 by this, 1.4 by plain
+    sums and 2.8 by the labels, those of frames without a car to 0.5 and 0.6.
+    """
+    mass = 9 * F.avg_pool2d(probability, 3, 1, 1)
+    part = ((mass - NOTHING) / (WHOLE - NOTHING)).clamp(0, 1)
+    return probability * part.square() * (3 - 2 * part) * (1 / mass.clamp(min=NOTHING)).clamp(min=1.0)
 
 
 def _head(channels: int, out: int) -> nn.Sequential:

@@ -11,7 +11,7 @@ from probscene.app.view import View
 from probscene.errors import ProbsceneError
 from probscene.inference.count_training import relative_count_loss
 from probscene.inference.pretrained import EfficientNetLite
-from probscene.inference.pretrained_count import PretrainedCountNet
+from probscene.inference.pretrained_count import NOTHING, WHOLE, PretrainedCountNet, believed
 from probscene.inference.pretrained_count_training import PretrainedCountTraining
 from probscene.inference.projection import SHARE, discriminant, self_share
 
@@ -70,7 +70,7 @@ def test_features_are_the_map_summed_and_the_projection_in_units(dots):
     images = torch.randint(0, 256, (5, 3, 64, 96), dtype=torch.uint8)
     maps, pooled = net.look(images)
     share = net(maps).double().exp()
-    counts = (share / share.sum(2, keepdim=True))[:, :, 1:].sum((3, 4)).mean(0)
+    counts = believed((share / share.sum(2, keepdim=True)).mean(0)[:, 1:]).sum((2, 3))
     directions = (pooled - net.projected_mean).double() @ net.projected_weight.double()
     expected = torch.cat([counts, counts.sum(1, keepdim=True), directions], 1) / net.unit
     assert torch.allclose(net.embed(images).double(), expected, rtol=1e-4, atol=1e-4)
@@ -78,6 +78,20 @@ def test_features_are_the_map_summed_and_the_projection_in_units(dots):
     one = torch.cat([net.embed(image[None]) for image in images])
     assert torch.allclose(one, net.embed(images), rtol=1e-4, atol=1e-4)
     assert sum(value.numel() for value in net.state_dict().values()) < 400_000  # none of the frozen network's
+
+
+def test_an_object_is_taken_to_whole():
+    """Spread over four places it counts as none, as a part or as one; beyond that what there is counts."""
+    for probability, least, most in (
+        (0.0, 0, 0), (NOTHING, 0, 1e-6), ((NOTHING + WHOLE) / 2, 0.5 - 1e-5, 0.5 + 1e-5),
+        (WHOLE, 1 - 1e-5, 1 + 1e-5), (1.0, 1 - 1e-5, 1 + 1e-5), (2.0, 2 - 1e-5, 2 + 1e-5),
+    ):  # fmt: skip
+        maps = torch.zeros(1, 2, 9, 9)
+        maps[0, 1, :2, 3:5] = probability * torch.tensor([[0.1, 0.2], [0.3, 0.4]])
+        counts = believed(maps).sum((2, 3))[0]
+        assert counts[0] == 0 and least <= counts[1] <= most
+    grain = torch.full((1, 1, 30, 30), 0.01)  # a little everywhere
+    assert grain.sum() == pytest.approx(9, rel=1e-4) and believed(grain).sum() == 0
 
 
 def test_it_learns_to_count(dots, draw_twice):
