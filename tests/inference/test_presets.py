@@ -55,6 +55,7 @@ def test_pretrained_features_bring_their_own_unit():
         assert street.seeing(features).divergence() == JensenShannon(1.0, None)
         assert preset("paper").seeing(features).variance is None
     assert street.seeing("count").divergence() == street.divergence()
+    assert street.seeing("count=efficientnet").anchor > street.anchor > 0 == QUICK.seeing("count=efficientnet").anchor
 
 
 def test_guides_and_their_settings():
