@@ -4,15 +4,14 @@ A count network that is trained on renders alone learns what renders look like, 
 its own kind; the frozen maps of a pretrained network change less between the two. Only small heads are trained
 (``pretrained_count_training``): every place of the map, 16 pixels apart, holds a distribution over background and
 classes, as in ``count_net``, and the sums of the map, every object taken to whole (``believed``), and their total are
-the counts. Heads that agree on renders differ
-by a quarter in how many cars they read in photographs, so the mean of several is taken. Groups of a model are counted
-as any class is. Beside them stand the directions of ``projection``, from the same pass: counts say how many cars there
-are, and nothing of how a wood differs from five trees.
+the counts. Heads that agree on renders differ by a quarter in how many cars they read in photographs, so the mean of
+several is taken. Groups of a model are counted as any class is. Beside them stand the directions of ``projection``,
+from the same pass: counts say how many cars there are, and nothing of how a wood differs from five trees.
 
 The unit of the counts is the bandwidth of their density, as it is of the projection's directions: how many kernels away
-one object is depends on how well objects can be counted. The two are blocks with a density each: photographs lie far
-from all renders in some direction, and in a joint density whichever lies nearest there would be all that is known of
-their counts. Axis letters: N images, C channels of the maps, h w places, P pooled features, d directions.
+one object is depends on how well objects can be counted. The two are blocks with a density each (``Blockwise``), since
+photographs may lie far from all renders in some direction. Axis letters: N images, C channels of the maps, h w places,
+P pooled features, d directions.
 """
 
 import math
@@ -31,7 +30,7 @@ DROPPED = 0.2  # of the channels, so that none is relied upon
 
 
 class PretrainedCountNet(nn.Module):
-    """A ``FeatureNet``: soft counts of the classes, their total and directions, D = classes + 1 + d, in bandwidths.
+    """A ``FeatureNet``: counts of the classes, their total and directions, D = classes + 1 + d, in bandwidths.
 
     Args:
         classes: the kinds that are counted.
