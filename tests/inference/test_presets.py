@@ -51,8 +51,9 @@ def test_pretrained_features_bring_their_own_unit():
     """A kernel that was chosen for counts is none for features in units of their bandwidth."""
     street = preset("street")
     assert street.divergence() == JensenShannon(street.variance, 0.1) and street.variance != 1
-    for features in ("efficientnet", "count=efficientnet"):
-        assert street.seeing(features).divergence() == JensenShannon(1.0, None)
+    for features, single in (("efficientnet", None), ("count=efficientnet", 0.25)):
+        assert street.seeing(features).divergence() == JensenShannon(1.0, single)
+        assert QUICK.seeing(features).divergence() == KDELogRatio(1.0, None)
         assert preset("paper").seeing(features).variance is None
     assert street.seeing("count").divergence() == street.divergence()
     assert street.seeing("count=efficientnet").anchor > street.anchor > 0 == QUICK.seeing("count=efficientnet").anchor
