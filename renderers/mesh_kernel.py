@@ -158,7 +158,7 @@ def render(
                     column = i32(0)
                     w, w_u = strip_row(scene, laid, row, width, 1.0, 0.0, bounds_base, scene_table, edges, bounds)
                     while column < width:
-                        count = ti.min(width - column, i32(LANES) - (line_at + column & i32(LANES - 1)))
+                        count = ti.cast(ti.min(width - column, i32(LANES) - (line_at + column & i32(LANES - 1))), i32)
                         read_pixels(column, row, count, line_at + column, seen, some)
                         read_ground(column, count, laid, w, w_u, bounds_base, bounds, some)
                         compare(some)

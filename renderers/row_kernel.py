@@ -44,7 +44,7 @@ def read_ground(
                 here = ti.min(column + i, column + count - 1)
                 near = high(w + w_u * ti.cast(here, f32), f32(LEAST))
                 covers = (here >= start) & (here < end) & (near > some.w[i])
-                some.record[i] = ti.select(covers, strip + 1, some.record[i])
+                some.record[i] = ti.select(covers, ti.cast(strip + 1, i32), some.record[i])
                 some.w[i] = ti.select(covers, near, some.w[i])
 
 

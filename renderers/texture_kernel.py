@@ -46,7 +46,8 @@ def texture_samples(z: ti.template(), some: ti.template(), table: ti.template(),
         height = ti.max(ti.cast(some.high[i], i32) >> level_t, i32(1))
         at[i], stride[i] = some.table[i] + level_t * i32(LEVELS) + level_s + i32(AT), width + i32(2)
         column, row = place(s, width), place(t, height)
-        across[i], down[i], place_in[i] = column & 255, row & 255, (row >> 8) * stride[i] + (column >> 8)
+        across[i], down[i] = ti.cast(column & 255, i32), ti.cast(row & 255, i32)
+        place_in[i] = ti.cast((row >> 8) * stride[i] + (column >> 8), i32)
     for i in range(i32(LANES)):
         j = table[at[i]] + place_in[i]
         upper[i], lower[i] = texels[j], texels[j + stride[i]]
