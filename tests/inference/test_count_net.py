@@ -92,7 +92,7 @@ def test_it_learns_to_count(dots, draw_dots):
 
 
 @pytest.mark.parametrize("kind", ["count", "presence"])
-def test_training_goes_on_to_the_same_bits(dots, draw_dots, kind):
+def test_training_goes_on_to_the_same_bits(dots, draw_dots, kind, goes_on_to_the_same_bits):
     def training():
         torch.manual_seed(0)
         if kind == "count":
@@ -101,24 +101,7 @@ def test_training_goes_on_to_the_same_bits(dots, draw_dots, kind):
             return CountTraining(net, draw_dots, schedule, seed=1)
         return PresenceTraining(PresenceNet(dots.classes, 4, 8), draw_dots, 60, 4, 20, accuracy=1.1, seed=1)
 
-    class Interrupted(Exception):
-        pass
-
-    kept = {}
-
-    def stop(training, _):
-        kept.update({key: value.clone() for key, value in training.state().items()})
-        raise Interrupted
-
-    whole, first, second = training(), training(), training()
-    whole.run()
-    with pytest.raises(Interrupted):
-        first.run(stop)
-    second.restore(kept)
-    assert 0 < second.done < whole.done
-    second.run()
-    for (key, a), b in zip(whole.net.state_dict().items(), second.net.state_dict().values(), strict=True):
-        assert torch.equal(a, b), key
+    goes_on_to_the_same_bits(training)
 
 
 def test_what_goes_wrong_while_drawing_ahead_ends_the_training(dots, draw_dots):

@@ -132,25 +132,8 @@ def test_what_is_hidden_or_smaller_than_a_place_is_not_counted(dots, draw_twice)
     assert abs(row + 0.5 - 2.5) <= 0.5 and abs(column + 0.5 - 2.5) <= 0.5
 
 
-def test_training_goes_on_to_the_same_bits(dots, draw_twice):
-    class Interrupted(Exception):
-        pass
-
-    kept = {}
-
-    def stop(training, _):
-        kept.update({key: value.clone() for key, value in training.state().items()})
-        raise Interrupted
-
-    whole, first, second = (training(dots, draw_twice, 8, 3, 8, 4) for _ in range(3))
-    whole.run()
-    with pytest.raises(Interrupted):
-        first.run(stop)
-    second.restore(kept)
-    assert 0 < second.done < whole.done
-    second.run()
-    for (key, a), b in zip(whole.net.state_dict().items(), second.net.state_dict().values(), strict=True):
-        assert torch.equal(a, b), key
+def test_training_goes_on_to_the_same_bits(dots, draw_twice, goes_on_to_the_same_bits):
+    goes_on_to_the_same_bits(lambda: training(dots, draw_twice, 8, 3, 8, 4))
 
 
 def test_a_loss_that_is_not_finite_is_said(dots, draw_twice):
