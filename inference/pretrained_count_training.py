@@ -28,10 +28,11 @@ SHIFT = 0.2  # of a channel over a whole image, in its standard deviations
 
 
 class Found(NamedTuple):
-    """How well structure is seen, on renders held out.
+    """How well structure is seen.
 
     Attributes:
-        correlation: of the soft counts with the true ones, ``(classes,)``; NaN where one of them does not vary.
+        correlation: of the counts with the true ones on the renders held out, ``(classes,)``; NaN where one of them
+            does not vary.
         ratio: of the projection, see there.
     """
 
