@@ -193,13 +193,14 @@ def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> 
         done += images
         progress("target", done, len(target), "")
 
-    if target is None or (kept is not None and bytes(kept["fingerprint"].tolist()).hex() == target.fingerprint):
-        features = None if kept is None else kept["features"]
-    else:
-        features = features_in(run, target, own_net(run), each)
-    if features is None:
+    if target is None and kept is None:
         return None
-    return Source(*estimated(model, names, features * own_net(run).unit), seed=1)
+    net = own_net(run)
+    if kept is not None and (target is None or bytes(kept["fingerprint"].tolist()).hex() == target.fingerprint):
+        features = kept["features"]
+    else:
+        features = features_in(run, target, net, each)
+    return Source(*estimated(model, names, features * net.unit), seed=1)
 
 
 def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:
