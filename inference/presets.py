@@ -28,7 +28,8 @@ class Preset:
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
         pairs, directions: of a pretrained network's projection: structures that are drawn twice, and features.
-        head_epochs: training of the head that counts on pretrained maps, on the same renders.
+        head_epochs: training of the heads that count on pretrained maps, on the same renders.
+        photographs: images of the target, at most, on which those heads teach themselves in one more epoch.
         views: of each real image in the density of their features, the image itself and parts of it
             (``ImageFolder.load``). Among few images they take some noise out: of 81 KITTI frames under EfficientNet's
             projected features, 4 views lower the standard deviation between the log densities that two halves of the
@@ -58,6 +59,7 @@ class Preset:
     pairs: int = 500
     directions: int = 8
     head_epochs: int = 8
+    photographs: int = 500
     views: int = 1
     guide: str = "lstm"
     objective: str = "kde"

@@ -92,10 +92,14 @@ class PretrainedCountNet(nn.Module):
         return torch.stack([head(x) for head in self.heads])
 
     @torch.no_grad()
+    def held(self, maps: Tensor) -> Tensor:
+        """What the heads together believe that places hold, every object taken to whole, ``(N, classes, h, w)``."""
+        return torch.cat([believed(self(some.float()).softmax(2).mean(0)[:, 1:]) for some in maps.split(64)])
+
+    @torch.no_grad()
     def counts(self, maps: Tensor) -> Tensor:
         """Counts and their total, ``(N, classes + 1)``, objects."""
-        parts = [believed(self(some.float()).softmax(2).mean(0)[:, 1:]) for some in maps.split(64)]
-        counts = torch.cat(parts).sum((2, 3))
+        counts = self.held(maps).sum((2, 3))
         return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
 
     @torch.no_grad()

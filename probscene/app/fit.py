@@ -93,7 +93,7 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     preset, model, threads = Preset.of(run.record["preset"]), run.model, run.record["threads"]
     view = View(model, threads)
     torch.set_num_threads(threads)
-    net = _feature_net(run, preset, view, progress)
+    net = _feature_net(run, preset, view, progress, target)
     real = _real_features(run, net, model, progress, target)
     torch.set_num_threads(1)  # the guide's tensors are tiny: a second thread only waits
     divergence = preset.divergence()
@@ -105,7 +105,7 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     return guide
 
 
-def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> FeatureNet:
+def _feature_net(run: Run, preset: Preset, view: View, progress: Progress, target: ImageFolder | None) -> FeatureNet:
     seed_everything(batch_seed(run.record["seed"], 0))
     net = feature_net(preset, view.model)
     tensors = run.load("features")
@@ -114,7 +114,7 @@ def _feature_net(run: Run, preset: Preset, view: View, progress: Progress) -> Fe
     elif isinstance(net, Projected):
         _project(run, preset, view, net, progress)
     else:
-        _train(run, preset, view, net, progress)
+        _train(run, preset, view, net, progress, target)
     return net.eval()
 
 
@@ -138,15 +138,20 @@ def _project(run: Run, preset: Preset, view: View, net: Projected, progress: Pro
     run.save("features", net.state_dict())
 
 
-def _train(run: Run, preset: Preset, view: View, net: FeatureNet, progress: Progress) -> None:
+def _train(
+    run: Run, preset: Preset, view: View, net: FeatureNet, progress: Progress, target: ImageFolder | None
+) -> None:
     seed = batch_seed(run.record["seed"], 1)
     if preset.features == COUNT_ON_PRETRAINED:
         from probscene.inference.pretrained_count_training import PretrainedCountTraining  # torchvision takes seconds
 
         # Of the prior's few cars a head learns that there are few: in photographs it must read many.
         draw = partial(view.draw_twice, policy=view.model.pretraining_policy)
-        training = PretrainedCountTraining(net, draw, preset.pairs, preset.head_epochs, preset.num_scenes, seed=seed)
-        steps = preset.head_epochs
+        photographs = _photographs(run, preset.photographs, progress, target)
+        training = PretrainedCountTraining(
+            net, draw, preset.pairs, preset.head_epochs, preset.num_scenes, seed=seed, photographs=photographs
+        )
+        steps = preset.head_epochs + (photographs is not None)
     elif isinstance(net, PresenceNet):
         training = PresenceTraining(net, view.draw, preset.presence_images, preset.presence_epochs, seed=seed)
         steps = preset.presence_epochs
@@ -163,7 +168,7 @@ def _train(run: Run, preset: Preset, view: View, net: FeatureNet, progress: Prog
         progress("features", training.done, steps, f"loss {loss:.3f}")
 
     if preset.features == COUNT_ON_PRETRAINED:
-        found = training.run(each, lambda done, total: progress("renders", done, total, ""))
+        found = training.run(each, lambda done, total: progress("looking", done, total, ""))
         seen = {name: [x if x == x else None for x in part.tolist()] for name, part in found._asdict().items()}
         keep.lines.append(json.dumps({"stage": "counts", **seen}))
     else:
@@ -173,6 +178,17 @@ def _train(run: Run, preset: Preset, view: View, net: FeatureNet, progress: Prog
     keep.finish()
     run.save("features", net.state_dict())
     keep.forget()
+
+
+def _photographs(run: Run, most: int, progress: Progress, target: ImageFolder | None) -> Tensor | None:
+    """Images of the target, ``(L, C, H, W)`` uint8 and evenly spread over the folder; None where none are wanted."""
+    if most == 0:
+        return None
+    if target is None:
+        target = open_target(run, progress)
+    check_target(target)
+    number = min(most, len(target))
+    return torch.stack([target.load(i * len(target) // number) for i in range(number)])
 
 
 def _real_features(

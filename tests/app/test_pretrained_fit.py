@@ -139,15 +139,15 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
 def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call, discs, target, tmp_path):
     words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=2"]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
-    assert done.code == 0 and "Prior's renders" in done.err and "epochs" in done.err, done.err
+    assert done.code == 0 and "Renders and photographs" in done.err and "epochs" in done.err, done.err
     run = Run.open(tmp_path / "run")
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
     assert len(net.names) == len(run.model.classes) + 1 + 3
     assert torch.allclose(seen, run.load("real")["features"][:9], atol=1e-3)
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
-    assert [line["stage"] for line in lines] == ["features"] * 2 + ["counts"] + ["structure"] * 2
-    assert len(lines[2]["correlation"]) == len(run.model.classes) and len(lines[2]["ratio"]) == 3
+    assert [line["stage"] for line in lines] == ["features"] * 3 + ["counts"] + ["structure"] * 2
+    assert len(lines[3]["correlation"]) == len(run.model.classes) and len(lines[3]["ratio"]) == 3
     guide = (run.path / "guide.safetensors").read_bytes()
     for name in ("guide", "real", "features"):
         (run.path / f"{name}.safetensors").unlink()

@@ -94,24 +94,64 @@ def test_an_object_is_taken_to_whole():
     assert grain.sum() == pytest.approx(9, rel=1e-4) and believed(grain).sum() == 0
 
 
-def test_it_learns_to_count(dots, draw_twice):
+@pytest.fixture(scope="module")
+def learnt(dots, draw_twice):
+    """A finished training, what it found, and what it told of its drawings."""
     seen = []
     fit = training(dots, draw_twice, 80, 15, 64, 8)
-    found = fit.run(drawn=lambda *done: seen.append(done))
+    return fit, fit.run(drawn=lambda *done: seen.append(done)), seen
+
+
+def number(drawings) -> torch.Tensor:
+    """True counts ``(N, 2)``."""
+    return torch.stack([(drawings.label == c).sum(1) for c in range(2)], 1).float()
+
+
+def read(net: PretrainedCountNet, images: torch.Tensor) -> torch.Tensor:
+    """The counts of a network, ``(N, 2)``, objects."""
+    return net.embed(images)[:, :2] * net.unit[:2]
+
+
+def test_it_learns_to_count(learnt, draw_twice):
+    fit, found, seen = learnt
     assert seen[-1] == (224, 224) and (found.correlation > 0.9).all() and (found.ratio > 2).all()
     torch.manual_seed(99)
     fresh = draw_twice(50)
-    counts = torch.stack([(fresh.label == c).sum(1) for c in range(2)], 1).float()
-    features = fit.net.embed(fresh.image)
-    assert ((features[:, :2] * fit.net.unit[:2] - counts).square().mean(0) < 0.2 * counts.var(0)).all()
-    for block in features[:64].split(fit.net.blocks, 1):
+    counts = number(fresh)
+    assert ((read(fit.net, fresh.image) - counts).square().mean(0) < 0.2 * counts.var(0)).all()
+    for block in fit.net.embed(fresh.image)[:64].split(fit.net.blocks, 1):
         assert self_share(block) == pytest.approx(SHARE, rel=0.5)
+
+
+def test_it_teaches_itself_on_images_unlike_renders(learnt, dots, draw_twice):
+    """Of pale, bright images it has read too little; their labels play no part."""
+
+    def pale(images):
+        return (90 + 0.25 * images.float() + 0.375 * images.float().mean(1, keepdim=True)).round().clamp(0, 255).byte()
+
+    torch.manual_seed(50)
+    photographs, fresh = pale(draw_twice(40).image), draw_twice(60)
+    fit = training(dots, draw_twice, 80, 15, 64, 8, photographs=photographs)
+    fit.restore(learnt[0].state())
+    seen = []
+    fit.run(drawn=lambda *done: seen.append(done))
+    assert fit.done == 16 and seen[-1] == (304, 304)
+    before, after = (read(each.net, pale(fresh.image)) for each in (learnt[0], fit))
+    assert (after - number(fresh)).square().mean() < 0.85 * (before - number(fresh)).square().mean()
+    assert before.mean() < after.mean() < 1.05 * number(fresh).mean()
+
+
+def test_what_it_believes_is_a_distribution_in_each_place(learnt, draw_twice):
+    maps, target = learnt[0]._own(learnt[0].net.look(draw_twice(10).image)[0].half())
+    assert (target >= 0).all() and torch.allclose(target.sum(1), torch.ones(()), atol=1e-5)
+    counts = learnt[0].net.counts(maps)[:, :2]
+    assert torch.allclose(target[:, 1:].sum((2, 3)), counts, atol=0.05)  # hardly a place holds more than one
 
 
 def test_the_projection_is_that_of_the_pairs(dots, draw_twice):
     fit = training(dots, draw_twice, 40, 1, 20)
     fit.run()
-    _, pooled, target = fit._look(None)
+    _, pooled, target, _ = fit._look(None)
     expected = discriminant(pooled[:40], pooled[40:80], 2, 20)
     assert torch.allclose(fit.net.projected_weight, expected.weight, rtol=1e-3, atol=1e-6)
     number = target[:80, 1:].sum((1, 2, 3)).float()
@@ -134,6 +174,8 @@ def test_what_is_hidden_or_smaller_than_a_place_is_not_counted(dots, draw_twice)
 
 def test_training_goes_on_to_the_same_bits(dots, draw_twice, goes_on_to_the_same_bits):
     goes_on_to_the_same_bits(lambda: training(dots, draw_twice, 8, 3, 8, 4))
+    photographs = draw_twice(6).image
+    goes_on_to_the_same_bits(lambda: training(dots, draw_twice, 8, 1, 8, 4, photographs=photographs))
 
 
 def test_a_loss_that_is_not_finite_is_said(dots, draw_twice):
