@@ -41,6 +41,7 @@ class PretrainedCountNet(nn.Module):
     Attributes:
         unit: ``(D,)``, what 1 in each feature stands for: objects, or the projection's own unit.
         blocks: how many features are counts, and how many directions.
+        taught_by: fingerprint of the images that the heads taught themselves on, ``(32,)`` uint8; zeros for none.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class PretrainedCountNet(nn.Module):
         self.register_buffer("mean", torch.zeros(frozen.channels, 1, 1))
         self.register_buffer("scale", torch.ones(frozen.channels, 1, 1))
         self.register_buffer("unit", torch.ones(len(self.names)))
+        self.register_buffer("taught_by", torch.zeros(32, dtype=torch.uint8))
         self.register_buffer("projected_mean", torch.zeros(len(frozen.names)))
         self.register_buffer("projected_weight", torch.zeros(len(frozen.names), directions))
         self.heads = nn.ModuleList(_head(frozen.channels, 1 + len(classes)) for _ in range(HEADS))

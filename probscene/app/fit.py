@@ -9,7 +9,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -93,8 +93,9 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     preset, model, threads = Preset.of(run.record["preset"]), run.model, run.record["threads"]
     view = View(model, threads)
     torch.set_num_threads(threads)
-    net = _feature_net(run, preset, view, progress, target)
-    real = _real_features(run, net, model, progress, target)
+    images = cache(lambda: open_target(run, progress) if target is None else target)
+    net = _feature_net(run, preset, view, progress, images)
+    real = _real_features(run, net, progress, images)
     torch.set_num_threads(1)  # the guide's tensors are tiny: a second thread only waits
     divergence = preset.divergence()
     if preset.features == COUNT_ON_PRETRAINED:
@@ -105,7 +106,9 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     return guide
 
 
-def _feature_net(run: Run, preset: Preset, view: View, progress: Progress, target: ImageFolder | None) -> FeatureNet:
+def _feature_net(
+    run: Run, preset: Preset, view: View, progress: Progress, target: Callable[[], ImageFolder]
+) -> FeatureNet:
     seed_everything(batch_seed(run.record["seed"], 0))
     net = feature_net(preset, view.model)
     tensors = run.load("features")
@@ -139,7 +142,7 @@ def _project(run: Run, preset: Preset, view: View, net: Projected, progress: Pro
 
 
 def _train(
-    run: Run, preset: Preset, view: View, net: FeatureNet, progress: Progress, target: ImageFolder | None
+    run: Run, preset: Preset, view: View, net: FeatureNet, progress: Progress, target: Callable[[], ImageFolder]
 ) -> None:
     seed = batch_seed(run.record["seed"], 1)
     if preset.features == COUNT_ON_PRETRAINED:
@@ -147,7 +150,10 @@ def _train(
 
         # Of the prior's few cars a head learns that there are few: in photographs it must read many.
         draw = partial(view.draw_twice, policy=view.model.pretraining_policy)
-        photographs = _photographs(run, preset.photographs, progress, target)
+        photographs = None
+        if preset.photographs:
+            photographs = _photographs(target(), preset.photographs)
+            net.taught_by.copy_(_fingerprint(target()))
         training = PretrainedCountTraining(
             net, draw, preset.pairs, preset.head_epochs, preset.num_scenes, seed=seed, photographs=photographs
         )
@@ -162,6 +168,7 @@ def _train(
         steps = preset.count.steps
         torch.set_num_threads(1)  # its images are drawn on another core meanwhile
     keep = Keeper(run, "features", training)
+    _check_taught(net, target)
 
     def each(training, loss):
         keep({"stage": "features", "step": training.done, "loss": loss})
@@ -180,30 +187,20 @@ def _train(
     keep.forget()
 
 
-def _photographs(run: Run, most: int, progress: Progress, target: ImageFolder | None) -> Tensor | None:
-    """Images of the target, ``(L, C, H, W)`` uint8 and evenly spread over the folder; None where none are wanted."""
-    if most == 0:
-        return None
-    if target is None:
-        target = open_target(run, progress)
+def _photographs(target: ImageFolder, most: int) -> Tensor:
+    """Images of the target, ``(L, C, H, W)`` uint8, evenly spread over the folder."""
     check_target(target)
     number = min(most, len(target))
     return torch.stack([target.load(i * len(target) // number) for i in range(number)])
 
 
-def _real_features(
-    run: Run, net: FeatureNet, model: SceneModel, progress: Progress, target: ImageFolder | None
-) -> Tensor:
+def _real_features(run: Run, net: FeatureNet, progress: Progress, target: Callable[[], ImageFolder]) -> Tensor:
     """Of every image, ``(L, D)``, then of the preset's further views, kept apart: a verdict is about L images."""
-    if target is None:
-        target = open_target(run, progress)
+    _check_taught(net, target)
+    target = target()
     cached = run.load("real")
     if cached is not None:
-        if bytes(cached["fingerprint"].tolist()).hex() != target.fingerprint:
-            raise RunError(
-                f"Expected the target images in {target.path} as they were when the run began, actual others; put them "
-                "back, or begin a new run."
-            )
+        _check_same(target, cached["fingerprint"])
         return torch.cat([cached["features"], *([cached["views"]] if "views" in cached else [])])
     views, done = Preset.of(run.record["preset"]).views, 0
 
@@ -215,10 +212,28 @@ def _real_features(
     check_target(target)
     features, *others = (embed_all(net, target.batches(RENDERED_AT_ONCE, view), each) for view in range(views))
     check_features(features)
-    fingerprint = torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
-    kept = {"features": features, "fingerprint": fingerprint}
+    kept = {"features": features, "fingerprint": _fingerprint(target)}
     run.save("real", kept | ({"views": torch.cat(others)} if others else {}))
     return torch.cat([features, *others])
+
+
+def _fingerprint(target: ImageFolder) -> Tensor:
+    return torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
+
+
+def _check_same(target: ImageFolder, fingerprint: Tensor) -> None:
+    if not torch.equal(_fingerprint(target), fingerprint):
+        raise RunError(
+            f"Expected the target images in {target.path} as they were when the run began, actual others; put them "
+            "back, or begin a new run."
+        )
+
+
+def _check_taught(net: FeatureNet, target: Callable[[], ImageFolder]) -> None:
+    """See that a network that taught itself on images did so on those of the run, begun anew or going on."""
+    taught_by = dict(net.named_buffers()).get("taught_by")
+    if taught_by is not None and taught_by.any():
+        _check_same(target(), taught_by)
 
 
 def check_target(target: ImageFolder) -> None:

@@ -1,6 +1,7 @@
 """A fit by a pretrained network's features, through the command line."""
 
 import json
+import shutil
 
 import pytest
 import safetensors.torch
@@ -161,3 +162,16 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
     assert estimate["mean_number"] == pytest.approx(total.round().mean().item(), abs=1e-6)
     assert not torch.equal(total.round(), run.load("real")["features"][:, 2].round())
     assert call("report", run.path, "--num", 50, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
+
+
+def test_heads_that_taught_themselves_are_of_the_runs_images(call, discs, target, tmp_path):
+    images = tmp_path / "images"
+    shutil.copytree(target.images, images)
+    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=1"]
+    assert call("fit", discs.file, "--target", images, "--out", tmp_path / "run", *words).code == 0
+    for name in ("guide", "real"):
+        (tmp_path / f"run/{name}.safetensors").unlink()
+    next(images.iterdir()).unlink()
+    done = call("fit", "--out", tmp_path / "run", "--resume")
+    assert done.code == 2 and "as they were when the run began" in done.err and "Traceback" not in done.err
+    assert not (tmp_path / "run/real.safetensors").exists()
