@@ -8,8 +8,8 @@ from probscene.renderers.engine import ti
 
 LANES, SHIFT = 16, 4  # SHIFT: bits of a place within a block
 
-i32, f32, u64 = ti.i32, ti.f32, ti.u64
-floats, whole, words = (ti.types.vector(LANES, kind) for kind in (f32, i32, u64))
+i32, u32, f32 = ti.i32, ti.u32, ti.f32
+floats, whole, natural = (ti.types.vector(LANES, kind) for kind in (f32, i32, u32))
 
 
 @ti.dataclass

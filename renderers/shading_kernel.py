@@ -72,10 +72,10 @@ def run_end(first: i32, some: ti.template()):
 
 @ti.func
 def look_up(
-    first: i32, record_base: i32, mark_base: i32, records: ti.template(), marks: ti.template(),
-    table: ti.template(), some: ti.template(),
+    all_of_them: ti.template(), first: i32, record_base: i32, mark_base: i32, records: ti.template(),
+    marks: ti.template(), table: ti.template(), some: ti.template(),
 ):  # fmt: skip
-    """Planes of a record at its samples, ``first`` and all after it; returns its texture."""
+    """Planes of a record at its samples, ``first`` and all after it, in ``all_of_them`` all; returns its texture."""
     r, m = record_base + some.record[first] * RECORD, mark_base + some.record[first] * MARKS
     texture, from_u, from_v = marks[m + IMAGE], records[r + FROM_U], records[r + FROM_V]
     sun, sun_u, sun_v = records[r + PLANE_SUN], records[r + PLANE_SUN + 1], records[r + PLANE_SUN + 2]
@@ -85,7 +85,7 @@ def look_up(
     wide, tall = ti.cast(table[row + WIDTH], f32), ti.cast(table[row + HEIGHT], f32)
     steady = ti.select(marks[m + VARIES] != 0, f32(0.0), f32(1.0))
     for i in range(i32(LANES)):
-        mine, left, down = i >= first, some.u[i] - from_u, some.v[i] - from_v
+        mine, left, down = ti.static(all_of_them) or i >= first, some.u[i] - from_u, some.v[i] - from_v
         over_depth = steady * some.w[i] + (f32(1.0) - steady)
         some.sun[i] = ti.select(mine, sun * over_depth + sun_v * down + sun_u * left, some.sun[i])
         some.up[i] = ti.select(mine, up * over_depth + up_v * down + up_u * left, some.up[i])
@@ -98,7 +98,7 @@ def look_up(
         t, t_u, t_v = records[r + PLANE_T], records[r + PLANE_T + 1], records[r + PLANE_T + 2]
         w_u, w_v = records[r + W_U], records[r + W_V]
         for i in range(i32(LANES)):
-            mine, left, down = i >= first, some.u[i] - from_u, some.v[i] - from_v
+            mine, left, down = ti.static(all_of_them) or i >= first, some.u[i] - from_u, some.v[i] - from_v
             some.s[i] = ti.select(mine, s + s_v * down + s_u * left, some.s[i])
             some.t[i] = ti.select(mine, t + t_v * down + t_u * left, some.t[i])
             some.s_u[i], some.s_v[i] = ti.select(mine, s_u, some.s_u[i]), ti.select(mine, s_v, some.s_v[i])
@@ -114,15 +114,19 @@ def shade(
     some: ti.template(),
 ):  # fmt: skip
     """The samples' colours."""
-    textured, sky, first = i32(0), i32(0), i32(0)
+    textured, sky, first = i32(0), i32(0), i32(LANES)
+    if some.alone == 0:
+        first = run_end(0, some)
+    if some.record[0] == 0:
+        sky = first
+    else:
+        textured = look_up(True, 0, record_base, mark_base, records, marks, table, some)
     while first < LANES:
-        end = i32(LANES)
-        if some.alone == 0:
-            end = run_end(first, some)
+        end = run_end(first, some)
         if some.record[first] == 0:
             sky += end - first
         else:
-            textured |= look_up(first, record_base, mark_base, records, marks, table, some)
+            textured |= look_up(False, first, record_base, mark_base, records, marks, table, some)
         first = end
     length = floats(0)  # of the rays for a metre of depth
     for i in range(i32(LANES)):

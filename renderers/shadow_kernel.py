@@ -124,16 +124,20 @@ def sunlit(
         tile[i] = (y >> TILE) * (size >> TILE) + (x >> TILE)
         on = (columns[i] >= 0) & (rows[i] >= 0) & (columns[i] < most) & (rows[i] < most) & (through[i] > 0)
         place[i] = ti.select(on, y * size + x, i32(-1))
-    first_tile, a, b, c, d = base >> 2 * TILE, floats(NOTHING), floats(NOTHING), floats(NOTHING), floats(NOTHING)
-    shaded = i32(0)
+    first_tile, signs = base >> 2 * TILE, i32(-1)
     for i in range(i32(LANES)):
-        if opened[first_tile + tile[i]] == mark and place[i] >= 0:
-            at = base + place[i]
-            under, shaded = at + size, i32(1)
+        place[i] = ti.select(opened[first_tile + tile[i]] == mark, place[i], i32(-1))
+    for i in range(i32(LANES)):
+        signs &= place[i]
+    if signs >= 0:  # somewhere a shadow may fall; then all are looked up, which takes less than to choose
+        a, b, c, d = floats(0), floats(0), floats(0), floats(0)
+        for i in range(i32(LANES)):
+            at = base + ti.max(place[i], i32(0))
+            under = at + size
             a[i], b[i], c[i], d[i] = shadow[at], shadow[at + 1], shadow[under], shadow[under + 1]
-    if shaded != 0:
         for i in range(i32(LANES)):
             upper, lower = let(a[i], near[i]), let(c[i], near[i])
             upper += (let(b[i], near[i]) - upper) * across[i]
             lower += (let(d[i], near[i]) - lower) * across[i]
-            through[i] = through[i] * (upper + (lower - upper) * down[i])
+            share = ti.select(place[i] >= 0, upper + (lower - upper) * down[i], f32(1.0))
+            through[i] = through[i] * share

@@ -1,11 +1,11 @@
 """Where textures are read, at which of their levels, and the bilinear samples of them."""
 
 from probscene.renderers.engine import ti
-from probscene.renderers.lane_kernel import LANES, whole, words
+from probscene.renderers.lane_kernel import LANES, natural, whole
 from probscene.renderers.raster_kernel import high, low
 from probscene.renderers.texture_atlas import AT, LEVELS
 
-i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
+i32, u32, f32 = ti.i32, ti.u32, ti.f32
 PAIR = 0x00FF00FF  # red and blue of a texel
 FAR = 1e9  # whole numbers beyond this have no fraction in f32, and none beyond 2^31 is an i32
 
@@ -36,7 +36,7 @@ def mixed(near: u32, beside: u32, below: u32, opposite: u32, right: u32, low_sha
 def texture_samples(z: ti.template(), some: ti.template(), table: ti.template(), texels: ti.template()):
     """Multiply the colours by the textures'; ``z`` are depths."""
     at, place_in, stride, across, down = whole(0), whole(0), whole(0), whole(0), whole(0)
-    upper, lower = words(0), words(0)
+    near, beside, below, opposite = natural(0), natural(0), natural(0), natural(0)
     for i in range(i32(LANES)):
         s, t = some.s[i] * z[i], some.t[i] * z[i]
         step_s = high(ti.abs(some.s_u[i] - s * some.w_u[i]), ti.abs(some.s_v[i] - s * some.w_v[i])) * z[i]
@@ -50,15 +50,16 @@ def texture_samples(z: ti.template(), some: ti.template(), table: ti.template(),
         place_in[i] = ti.cast((row >> 8) * stride[i] + (column >> 8), i32)
     for i in range(i32(LANES)):
         j = table[at[i]] + place_in[i]
-        upper[i], lower[i] = texels[j], texels[j + stride[i]]
+        upper, lower = texels[j], texels[j + stride[i]]
+        near[i], beside[i] = ti.cast(upper, u32), ti.cast(upper >> 32, u32)
+        below[i], opposite[i] = ti.cast(lower, u32), ti.cast(lower >> 32, u32)
     for i in range(i32(LANES)):
         right, low_share = ti.cast(across[i], u32), ti.cast(down[i], u32)
         twisted = (right * low_share + 128) >> 8
-        near, beside = ti.cast(upper[i], u32), ti.cast(upper[i] >> 32, u32)
-        below, opposite = ti.cast(lower[i], u32), ti.cast(lower[i] >> 32, u32)
-        pair = mixed(near & PAIR, beside & PAIR, below & PAIR, opposite & PAIR, right, low_share, twisted)
-        near, beside, below, opposite = near >> 8, beside >> 8, below >> 8, opposite >> 8
-        green = mixed(near & 255, beside & 255, below & 255, opposite & 255, right, low_share, twisted)
+        a, b, c, d = near[i], beside[i], below[i], opposite[i]
+        pair = mixed(a & PAIR, b & PAIR, c & PAIR, d & PAIR, right, low_share, twisted)
+        a, b, c, d = a >> 8, b >> 8, c >> 8, d >> 8
+        green = mixed(a & 255, b & 255, c & 255, d & 255, right, low_share, twisted)
         some.red[i] = some.red[i] * (ti.cast(ti.cast(pair & 0xFFFF, i32), f32) * f32(1 / 65280))
         some.green[i] = some.green[i] * (ti.cast(ti.cast(green, i32), f32) * f32(1 / 65280))
         some.blue[i] = some.blue[i] * (ti.cast(ti.cast(pair >> 16, i32), f32) * f32(1 / 65280))
