@@ -207,12 +207,14 @@ def lay_ground(
     scene: i32, strips: i32, record_base: i32, mark_base: i32, middle_u: f64, middle_v: f64, scenes: ti.template(),
     strip: ti.template(), tiles: ti.template(), records: ti.template(), marks: ti.template(),
 ):  # fmt: skip
-    """The records of the strips, 1 to ``strips``: planes like any triangle's."""
+    """The records of the strips, 1 to ``strips``: planes like any triangle's; record 0, the sky, has no label."""
     s = scene * tables.SCENE
     x, y = ray(s + tables.RAY, scenes), ray(s + tables.RAY + 3, scenes)
     w = ray(s + tables.RAY + 6, scenes) / -scenes[s + tables.EYE + 2]
     across = w * scenes[s + tables.EYE + 1] + y
     along = w * (scenes[s + tables.EYE] - scenes[s + tables.OFFSET]) + x
+    for i in ti.static(range(shading.MARKS)):
+        marks[mark_base + i] = i32(0)
     for i in range(strips):
         r, m = record_base + (i + 1) * shading.RECORD, mark_base + (i + 1) * shading.MARKS
         at = 2 * (scene * strips + i)

@@ -1,15 +1,16 @@
 """Samples of an image side by side, in local arrays: what a loop over them computes, the compiler does for several at
 once. Arguments' arrays stop it from that, since anything written to one may change where the others lie: after each
 write it asks again. So where all ``LANES`` pixels of a block are written, whole words of 64 bits are, and blocks begin
-where these do: at multiples of ``LANES`` of all the images' pixels.
+where these do: at multiples of ``LANES`` of all the images' pixels. What is read and then written there is an element
+of an array of vectors, of which it asks once.
 """
 
 from probscene.renderers.engine import ti
 
 LANES, SHIFT = 16, 4  # SHIFT: bits of a place within a block
 
-i32, u32, f32 = ti.i32, ti.u32, ti.f32
-floats, whole, natural = (ti.types.vector(LANES, kind) for kind in (f32, i32, u32))
+i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
+floats, whole, natural, words = (ti.types.vector(LANES, kind) for kind in (f32, i32, u32, u64))
 
 
 @ti.dataclass

@@ -8,7 +8,7 @@ from probscene.renderers import mesh_tables as tables
 from probscene.renderers import shading_kernel as shading
 from probscene.renderers.engine import ti
 from probscene.renderers.geometry_kernel import draw_instance, lay_ground, unstamp
-from probscene.renderers.lane_kernel import LANES, SHIFT, Samples, floats
+from probscene.renderers.lane_kernel import LANES, SHIFT, Samples, floats, words
 from probscene.renderers.photo_kernel import develop
 from probscene.renderers.raster_kernel import lay_row, strip_row
 from probscene.renderers.row_kernel import (
@@ -67,6 +67,7 @@ def render(
     instance: ti.types.ndarray(ti.i16, 1),
     semantic: ti.types.ndarray(ti.u8, 1),
     depth: ti.types.ndarray(ti.f32, 1),
+    seen_blocks: ti.types.ndarray(words, 1),
     shadow_words: ti.types.ndarray(ti.u64, 1),
     image_words: ti.types.ndarray(ti.u64, 1),
     instance_words: ti.types.ndarray(ti.u64, 1),
@@ -80,7 +81,7 @@ def render(
     ``fine`` is whether there are four samples a pixel, kept behind the visibility buffer's first part. ``first (scenes
     + 1)`` says where the instances of each scene begin; ``seen`` to ``bounds`` are scratch, as much for each worker, of
     which ``seen``, ``stamp``, ``opened`` and ``line`` hold zeros, as ``queue`` does; ``result`` and ``extent``
-    empty extents. Those named words are the same memory as what they are words of.
+    empty extents. Those named words and blocks are the same memory as what they are of.
     """
     for j in range(workers * ti.i32(512)):
         if j % 512 == 0:
@@ -159,7 +160,7 @@ def render(
                     w, w_u = strip_row(scene, laid, row, width, 1.0, 0.0, bounds_base, scene_table, edges, bounds)
                     while column < width:
                         count = ti.cast(ti.min(width - column, i32(LANES) - (line_at + column & i32(LANES - 1))), i32)
-                        read_pixels(column, row, count, line_at + column, seen, some)
+                        read_pixels(column, row, count, line_at + column, seen, seen_blocks, some)
                         read_ground(column, count, laid, w, w_u, bounds_base, bounds, some)
                         compare(some)
                         label(

@@ -140,6 +140,7 @@ class MeshRenderer:
             world.photo.seed.cpu().numpy().astype(np.int64), table.edges, table.strips, table.tiles,
             atlas.positions, atlas.corners, atlas.faces, atlas.textures.table, atlas.textures.texels,
             *(self._scratch[name] for name in each), image, instance, semantic, depth,
+            self._scratch["seen"].reshape(-1, LANES),
             *(_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)), result, extent,
         )  # fmt: skip
 

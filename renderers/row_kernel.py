@@ -3,27 +3,27 @@
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers import shading_kernel as shading
 from probscene.renderers.engine import ti
-from probscene.renderers.lane_kernel import LANES, SHIFT, floats
+from probscene.renderers.lane_kernel import LANES, SHIFT, floats, whole, words
 from probscene.renderers.raster_kernel import LEAST, high
-from probscene.renderers.shading_kernel import nearness, record_of, run_end
+from probscene.renderers.shading_kernel import nearness, record_of
 
 i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
 
 
 @ti.func
-def read_pixels(column: i32, row: i32, count: i32, at: i32, seen: ti.template(), some: ti.template()):
+def read_pixels(column: i32, row: i32, count: i32, at: i32, seen: ti.template(),
+                seen_blocks: ti.template(), some: ti.template()):  # fmt: skip
     """``count`` pixels from a column on, of which nothing is seen any more; samples beyond them are like the last."""
     for i in range(i32(LANES)):
         some.u[i], some.v[i] = ti.cast(column + i, f32), ti.cast(row, f32)
     if count == LANES:
-        block, drawn = (at >> SHIFT) << SHIFT, i32(0)
+        block, drawn = seen_blocks[at >> SHIFT], u64(0)
         for i in range(i32(LANES)):
-            some.record[i], some.w[i] = record_of(seen[block + i]), nearness(seen[block + i])
+            some.record[i], some.w[i] = record_of(block[i]), nearness(block[i])
         for i in range(i32(LANES)):
-            drawn |= some.record[i]
+            drawn |= block[i]
         if drawn != 0:
-            for i in ti.static(range(LANES)):
-                seen[block + i] = u64(0)
+            seen_blocks[at >> SHIFT] = words(0)
     else:
         for i in range(i32(LANES)):
             word = seen[at + ti.min(i, count - 1)]
@@ -92,29 +92,38 @@ def label(
     else:
         for i in range(count):
             depth[out + i] = z[i]
-    if some.alone != 0 and count == LANES:
-        name, kind = u64(0), u64(0)
-        if some.record[0] > 0:
-            m = mark_base + some.record[0] * shading.MARKS
-            name, kind = ti.cast(marks[m + shading.LABEL], u64), ti.cast(marks[m + shading.CLASS], u64)
-        for i in ti.static(range(LANES // 4)):
-            instance_words[block * (LANES // 4) + i] = name * u64(0x0001000100010001)
-        for i in ti.static(range(LANES // 8)):
-            semantic_words[block * (LANES // 8) + i] = kind * u64(0x0101010101010101)
-        if name > 0:
-            name_run(0, LANES, column, row, first_node + ti.cast(name, i32) - 1, result)
+    names, kinds, first, other = whole(0), whole(0), i32(0), i32(0)
+    if some.alone != 0:
+        m = mark_base + some.record[0] * shading.MARKS
+        name, kind = marks[m + shading.LABEL], marks[m + shading.CLASS]
+        for i in range(i32(LANES)):
+            names[i], kinds[i] = name, kind
     else:
-        first = i32(0)
-        while first < count:
-            end, record, name, kind = ti.min(run_end(first, some), count), some.record[first], i32(0), i32(0)
-            if record > 0:
-                m = mark_base + record * shading.MARKS
-                name, kind = marks[m + shading.LABEL], marks[m + shading.CLASS]
-            for i in range(first, end):
-                instance[out + i], semantic[out + i] = ti.cast(name, ti.i16), ti.cast(kind, ti.u8)
-            if name > 0:
-                name_run(first, end, column, row, first_node + name - 1, result)
-            first = end
+        for i in range(i32(LANES)):
+            m = mark_base + some.record[i] * shading.MARKS
+            names[i], kinds[i] = marks[m + shading.LABEL], marks[m + shading.CLASS]
+        for i in range(i32(LANES)):
+            other |= names[i] ^ names[0]
+    if count == LANES:
+        for i in ti.static(range(LANES // 4)):
+            n = [ti.cast(names[4 * i + j], u64) for j in range(4)]
+            instance_words[block * (LANES // 4) + i] = n[0] | (n[1] << 16) | (n[2] << 32) | (n[3] << 48)
+        for i in ti.static(range(LANES // 8)):
+            k = [ti.cast(kinds[8 * i + j], u64) for j in range(8)]
+            start, rest = [k[j] | (k[j + 1] << 8) | (k[j + 2] << 16) | (k[j + 3] << 24) for j in (0, 4)]
+            semantic_words[block * (LANES // 8) + i] = start | (rest << 32)
+    else:
+        for i in range(count):
+            instance[out + i], semantic[out + i] = ti.cast(names[i], ti.i16), ti.cast(kinds[i], ti.u8)
+    while first < count:
+        end = count
+        if other != 0:
+            end = first + i32(1)
+            while end < count and names[end] == names[first]:
+                end += i32(1)
+        if names[first] > 0:
+            name_run(first, end, column, row, first_node + names[first] - 1, result)
+        first = end
 
 
 @ti.func
