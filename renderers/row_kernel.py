@@ -104,7 +104,12 @@ def label(
             names[i], kinds[i] = marks[m + shading.LABEL], marks[m + shading.CLASS]
         for i in range(i32(LANES)):
             other |= names[i] ^ names[0]
-    if count == LANES:
+    if some.alone != 0 and count == LANES:
+        for i in ti.static(range(LANES // 4)):
+            instance_words[block * (LANES // 4) + i] = ti.cast(names[0], u64) * u64(0x0001000100010001)
+        for i in ti.static(range(LANES // 8)):
+            semantic_words[block * (LANES // 8) + i] = ti.cast(kinds[0], u64) * u64(0x0101010101010101)
+    elif count == LANES:
         for i in ti.static(range(LANES // 4)):
             n = [ti.cast(names[4 * i + j], u64) for j in range(4)]
             instance_words[block * (LANES // 4) + i] = n[0] | (n[1] << 16) | (n[2] << 32) | (n[3] << 48)
