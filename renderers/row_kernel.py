@@ -11,8 +11,9 @@ i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
 
 
 @ti.func
-def read_pixels(column: i32, row: i32, count: i32, at: i32, seen: ti.template(),
-                seen_blocks: ti.template(), some: ti.template()):  # fmt: skip
+def read_pixels(
+    column: i32, row: i32, count: i32, at: i32, seen: ti.template(), seen_blocks: ti.template(), some: ti.template()
+):
     """``count`` pixels from a column on, of which nothing is seen any more; samples beyond them are like the last."""
     for i in range(i32(LANES)):
         some.u[i], some.v[i] = ti.cast(column + i, f32), ti.cast(row, f32)
