@@ -20,7 +20,7 @@ from rich.text import Text
 
 STAGES = {
     "reading": ("Target's images", "images"),
-    "looking": ("Renders and photographs", "images"),
+    "looking": ("Looking at images", "images"),
     "features": ("Feature network", "steps"),
     "target": ("Target's features", "images"),
     "pretraining": ("Pretraining", "epochs"),

@@ -140,7 +140,7 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
 def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call, discs, target, tmp_path):
     words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=2"]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
-    assert done.code == 0 and "Renders and photographs" in done.err and "epochs" in done.err, done.err
+    assert done.code == 0 and "Looking at images" in done.err and "epochs" in done.err, done.err
     run = Run.open(tmp_path / "run")
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
