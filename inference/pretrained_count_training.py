@@ -188,7 +188,7 @@ class PretrainedCountTraining:
         loss = self._loss(maps, target)
         if own is not None:
             rows = torch.randint(len(own[0]), (PHOTOGRAPHS,))
-            loss = loss + self._loss(*(part[rows] for part in own))
+            loss = loss + self._loss(*(each[rows] for each in own))
         self.optimiser.zero_grad()
         loss.backward()
         self.optimiser.step()
