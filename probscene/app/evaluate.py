@@ -23,7 +23,7 @@ from probscene.app.image_distances import IMAGES, Distances, image_distances
 from probscene.app.labels import Labels
 from probscene.app.likelihood import Likelihood, likelihood
 from probscene.app.run import Run
-from probscene.app.seen import features_in, own_net
+from probscene.app.seen import features_in, fingerprint, own_net
 from probscene.app.shown import counted, number_of
 from probscene.app.source import Source
 from probscene.app.structures import Relation
@@ -196,7 +196,7 @@ def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> 
     if target is None and kept is None:
         return None
     net = own_net(run)
-    if kept is not None and (target is None or bytes(kept["fingerprint"].tolist()).hex() == target.fingerprint):
+    if kept is not None and (target is None or torch.equal(kept["fingerprint"], fingerprint(target))):
         features = kept["features"]
     else:
         features = features_in(run, target, net, each)

@@ -20,6 +20,7 @@ from probscene.app.files import write_text
 from probscene.app.keeper import Keeper
 from probscene.app.loading import load_model
 from probscene.app.run import Run
+from probscene.app.seen import fingerprint
 from probscene.app.view import RENDERED_AT_ONCE, View, feature_net
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, RunError
@@ -153,7 +154,7 @@ def _train(
         photographs = None
         if preset.photographs:
             photographs = _photographs(target(), preset.photographs)
-            net.taught_by.copy_(_fingerprint(target()))
+            net.taught_by.copy_(fingerprint(target()))
         training = PretrainedCountTraining(
             net, draw, preset.pairs, preset.head_epochs, preset.num_scenes, seed=seed, photographs=photographs
         )
@@ -212,17 +213,13 @@ def _real_features(run: Run, net: FeatureNet, progress: Progress, target: Callab
     check_target(target)
     features, *others = (embed_all(net, target.batches(RENDERED_AT_ONCE, view), each) for view in range(views))
     check_features(features)
-    kept = {"features": features, "fingerprint": _fingerprint(target)}
+    kept = {"features": features, "fingerprint": fingerprint(target)}
     run.save("real", kept | ({"views": torch.cat(others)} if others else {}))
     return torch.cat([features, *others])
 
 
-def _fingerprint(target: ImageFolder) -> Tensor:
-    return torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
-
-
-def _check_same(target: ImageFolder, fingerprint: Tensor) -> None:
-    if not torch.equal(_fingerprint(target), fingerprint):
+def _check_same(target: ImageFolder, kept: Tensor) -> None:
+    if not torch.equal(fingerprint(target), kept):
         raise RunError(
             f"Expected the target images in {target.path} as they were when the run began, actual others; put them "
             "back, or begin a new run."

@@ -25,6 +25,11 @@ Each = Callable[[int], None]
 """Told how many more images are done."""
 
 
+def fingerprint(target: ImageFolder) -> Tensor:
+    """Of the images, ``(32,)`` uint8: as a run's tensors keep what says which images they are of."""
+    return torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
+
+
 def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Iterator[Tensor]:
     """Renders of ``num`` scenes with structures from ``policy``, in batches ``(n, channels, H, W)`` uint8 as a reader
     of their files would have them."""
