@@ -95,7 +95,8 @@ class PretrainedCountNet(nn.Module):
 
     @torch.no_grad()
     def held(self, maps: Tensor) -> Tensor:
-        """What the heads together believe that places hold, every object taken to whole, ``(N, classes, h, w)``."""
+        """What the heads together believe that places of maps ``(N, C, h, w)`` hold, every object taken to whole,
+        ``(N, classes, h, w)``."""
         return torch.cat([believed(self(some.float()).softmax(2).mean(0)[:, 1:]) for some in maps.split(64)])
 
     @torch.no_grad()

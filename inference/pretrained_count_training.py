@@ -110,7 +110,7 @@ class PretrainedCountTraining:
         while self.done < self.epochs + (len(photographs) > 0):
             seed_everything(batch_seed(self.seed, 1, self.done))
             if self.done == self.epochs:
-                own = self._own(photographs)
+                own = photographs, self._own(photographs)
             self.net.train()
             batches = torch.randperm(n).split(self.batch_size)
             losses = [self._step(maps[rows], target[rows], i / len(batches), own) for i, rows in enumerate(batches)]
@@ -168,12 +168,12 @@ class PretrainedCountTraining:
         )
         return *renders, torch.cat([look(some)[0] for some in photographs] or [maps[:0]])
 
-    def _own(self, photographs: Tensor) -> tuple[Tensor, Tensor]:
-        """Photographs' maps and what their places hold in the heads' own belief, ``(L, 1 + classes, h, w)``."""
+    def _own(self, photographs: Tensor) -> Tensor:
+        """What the places of photographs' maps hold in the heads' own belief, ``(L, 1 + classes, h, w)``."""
         self.net.eval()
         held = self.net.held(photographs)
         held = held / held.sum(1, keepdim=True).clamp(min=1)
-        return photographs, torch.cat([1 - held.sum(1, keepdim=True), held], 1)
+        return torch.cat([1 - held.sum(1, keepdim=True), held], 1)
 
     def _target(self, drawings: Examples, height: int, width: int) -> Tensor:
         places = torch.tensor([width / drawings.image.shape[-1], height / drawings.image.shape[-2]])

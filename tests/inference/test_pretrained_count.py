@@ -142,7 +142,8 @@ def test_it_teaches_itself_on_images_unlike_renders(learnt, dots, draw_twice):
 
 
 def test_what_it_believes_is_a_distribution_in_each_place(learnt, draw_twice):
-    maps, target = learnt[0]._own(learnt[0].net.look(draw_twice(10).image)[0].half())
+    maps = learnt[0].net.look(draw_twice(10).image)[0].half()
+    target = learnt[0]._own(maps)
     assert (target >= 0).all() and torch.allclose(target.sum(1), torch.ones(()), atol=1e-5)
     counts = learnt[0].net.counts(maps)[:, :2]
     assert torch.allclose(target[:, 1:].sum((2, 3)), counts, atol=0.05)  # hardly a place holds more than one
