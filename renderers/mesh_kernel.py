@@ -8,7 +8,7 @@ from probscene.renderers import mesh_tables as tables
 from probscene.renderers import shading_kernel as shading
 from probscene.renderers.engine import ti
 from probscene.renderers.geometry_kernel import draw_instance, lay_ground, unstamp
-from probscene.renderers.lane_kernel import LANES, SHIFT, Samples, floats, words
+from probscene.renderers.lane_kernel import LANES, Samples, floats, whole_lanes, words
 from probscene.renderers.photo_kernel import develop
 from probscene.renderers.raster_kernel import lay_row, strip_row
 from probscene.renderers.row_kernel import (
@@ -23,7 +23,7 @@ from probscene.renderers.row_kernel import (
     take_colours,
 )
 from probscene.renderers.shading_kernel import shade
-from probscene.renderers.shadow_kernel import cast_shadow, open_tiles
+from probscene.renderers.shadow_kernel import SPARE, cast_shadow, open_tiles
 
 i32, u64, f32, f64 = ti.i32, ti.u64, ti.f32, ti.f64
 
@@ -87,10 +87,10 @@ def render(
         if j % 512 == 0:
             worker = ti.cast(j // 512, i32)
             pixels = height * width
-            room = ((pixels + i32(2 * LANES - 1)) >> SHIFT) << SHIFT
+            room = whole_lanes(pixels + i32(2 * LANES))  # the first block may begin late, and spans end late
             seen_base = worker * room * ti.static(5 if fine else 1)
             stamp_base = worker * height * ((width + 63) >> 6)
-            map_base, corner_base = worker * map_size * map_size, worker * most_vertices * 5
+            map_base, corner_base = worker * (map_size * map_size + i32(SPARE)), worker * most_vertices * 5
             record_base, mark_base = worker * most_records * shading.RECORD, worker * most_records * shading.MARKS
             line_base, bounds_base = worker * width * 3, worker * 2 * ti.max(strips, 1)
             some, share = Samples(), floats(0)

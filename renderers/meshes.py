@@ -26,6 +26,7 @@ from probscene.renderers import mesh_tables as tables
 from probscene.renderers.lane_kernel import LANES
 from probscene.renderers.mesh_atlas import MeshAtlas
 from probscene.renderers.mesh_instances import Instances, instances, names
+from probscene.renderers.shadow_kernel import SPARE
 from probscene.renderers.vertex_kernel import CORNER
 from probscene.world import World
 
@@ -114,13 +115,14 @@ class MeshRenderer:
                 "use coarser meshes or fewer."
             )
         strips = 0 if world.ground is None else world.ground.surface.shape[1]
-        room = (height * width + 2 * LANES - 1) // LANES * LANES
+        room = (height * width + 3 * LANES - 1) // LANES * LANES
         most_records, seen = triangles + strips + 1, room * (1 if self.samples == 1 else 5)
+        shadow = self.map_size**2 + SPARE
         each = {
             "seen": (seen, np.uint64),
             "stamp": (height * ((width + 63) // 64), np.uint64),
-            "shadow": (self.map_size**2, np.float32),
-            "opened": (self.map_size**2 // 256, np.int32),
+            "shadow": (shadow, np.float32),
+            "opened": (shadow // SPARE, np.int32),  # a tile each
             "corners": (most_vertices * CORNER, np.float64),
             "records": (most_records * shading_kernel.RECORD, np.float32),
             "marks": (most_records * shading_kernel.MARKS, np.int32),

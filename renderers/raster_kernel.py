@@ -7,6 +7,7 @@ The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above 
 
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers.engine import ti
+from probscene.renderers.lane_kernel import whole_lanes
 
 LEAST = 1e-9  # of 1/z, which rounding may not take to 0 or below
 
@@ -73,6 +74,21 @@ def stamp_row(first: i32, last: i32, at: i32, stamp: ti.template()):
     return fresh
 
 
+@ti.real_func
+def draw_span(at: i32, count: i32, start: f32, slope: f32, record: i32, seen: ti.types.ndarray(u64, 1)) -> i32:
+    """Draw samples from a place of the visibility buffer on; 1/z is ``start`` at the first and linear.
+
+    Up to ``LANES - 1`` words behind them are written as they were. Returns whether any sample is seen.
+    """
+    changed = u64(0)
+    for i in range(whole_lanes(count)):
+        old, word = seen[at + i], key(start + slope * ti.cast(i, f32), record)
+        new = ti.select((i < count) & (word > old), word, old)
+        changed |= new ^ old
+        seen[at + i] = new
+    return ti.cast(changed != 0, i32)
+
+
 @ti.func
 def fill(
     a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, w: f64, w_u: f64, w_v: f64, record: i32, stamped: i32,
@@ -91,11 +107,7 @@ def fill(
         first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, width)
         if first < last:
             start = ti.cast(w + w_v * y + w_u * ti.cast(first, f64), f32)
-            line = base + row * width
-            for column in range(first, last):
-                word = key(start + slope * ti.cast(column - first, f32), record)
-                if word > seen[line + column]:
-                    seen[line + column], visible = word, i32(1)
+            visible |= draw_span(base + row * width + first, last - first, start, slope, record, seen)
             if stamped != 0:
                 area += stamp_row(first, last, stamp_base + row * ((width + 63) >> 6), stamp)
     return visible, area

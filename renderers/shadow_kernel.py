@@ -5,13 +5,14 @@ The map is cleared, written and read in tiles of 16 x 16, and only those that so
 
 from probscene.renderers import mesh_tables as tables
 from probscene.renderers.engine import ti
-from probscene.renderers.lane_kernel import LANES, floats, whole
+from probscene.renderers.lane_kernel import LANES, floats, whole, whole_lanes
 from probscene.renderers.mesh_tables import ON_MAP
 from probscene.renderers.raster_kernel import by_height, columns, high, low, up
 from probscene.renderers.vertex_kernel import CORNER, transform, vertex
 
 NOTHING = -1e30
 TILE = 4  # bits of a tile's width
+SPARE = 1 << 2 * TILE  # texels behind each worker's map, a tile of them, which `cast_span` may write to
 SLACK = 0.02  # metres by which a shadow keeps off what casts it
 
 i32, f32, f64 = ti.i32, ti.f32, ti.f64
@@ -49,6 +50,17 @@ def open_tiles(k: i32, mark: i32, size: i32, base: i32, whole: ti.template(), sh
                         shadow[line + 16] = f32(NOTHING)
 
 
+@ti.real_func
+def cast_span(at: i32, count: i32, start: f32, slope: f32, shadow: ti.types.ndarray(f32, 1)):
+    """Draw texels from a place of the map on; how near to the sun they are is ``start`` at the first and linear.
+
+    Up to ``LANES - 1`` texels behind them are written as they were.
+    """
+    for i in range(whole_lanes(count)):
+        old, near = shadow[at + i], start + slope * ti.cast(i, f32)
+        shadow[at + i] = ti.select((i < count) & (near > old), near, old)
+
+
 @ti.func
 def fill_map(
     a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, d: f64, d_u: f64, d_v: f64,
@@ -62,11 +74,7 @@ def fill_map(
         y = ti.cast(row, f64)
         first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, size)
         start = ti.cast(d + d_v * y + d_u * ti.cast(first, f64), f32)
-        line = base + row * size
-        for column in range(first, last):
-            near = start + slope * ti.cast(column - first, f32)
-            if near > shadow[line + column]:
-                shadow[line + column] = near
+        cast_span(base + row * size + first, last - first, start, slope, shadow)
 
 
 @ti.func
