@@ -133,7 +133,7 @@ class MeshRenderer:
         workers = max(1, min(self.threads, N, ((1 << 31) - 1) // largest))
         for name, (size, dtype) in each.items():
             if name not in self._scratch or self._scratch[name].size < workers * size:
-                self._scratch[name] = np.zeros(max(1, workers * size), dtype)
+                self._scratch[name] = _zeros(max(1, workers * size), dtype)
         self._scratch["opened"][:] = 0
         atlas = self._atlas
         kernel.render(
@@ -145,6 +145,12 @@ class MeshRenderer:
             self._scratch["seen"].reshape(-1, LANES),
             *(_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)), result, extent,
         )  # fmt: skip
+
+
+def _zeros(size: int, dtype: type) -> np.ndarray:
+    """Zeros; those of more than 2 MiB lie in as few pages as can be, which NumPy asks for from 4 MiB on."""
+    nbytes = size * np.dtype(dtype).itemsize
+    return np.zeros(max(nbytes, 1 << 22) if nbytes > 1 << 21 else nbytes, np.uint8)[:nbytes].view(dtype)
 
 
 def _words(flat: np.ndarray) -> np.ndarray:
