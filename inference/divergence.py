@@ -136,23 +136,23 @@ class MMD:
 
 @dataclass(frozen=True)
 class Blockwise:
-    """The sum of one divergence over blocks of features, each by its own density.
+    """The sum of divergences, each of its own block of features.
 
     Where one block's real features lie far from all generated ones, a joint density at a scene is that of the one or
     two real images that are nearest in that block, and the others' features say nothing any more.
 
     Args:
-        divergence: of each block.
-        sizes: how many features each has, in their order.
+        sizes: how many features each block has, in their order.
+        divergences: of each block; None where it is not compared.
     """
 
-    divergence: Divergence
     sizes: tuple[int, ...]
+    divergences: tuple[Divergence | None, ...]
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
         _check(generated, real)
-        blocks = zip(generated.split(self.sizes, 1), real.split(self.sizes, 1), strict=True)
-        return sum(self.divergence(*block) for block in blocks)
+        blocks = zip(self.divergences, generated.split(self.sizes, 1), real.split(self.sizes, 1), strict=True)
+        return sum(divergence(*block) for divergence, *block in blocks if divergence is not None)
 
 
 def _centred(points: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,8 @@ class Preset:
         guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``.
         objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
             value for each scene; ``"mmd"``, MMD as a reward that all scenes share.
-        variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first one also of ``MMD``.
+        variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first one also of ``MMD``. Marginals are of
+            counts alone where directions stand beside them.
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Learner`` and ``ScoreFunction``.
         candidates: drawings of each structure, of which the clearest is looked at.
@@ -122,13 +123,13 @@ class Preset:
         few = {"batches": 40, "num_scenes": 150, "candidates": 1, "learning_rate": min(self.learning_rate, 5e-3)}
         few |= {"marginal_variance": None, "variance": None if self.variance is None else 1.0}
         if features == COUNT_ON_PRETRAINED:
-            # Photographs' counts are noisy, and few: an anchor, where there is one, holds them more. They do lie among
-            # the renders', and a bounded objective bears their marginals (KITTI, one seed: FID 263 without, 258 with).
+            # Photographs' counts are noisy, and few: an anchor, where there is one, holds them more. Those of things
+            # do lie among the renders', and a bounded objective bears their marginals; the directions have none, where
+            # photographs often lie beyond all renders: what is nearest is not what has as many cars.
             anchor = max(self.anchor, 0.1) if self.anchor else 0.0
             single = 0.25 if self.objective == "js" else None
-            return replace(
-                self, features=features, **few | {"marginal_variance": single, "pairs": 1000, "anchor": anchor}
-            )
+            few |= {"marginal_variance": single, "pairs": 1000, "anchor": anchor, "batches": 60}
+            return replace(self, features=features, **few)
         name, file = known(features, TRAINED), features.partition("=")[2]
         features = f"{name}={Path(file).resolve()}" if file else features
         return replace(self, features=features, **few)

@@ -3,15 +3,19 @@
 A count network that is trained on renders alone learns what renders look like, and reads photographs less well than
 its own kind; the frozen maps of a pretrained network change less between the two. Only small heads are trained
 (``pretrained_count_training``): every place of the map, 16 pixels apart, holds a distribution over background and
-classes, as in ``count_net``, and the sums of the map, every object taken to whole (``believed``), and their total are
-the counts. Heads that agree on renders differ by a quarter in how many cars they read in photographs, so the mean of
-several is taken. Groups of a model are counted as any class is. Beside them stand the directions of ``projection``,
-from the same pass: counts say how many cars there are, and nothing of how a wood differs from five trees.
+classes, as in ``count_net``, and the sums of the map, every object taken to whole (``believed``), are the counts. Heads
+that agree on renders differ by a quarter in how many cars they read in photographs, so the mean of several is taken.
+Groups of a model are counted as any class is. Beside them stand the directions of ``projection``, from the same pass:
+counts say how many cars there are, and nothing of how a wood differs from five trees.
 
 The unit of the counts is the bandwidth of their density, as it is of the projection's directions: how many kernels away
-one object is depends on how well objects can be counted. The two are blocks with a density each (``Blockwise``), since
-photographs may lie far from all renders in some direction. Axis letters: N images, C channels of the maps, h w places,
-P pooled features, d directions.
+one object is depends on how well objects can be counted. Things and directions are blocks with a density each
+(``Blockwise``), since photographs may lie far from all renders in some direction. Stuff is counted to tell it from
+things, and for who wants to know, but not compared: in KITTI's frames heads read 12 trees and half a building, since
+every place of a wood holds some of a tree, and few facades are like the model's. Guides that were to match this learnt
+16 trees, and scenes that look less like the frames than the prior's.
+
+Axis letters: N images, C channels of the maps, h w places, P pooled features, d directions.
 """
 
 import math
@@ -30,28 +34,36 @@ DROPPED = 0.2  # of the channels, so that none is relied upon
 
 
 class PretrainedCountNet(nn.Module):
-    """A ``FeatureNet``: counts of the classes, their total and directions, D = classes + 1 + d, in bandwidths.
+    """A ``FeatureNet``: counts of things, counts of stuff and directions, D = classes + d, in bandwidths.
 
     Args:
         classes: the kinds that are counted.
         directions: d.
         canvas: height and width of the images, which enter in about that size.
+        stuff: those of the classes that are no things, see ``SceneModel``.
         sizes: see ``SIZES``.
 
     Attributes:
         unit: ``(D,)``, what 1 in each feature stands for: objects, or the projection's own unit.
-        blocks: how many features are counts, and how many directions.
+        blocks: how many features are counts of things, counts of stuff, and directions.
         taught_by: fingerprint of the images that the heads taught themselves on, ``(32,)`` uint8; zeros for none.
     """
 
     def __init__(
-        self, classes: tuple[str, ...], directions: int, canvas: tuple[int, int], sizes: tuple[int, int] = SIZES
+        self,
+        classes: tuple[str, ...],
+        directions: int,
+        canvas: tuple[int, int],
+        stuff: tuple[str, ...] = (),
+        sizes: tuple[int, int] = SIZES,
     ):
         super().__init__()
         frozen = EfficientNetLite(min(max(round(math.sqrt(math.prod(canvas))), sizes[0]), sizes[1]))
         self.frozen = (frozen,)  # not a submodule: its weights are in no state
-        self.blocks = len(classes) + 1, directions
-        self.names = (*classes, "total", *(f"direction_{i}" for i in range(1, directions + 1)))
+        self.blocks = len(classes) - len(stuff), len(stuff), directions
+        self.order = sorted(range(len(classes)), key=lambda i: classes[i] in stuff)  # of the classes in the features
+        counted = (classes[i] for i in self.order)
+        self.names = (*counted, *(f"direction_{i}" for i in range(1, directions + 1)))
         self.register_buffer("mean", torch.zeros(frozen.channels, 1, 1))
         self.register_buffer("scale", torch.ones(frozen.channels, 1, 1))
         self.register_buffer("unit", torch.ones(len(self.names)))
@@ -76,10 +88,11 @@ class PretrainedCountNet(nn.Module):
 
     @torch.no_grad()
     def finish(self, projection: Projection, maps: Tensor) -> None:
-        """Take over a projection of pooled features, and choose the unit of the counts by the maps of renders that
-        nothing was trained on, as many as a batch of the fit has."""
+        """Take over a projection of pooled features, and choose the unit of the counts by the things in maps of renders
+        that nothing was trained on, as many as a batch of the fit has."""
         self.projected_mean.copy_(projection.mean), self.projected_weight.copy_(projection.weight)
-        self.unit[: self.blocks[0]] = bandwidth(self.counts(maps))
+        things = self.order[: self.blocks[0]]
+        self.unit[: len(self.order)] = bandwidth(self.counts(maps)[:, things])
 
     @torch.no_grad()
     def look(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -101,9 +114,8 @@ class PretrainedCountNet(nn.Module):
 
     @torch.no_grad()
     def counts(self, maps: Tensor) -> Tensor:
-        """Counts and their total, ``(N, classes + 1)``, objects."""
-        counts = self.held(maps).sum((2, 3))
-        return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
+        """Counts in the order of the classes, ``(N, classes)``, objects."""
+        return self.held(maps).sum((2, 3))
 
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
@@ -112,7 +124,7 @@ class PretrainedCountNet(nn.Module):
         for some in images.split(AT_ONCE):
             maps, pooled = self.look(some)
             directions = (pooled - self.projected_mean) @ self.projected_weight
-            out.append(torch.cat([self.counts(maps), directions], 1) / self.unit)
+            out.append(torch.cat([self.counts(maps)[:, self.order], directions], 1) / self.unit)
         return torch.cat(out)
 
 

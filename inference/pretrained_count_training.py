@@ -124,10 +124,10 @@ class PretrainedCountTraining:
             if each is not None:
                 each(self, loss)
         self.net.eval()
-        projection = discriminant(*pooled[:n].chunk(2), self.net.blocks[1], self.held_out)
+        projection = discriminant(*pooled[:n].chunk(2), self.net.blocks[-1], self.held_out)
         self.net.finish(projection, maps[n:])
         seen, true = self.net.counts(maps[n:]), target[n:, 1:].float().sum((2, 3))
-        each_class = zip(seen.T, true.T, strict=False)  # the total is not among the true ones
+        each_class = zip(seen.T, true.T, strict=True)
         return Found(torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class]), projection.ratio)
 
     def state(self) -> dict[str, Tensor]:
@@ -179,7 +179,7 @@ class PretrainedCountTraining:
         places = torch.tensor([width / drawings.image.shape[-1], height / drawings.image.shape[-2]])
         size = (drawings.size * places).amax(-1)
         label = drawings.label.masked_fill((drawings.visible < self.min_visible) | (size < SMALLEST), -1)
-        return cells(drawings.centre * places * STRIDE, label, self.net.blocks[0] - 1, height, width)
+        return cells(drawings.centre * places * STRIDE, label, len(self.net.order), height, width)
 
     def _step(self, maps: Tensor, target: Tensor, part: float, own: tuple[Tensor, Tensor] | None) -> float:
         over, slower = ((self.done + part) / self.epochs, 1) if own is None else (part, SLOWER)

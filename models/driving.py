@@ -37,6 +37,7 @@ from probscene.world import Meshes, World
 
 CANVAS = (188, 621)  # half of KITTI
 CLASSES = ("car", "van", "truck", "pedestrian", "cyclist", "pole", "sign", "object", "tree", "bush", "building")
+STUFF = ("tree", "bush", "building")
 
 
 class Assets(NamedTuple):
@@ -121,7 +122,7 @@ def driving(
     def model(name: str, structure: Policy, **more) -> SceneModel:
         program = partial(street_scenes, scenario=scenario, vehicles=vehicles, canvas=canvas, look=look)
         classes = tuple(kind for kind in CLASSES if kind in grammar.kinds)
-        more = {"assets": assets, **more}
+        more = {"assets": assets, "stuff": tuple(kind for kind in STUFF if kind in classes), **more}
         return SceneModel(name, grammar, structure, program, canvas, structures.MAX_STEPS, classes, **more)
 
     def target(seed: int) -> SceneModel:

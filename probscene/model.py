@@ -55,14 +55,16 @@ class SceneModel:
         drawn_with: ``drawn_with(folder)``, the same model drawn with what is in a folder, an absolute path; it looks
             through all of it at once. None where there is nothing that could be replaced.
         groups: by what objects are counted; over the whole image where None.
+        stuff: the classes of which photographs show no number: trees are a wood there, buildings a row. Where counts
+            are read in photographs, those of the others are compared, the things, and stuff by how images look.
         pretraining: the policy whose derivations a guide is pretrained on, the prior where None. A guide learns only
             from what it draws: give it now and then longer lists than the prior has, where the target may have them.
         scenarios: the models that this one is joined of, by name, see ``scenarios.join``.
         target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
 
     Raises:
-        ModelError: a class that the grammar has no object of, groups of no class or of the only one, a canvas or
-            ``max_steps`` that is not positive.
+        ModelError: a class that the grammar has no object of, groups of no class or of the only one, stuff that is no
+            class or all classes, a canvas or ``max_steps`` that is not positive.
     """
 
     name: str
@@ -76,6 +78,7 @@ class SceneModel:
     assets: str = ""
     drawn_with: Callable[[str], "SceneModel"] | None = None
     groups: Groups | None = None
+    stuff: tuple[str, ...] = ()
     pretraining: Policy | None = None
     target: Callable[[int], "SceneModel"] | None = None
     scenarios: tuple[tuple[str, "SceneModel"], ...] = ()
@@ -92,6 +95,11 @@ class SceneModel:
                 f"Expected the groups of model {self.name!r} by one of several classes {list(self.classes)}, actual "
                 f"{self.groups.kind!r}."
             )
+        if not set(self.stuff) < set(self.classes):
+            raise ModelError(
+                f"Expected the stuff of model {self.name!r} among its classes {list(self.classes)} and not all of "
+                f"them, actual {list(self.stuff)}."
+            )
         if min(self.canvas) < 1 or self.max_steps < 1:
             raise ModelError(
                 f"Expected a positive canvas and max_steps in model {self.name!r}, "
@@ -99,6 +107,11 @@ class SceneModel:
             )
         if self.channels not in (1, 3):
             raise ModelError(f"Expected channels 1 or 3 in model {self.name!r}, actual {self.channels}.")
+
+    @property
+    def things(self) -> tuple[str, ...]:
+        """The classes that are no stuff."""
+        return tuple(name for name in self.classes if name not in self.stuff)
 
     @property
     def pretraining_policy(self) -> Policy:

@@ -197,6 +197,7 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         assets="; ".join(dict.fromkeys(model.assets for model in each if model.assets)),
         drawn_with=drawn_with if all(model.drawn_with for model in each) else None,
         groups=groups.pop() if len(groups) == 1 else None,
+        stuff=tuple(dict.fromkeys(c for model in each for c in model.stuff)),
         pretraining=pretraining,
         target=target if all(targets) else None,
         scenarios=tuple(models.items()),

@@ -100,7 +100,8 @@ def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guid
     torch.set_num_threads(1)  # the guide's tensors are tiny: a second thread only waits
     divergence = preset.divergence()
     if preset.features == COUNT_ON_PRETRAINED:
-        divergence = Blockwise(divergence, net.blocks)
+        joint = dataclasses.replace(preset, marginal_variance=None).divergence()
+        divergence = Blockwise(net.blocks, (divergence, None, joint))
     guide = _learn(run, preset, model, view.observe(net, preset.candidates), divergence, real, progress)
     run.save("guide", guide.state_dict())
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)

@@ -30,7 +30,7 @@ from probscene.inference.latent import Guide
 from probscene.inference.scenario_guide import ScenarioGuide
 from probscene.model import SceneModel
 
-FORMAT = 2  # of the run folder; another number is not read
+FORMAT = 3  # of the run folder; another number is not read
 KEYS = {"model", "model_sha256", "assets"}  # that create adds to every run.json
 
 

@@ -115,7 +115,7 @@ def feature_net(preset: Preset, model: SceneModel) -> FeatureNet:
     if preset.features == COUNT_ON_PRETRAINED:
         from probscene.inference.pretrained_count import PretrainedCountNet  # torchvision takes seconds to import
 
-        return PretrainedCountNet(model.classes, preset.directions, model.canvas)
+        return PretrainedCountNet(model.classes, preset.directions, model.canvas, model.stuff)
     if preset.features != "count":
         from probscene.inference.pretrained import pretrained, weights_file  # torchvision takes seconds to import
 

@@ -144,7 +144,7 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
     run = Run.open(tmp_path / "run")
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
-    assert len(net.names) == len(run.model.classes) + 1 + 3
+    assert len(net.names) == len(run.model.classes) + 3
     assert torch.allclose(seen, run.load("real")["features"][:9], atol=1e-3)
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
     assert [line["stage"] for line in lines] == ["features"] * 3 + ["counts"] + ["structure"] * 2
@@ -158,9 +158,10 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
     done = call("evaluate", run.path, *words)
     assert done.code == 0, done.err
     estimate = json.loads((tmp_path / "e.json").read_text())["sources"]["estimate"]
-    total = run.load("real")["features"][:, 2] * net.unit[2]  # objects, whatever the unit of the features is
-    assert estimate["mean_number"] == pytest.approx(total.round().mean().item(), abs=1e-6)
-    assert not torch.equal(total.round(), run.load("real")["features"][:, 2].round())
+    counts = run.load("real")["features"][:, :2]
+    number = (counts * net.unit[:2]).round().sum(1)  # objects, whatever the unit of the features is
+    assert estimate["mean_number"] == pytest.approx(number.mean().item(), abs=1e-6)
+    assert not torch.equal(number, counts.round().sum(1))
     assert call("report", run.path, "--num", 50, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
 
 

@@ -133,6 +133,8 @@ def test_programs_that_are_none():
     [
         ({"classes": ("plate", "cup")}, r"\['cup'\]"),
         ({"classes": ()}, "actual none"),
+        ({"stuff": ("cup",)}, r"stuff .* actual \['cup'\]"),
+        ({"stuff": ("plate", "mug")}, "and not all"),
         ({"canvas": (0, 5)}, "positive canvas"),
         ({"max_steps": 0}, "max_steps 0"),
         ({"channels": 4}, "channels 1 or 3"),

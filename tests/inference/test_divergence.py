@@ -167,9 +167,12 @@ def test_blocks_have_densities_of_their_own():
     """A block in which the two sides have nothing in common leaves the other's costs as they are, up to a constant."""
     one, real = torch.randn(40, 2), torch.randn(30, 2)
     other, far = torch.randn(40, 3), torch.randn(30, 3) + 100
-    found = Blockwise(JensenShannon(0.5, None), (2, 3))(torch.cat([one, other], 1), torch.cat([real, far], 1))
-    assert torch.allclose(found, JensenShannon(0.5, None)(one, real) + math.log(2), atol=1e-5)
-    joint = JensenShannon(0.5, None)(torch.cat([one, other], 1), torch.cat([real, far], 1))
+    both = torch.cat([one, other], 1), torch.cat([real, far], 1)
+    each = JensenShannon(0.5, 0.1), JensenShannon(0.5, None)
+    found = Blockwise((2, 3), each)(*both)
+    assert torch.allclose(found, each[0](one, real) + math.log(2), atol=1e-5)
+    assert torch.allclose(Blockwise((2, 3), (each[0], None))(*both), each[0](one, real))
+    joint = each[1](*both)
     assert joint.std() < 1e-5 < found.std()
     with pytest.raises(ProbsceneError, match="Expected generated"):
-        Blockwise(JensenShannon(), (2, 3))(one, torch.cat([real, far], 1))
+        Blockwise((2, 3), each)(one, torch.cat([real, far], 1))

@@ -13,7 +13,7 @@ from probscene.inference.count_training import relative_count_loss
 from probscene.inference.pretrained import EfficientNetLite
 from probscene.inference.pretrained_count import NOTHING, WHOLE, PretrainedCountNet, believed
 from probscene.inference.pretrained_count_training import PretrainedCountTraining
-from probscene.inference.projection import SHARE, discriminant, self_share
+from probscene.inference.projection import SHARE, bandwidth, discriminant, self_share
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def draw_twice(dots):
 
 def training(dots, draw_twice, pairs, epochs, held_out, batch_size=32, **words) -> PretrainedCountTraining:
     torch.manual_seed(0)
-    net = PretrainedCountNet(dots.classes, 2, dots.canvas, (160, 160))
+    net = PretrainedCountNet(dots.classes, 2, dots.canvas, sizes=(160, 160))
     return PretrainedCountTraining(net, draw_twice, pairs, epochs, held_out, batch_size, seed=1, **words)
 
 
@@ -72,12 +72,25 @@ def test_features_are_the_map_summed_and_the_projection_in_units(dots):
     share = net(maps).double().exp()
     counts = believed((share / share.sum(2, keepdim=True)).mean(0)[:, 1:]).sum((2, 3))
     directions = (pooled - net.projected_mean).double() @ net.projected_weight.double()
-    expected = torch.cat([counts, counts.sum(1, keepdim=True), directions], 1) / net.unit
+    expected = torch.cat([counts, directions], 1) / net.unit
     assert torch.allclose(net.embed(images).double(), expected, rtol=1e-4, atol=1e-4)
-    assert len(net.names) == expected.shape[1] == 5 and net.embed(images[:0]).shape == (0, 5)
+    assert len(net.names) == expected.shape[1] == 4 and net.embed(images[:0]).shape == (0, 4)
     one = torch.cat([net.embed(image[None]) for image in images])
     assert torch.allclose(one, net.embed(images), rtol=1e-4, atol=1e-4)
     assert sum(value.numel() for value in net.state_dict().values()) < 400_000  # none of the frozen network's
+
+
+def test_things_come_before_stuff_and_choose_the_unit(dots):
+    torch.manual_seed(0)
+    plain = PretrainedCountNet(dots.classes, 2, dots.canvas).eval()
+    net = PretrainedCountNet(dots.classes, 2, dots.canvas, stuff=dots.classes[:1]).eval()
+    net.load_state_dict(plain.state_dict())
+    assert net.names[:2] == dots.classes[::-1] and net.blocks == (1, 1, 2) and plain.blocks == (2, 0, 2)
+    images = torch.randint(0, 256, (20, 3, 64, 96), dtype=torch.uint8)
+    assert torch.equal(net.embed(images)[:, :2], plain.embed(images)[:, [1, 0]])
+    maps, pooled = net.look(images)
+    net.finish(discriminant(pooled[:10], pooled[10:], 2, 10), maps)
+    assert net.unit[0] == net.unit[1] == pytest.approx(bandwidth(plain.counts(maps)[:, 1:]), rel=1e-5)
 
 
 def test_an_object_is_taken_to_whole():
@@ -119,7 +132,8 @@ def test_it_learns_to_count(learnt, draw_twice):
     fresh = draw_twice(50)
     counts = number(fresh)
     assert ((read(fit.net, fresh.image) - counts).square().mean(0) < 0.2 * counts.var(0)).all()
-    for block in fit.net.embed(fresh.image)[:64].split(fit.net.blocks, 1):
+    things, _, directions = fit.net.embed(fresh.image)[:64].split(fit.net.blocks, 1)
+    for block in (things, directions):
         assert self_share(block) == pytest.approx(SHARE, rel=0.5)
 
 
@@ -145,7 +159,7 @@ def test_what_it_believes_is_a_distribution_in_each_place(learnt, draw_twice):
     maps = learnt[0].net.look(draw_twice(10).image)[0].half()
     target = learnt[0]._own(maps)
     assert (target >= 0).all() and torch.allclose(target.sum(1), torch.ones(()), atol=1e-5)
-    counts = learnt[0].net.counts(maps)[:, :2]
+    counts = learnt[0].net.counts(maps)
     assert torch.allclose(target[:, 1:].sum((2, 3)), counts, atol=0.05)  # hardly a place holds more than one
 
 
