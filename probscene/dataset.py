@@ -43,6 +43,7 @@ class ImageFolder:
 
     Attributes:
         paths: the L files.
+        sizes: of each of them, the height and width that it has in its file.
         windows: of each of them, what is seen of it, see ``window``; None where that is all.
         scales: of each of them, how many of the canvas's rows a row of it becomes.
         resized: how many of them are of another size.
@@ -69,10 +70,11 @@ class ImageFolder:
         files, others = _listed(self.path)
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths: list[Path] = []
+        self.sizes: list[tuple[int, int]] = []
         self.windows: list[Window | None] = []
         self.scales: list[float] = []
         self.bad: dict[Path, str] = {}
-        sizes, cut, pictures = Counter(), Counter(), set()
+        cut, pictures = Counter(), set()
         with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
             for i, (file, found) in enumerate(zip(files, checked, strict=True)):
                 if isinstance(found, Fault):
@@ -80,7 +82,7 @@ class ImageFolder:
                 else:
                     self.paths.append(file)
                     digest.update(hashlib.sha256(os.fsencode(file.name)).digest() + found.data)
-                    sizes[found.size] += 1
+                    self.sizes.append(tuple(found.size))
                     pictures.add(found.picture)
                     seen = window(found.size, self.canvas)
                     self.windows.append(seen)
@@ -93,6 +95,7 @@ class ImageFolder:
         self._judge(skip_bad)
         self.fingerprint = digest.hexdigest()
         self.distinct = len(pictures)
+        sizes = Counter(self.sizes)
         sizes.pop(self.canvas, None)
         self.resized, self.cropped = sizes.total(), cut.total()
         self.notes = self._notes(sizes, cut, others)

@@ -47,6 +47,10 @@ class Object(NamedTuple):
     right: float
     bottom: float
 
+    def on(self, size: tuple[int, int]) -> bool:
+        """Whether any of it lies on an image of a height and width."""
+        return self.left < size[1] and self.right >= 0 and self.top < size[0] and self.bottom >= 0
+
     def within(self, seen: Window) -> bool:
         """Whether its middle is in a part of the image."""
         x, y = (self.left + self.right + 1) / 2 - seen.left, (self.top + self.bottom + 1) / 2 - seen.top
@@ -83,7 +87,8 @@ def read_kitti(
         min_height: of a box that is counted, pixels.
 
     Raises:
-        DataError: see ``read_objects``; an image without a file, or no type that the model has a class for.
+        DataError: see ``read_objects``; an image without a file, an object beside its image, or no type that the model
+            has a class for.
     """
     files = {path: folder / f"{path.stem}.txt" for path in target.paths}
     found = {path: read_objects(file) for path, file in files.items() if file.is_file()}
@@ -103,13 +108,20 @@ def read_kitti(
             f"actual {', '.join(occurring) or 'no object'}."
         )
     counts, small, cut = np.zeros((len(found), len(classes)), np.int64), 0, 0
-    windows = dict(zip(target.paths, target.windows, strict=True))
+    images = dict(zip(target.paths, zip(target.sizes, target.windows, strict=True), strict=True))
     for row, (path, objects) in zip(counts, found.items(), strict=True):
+        size, seen = images[path]
         for one in objects:
             name = of_type[one.type]
             if name is None:
                 continue
-            if windows[path] is not None and not one.within(windows[path]):
+            if not one.on(size):
+                raise DataError(
+                    f"Expected boxes on the image of {size[1]}x{size[0]} in {files[path]}, actual {one.type} from "
+                    f"{one.left:g}, {one.top:g} to {one.right:g}, {one.bottom:g}; give the labels of these images, not "
+                    "of images of another size."
+                )
+            if seen is not None and not one.within(seen):
                 cut += 1
             elif one.bottom - one.top < min_height:
                 small += 1

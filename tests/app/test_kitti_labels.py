@@ -30,14 +30,15 @@ OTHERS = ("Van", "Tram", "Misc", "DontCare")
 REST = "1.50 1.60 3.90 1.00 1.70 12.00 0.10"
 
 
-def line(type, height=30.0, left=10.0) -> str:
-    return f"{type} 0.00 0 0.02 {left:.2f} 100.00 {left + 40:.2f} {100 + height:.2f} {REST}"
+def line(type, height=30.0, left=10.0, top=100.0) -> str:
+    return f"{type} 0.00 0 0.02 {left:.2f} {top:.2f} {left + 40:.2f} {top + height:.2f} {REST}"
 
 
 def images(folder, names) -> SimpleNamespace:
-    """Of an ``ImageFolder``, the paths, and that nothing is cut."""
+    """Of an ``ImageFolder``, the paths, the files' sizes, and that nothing is cut."""
     paths = [Path(folder, name) for name in names]
-    return SimpleNamespace(path=Path(folder), paths=paths, bad={}, windows=[None] * len(names))
+    alike = {"windows": [None] * len(names), "sizes": [(375, 1242)] * len(names)}
+    return SimpleNamespace(path=Path(folder), paths=paths, bad={}, **alike)
 
 
 @given(st.lists(st.lists(st.sampled_from([*CLASS, *OTHERS])), min_size=1, max_size=9))
@@ -73,6 +74,18 @@ def test_objects_whose_middle_is_cut_away_are_not_counted(tmp_path):
     counts, _, notes = read_kitti(tmp_path, STREET, target)
     assert counts[0, 0] == 3
     assert notes == ("4 objects that lie where images are cut are not counted.",)
+
+
+def test_boxes_of_images_of_another_size_are_refused(tmp_path):
+    """Cut boxes end beyond an image, those of its labels begin within it."""
+    target = images("x", ["a.png"])
+    for left, height, error in ((1230, 400, False), (1242, 20, True), (-80, 20, True), (-39, 20, False)):
+        (tmp_path / "a.txt").write_text(line("Car") + "\n" + line("Car", height, left))
+        if error:
+            with pytest.raises(DataError, match=r"image of 1242x375 in .*a\.txt, actual .*of another size"):
+                read_kitti(tmp_path, STREET, target)
+        else:
+            assert read_kitti(tmp_path, STREET, target)[0][0, 0] == 2
 
 
 def test_names_of_the_model_go_first(tmp_path):
@@ -179,7 +192,7 @@ def labelled(target, tmp_path):
     names = sorted(path.stem for path in target.images.iterdir())
     for name, row in zip(names, target.counts, strict=True):
         types = ["Red"] * row[0] + ["BLUE"] * row[1]
-        lines = [line(type, 8 if k == 0 else 40) for k, type in enumerate(types)] + [line("DontCare")]
+        lines = [line(type, 8 if k == 0 else 40, top=10.0) for k, type in enumerate(types)] + [line("DontCare")]
         (tmp_path / "label_2" / f"{name}.txt").write_text("\n".join(lines))
     return tmp_path / "label_2"
 
