@@ -109,11 +109,6 @@ class SceneModel:
             raise ModelError(f"Expected channels 1 or 3 in model {self.name!r}, actual {self.channels}.")
 
     @property
-    def things(self) -> tuple[str, ...]:
-        """The classes that are no stuff."""
-        return tuple(name for name in self.classes if name not in self.stuff)
-
-    @property
     def pretraining_policy(self) -> Policy:
         """What a guide is pretrained on."""
         return self.prior if self.pretraining is None else self.pretraining
