@@ -109,7 +109,7 @@ class Preset:
         return replace(self, objective=objective, baseline="moving_average", updates=1, learning_rate=rate)
 
     def seeing(self, features: str) -> "Preset":
-        """This preset with another feature network. A pretrained one takes about 30 ms an image on one core where a
+        """This preset with another feature network. A pretrained one takes about 20 ms an image on one core where a
         preset's own takes 1, so that scenes are fewer and each is drawn once. So few have a noisier gradient: at twice
         the step, lists of Aerial 2D ran beyond T_max in the third batch. Marginals, which are far sharper than the
         joint density, say of photographs only that they are none: their log ratio's spread came to 18, without them 2.
