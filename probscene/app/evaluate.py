@@ -23,7 +23,7 @@ from probscene.app.image_distances import IMAGES, Distances, image_distances
 from probscene.app.labels import Labels
 from probscene.app.likelihood import Likelihood, likelihood
 from probscene.app.run import Run
-from probscene.app.seen import features_in, fingerprint, own_net
+from probscene.app.seen import features_in, kept_features, own_net
 from probscene.app.shown import counted, number_of
 from probscene.app.source import Source
 from probscene.app.structures import Relation
@@ -186,19 +186,17 @@ def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> 
     names = feature_net(Preset.of(run.record["preset"]), model).names
     if estimated(model, names, torch.zeros(0, len(names))) is None:
         return None
-    kept, done = run.load("real"), 0
+    features, done = kept_features(run, target), 0
 
     def each(images):
         nonlocal done
         done += images
         progress("target", done, len(target), "")
 
-    if target is None and kept is None:
+    if target is None and features is None:
         return None
     net = own_net(run)
-    if kept is not None and (target is None or torch.equal(kept["fingerprint"], fingerprint(target))):
-        features = kept["features"]
-    else:
+    if features is None:
         features = features_in(run, target, net, each)
     return Source(*estimated(model, names, features * net.unit), seed=1)
 

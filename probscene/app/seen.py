@@ -30,6 +30,15 @@ def fingerprint(target: ImageFolder) -> Tensor:
     return torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
 
 
+def kept_features(run: Run, target: ImageFolder | None) -> Tensor | None:
+    """The features ``(L, D)`` of its images that the fit kept, in the network's units; None where there are none, or
+    where the target's images are others. Without a target they are the fit's."""
+    kept = run.load("real")
+    if kept is None or (target is not None and not torch.equal(kept["fingerprint"], fingerprint(target))):
+        return None
+    return kept["features"]
+
+
 def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Iterator[Tensor]:
     """Renders of ``num`` scenes with structures from ``policy``, in batches ``(n, channels, H, W)`` uint8 as a reader
     of their files would have them."""

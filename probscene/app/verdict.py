@@ -17,7 +17,7 @@ from probscene.app.fit import Progress
 from probscene.app.preview import Pixels, pixels, shrunk
 from probscene.app.provenance import CHUNK, chunk_randomness
 from probscene.app.run import Run
-from probscene.app.seen import features_in, fingerprint, own_net, threads
+from probscene.app.seen import features_in, kept_features, own_net, threads
 from probscene.app.view import View
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
@@ -159,8 +159,8 @@ def _features(run: Run, policy: Policy, net: FeatureNet, candidates: int, num: i
 
 def _real(run: Run, target: ImageFolder, net: FeatureNet, each) -> Tensor:
     """The features that the fit kept where the images are the fit's, else new ones."""
-    kept = run.load("real")
-    if kept is not None and torch.equal(kept["fingerprint"], fingerprint(target)):
-        each(len(target))
-        return kept["features"]
-    return features_in(run, target, net, each)
+    kept = kept_features(run, target)
+    if kept is None:
+        return features_in(run, target, net, each)
+    each(len(target))
+    return kept
