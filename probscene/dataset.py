@@ -45,7 +45,6 @@ class ImageFolder:
         paths: the L files.
         sizes: of each of them, the height and width that it has in its file.
         windows: of each of them, what is seen of it, see ``window``; None where that is all.
-        scales: of each of them, how many of the canvas's rows a row of it becomes.
         resized: how many of them are of another size.
         cropped: how many of them are of another shape.
         distinct: how many of them are left without those that equal another one in every pixel.
@@ -72,9 +71,8 @@ class ImageFolder:
         self.paths: list[Path] = []
         self.sizes: list[tuple[int, int]] = []
         self.windows: list[Window | None] = []
-        self.scales: list[float] = []
         self.bad: dict[Path, str] = {}
-        cut, pictures = Counter(), set()
+        pictures = set()
         with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
             for i, (file, found) in enumerate(zip(files, checked, strict=True)):
                 if isinstance(found, Fault):
@@ -86,22 +84,27 @@ class ImageFolder:
                     pictures.add(found.picture)
                     seen = window(found.size, self.canvas)
                     self.windows.append(seen)
-                    self.scales.append(self.canvas[0] / (found.size[0] if seen is None else seen.height))
                     if seen is not None:
                         digest.update(repr(tuple(seen)).encode())
-                        cut[found.size] += 1
                 if progress is not None:
                     progress(i + 1, len(files))
         self._judge(skip_bad)
         self.fingerprint = digest.hexdigest()
         self.distinct = len(pictures)
         sizes = Counter(self.sizes)
+        cut = Counter(size for size, seen in zip(self.sizes, self.windows, strict=True) if seen is not None)
         sizes.pop(self.canvas, None)
         self.resized, self.cropped = sizes.total(), cut.total()
         self.notes = self._notes(sizes, cut, others)
 
     def __len__(self) -> int:
         return len(self.paths)
+
+    @property
+    def scales(self) -> list[float]:
+        """Of each of the files, how many of the canvas's rows a row of it becomes."""
+        seen = zip(self.sizes, self.windows, strict=True)
+        return [self.canvas[0] / (size[0] if window is None else window.height) for size, window in seen]
 
     def load(self, i: int, view: int = 0) -> Tensor:
         """Image number ``i``, ``(C, H, W)`` uint8.
