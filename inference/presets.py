@@ -130,9 +130,9 @@ class Preset:
             anchor = max(self.anchor, 0.1) if self.anchor else 0.0
             single = 0.25 if self.objective == "js" else None
             few |= {"marginal_variance": single, "pairs": 1000, "anchor": anchor, "batches": 60}
-            return replace(self, features=features, **few)
-        name, file = known(features, TRAINED), features.partition("=")[2]
-        features = f"{name}={Path(file).resolve()}" if file else features
+        else:
+            name, file = known(features, TRAINED), features.partition("=")[2]
+            features = f"{name}={Path(file).resolve()}" if file else features
         return replace(self, features=features, **few)
 
     def guided(self, kind: str) -> "Preset":
