@@ -103,8 +103,8 @@ class ImageFolder:
     @property
     def scales(self) -> list[float]:
         """Of each of the files, how many of the canvas's rows a row of it becomes."""
-        seen = zip(self.sizes, self.windows, strict=True)
-        return [self.canvas[0] / (size[0] if window is None else window.height) for size, window in seen]
+        each = zip(self.sizes, self.windows, strict=True)
+        return [self.canvas[0] / (size[0] if seen is None else seen.height) for size, seen in each]
 
     def load(self, i: int, view: int = 0) -> Tensor:
         """Image number ``i``, ``(C, H, W)`` uint8.
