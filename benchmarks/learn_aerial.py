@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fit import create, fit
-from probscene.app.generate import generate_scenes
-from probscene.app.run import Run
+from probscene.app.fitting.fit import create, fit
+from probscene.app.fitting.presets import DEFAULT, QUICK, Preset
+from probscene.app.fitting.run import Run
 from probscene.derive import derive_complete
-from probscene.inference.metrics import total_variation
-from probscene.inference.presets import DEFAULT, QUICK, Preset
+from probscene.inference.judging.metrics import total_variation
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
 from probscene.policy import Policy
 from probscene.relations import per_parent
@@ -40,8 +40,8 @@ def chosen(preset: str, fit: str) -> Preset:
     """The preset with another guide or objective."""
     base = PRESETS[preset]
     if fit in ("lstm", "pcfg", "grammar-vae"):
-        return base.guided(fit)
-    return base.toward(fit)
+        return base.with_guide(fit)
+    return base.with_objective(fit)
 
 
 def poisson(mean: float) -> np.ndarray:

@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
+from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fit import create, fit
-from probscene.app.generate import generate_scenes
+from probscene.app.fitting.fit import create, fit
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.presets import preset
+from probscene.app.fitting.run import Run
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
-from probscene.app.overrides import override
-from probscene.app.run import Run
 from probscene.derive import derive_complete
-from probscene.inference.metrics import histogram, total_variation, wasserstein
-from probscene.inference.presets import preset
+from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 
 from probscene.app.files import write_json
-from probscene.app.fit import create, fit
-from probscene.app.run import Run
+from probscene.app.fitting.fit import create, fit
+from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
+from probscene.app.fitting.run import Run
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
-from probscene.inference.guide import LSTMGuide
-from probscene.inference.learn import Learner
+from probscene.inference.guides.lstm import LSTMGuide
+from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
-from probscene.inference.presets import DEFAULT, PAPER, QUICK
 from probscene.inference.pretrain import pretrain
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL
 from probscene.sampling import seed_everything
@@ -35,9 +35,9 @@ from probscene.structure import StructurePrior, counts, weights
 
 PRESETS = {
     "quick": QUICK,
-    "quick-mmd": QUICK.toward("mmd"),
+    "quick-mmd": QUICK.with_objective("mmd"),
     "default": DEFAULT,
-    "default-mmd": DEFAULT.toward("mmd"),
+    "default-mmd": DEFAULT.with_objective("mmd"),
     "paper": PAPER,
     "oracle": QUICK,
 }
@@ -131,7 +131,7 @@ def fit_counts(target: int, seed: int, images: int) -> tuple[LSTMGuide, dict[str
     pretrain(guide, MODEL.prior)
     loss = ScoreFunction(observe, QUICK.divergence(), updates=QUICK.updates)
     features = torch.cat([seen, seen.sum(1, keepdim=True)], 1)
-    Learner(structures, guide, loss, features, ORACLE_BATCHES, seed=seed).run()
+    Trainer(structures, guide, loss, features, ORACLE_BATCHES, seed=seed).run()
     return guide, {"structure": time.monotonic() - start}
 
 

@@ -16,16 +16,16 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from probscene.app.evaluate import Evaluation, evaluate
+from probscene.app.evaluation.evaluate import Evaluation, evaluate
+from probscene.app.evaluation.labels import read_labels
 from probscene.app.files import write_json
-from probscene.app.fit import create, fit
-from probscene.app.labels import read_labels
+from probscene.app.fitting.fit import create, fit
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.presets import preset
+from probscene.app.fitting.run import Run
 from probscene.app.memory import keep_freed_memory
-from probscene.app.overrides import override
-from probscene.app.run import Run
 from probscene.dataset import ImageFolder
-from probscene.inference.metrics import histogram, total_variation, wasserstein
-from probscene.inference.presets import preset
+from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -82,7 +82,7 @@ def main():
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = override(preset("street").seeing(args.features), args.settings)
+        chosen = override(preset("street").with_features(args.features), args.settings)
         run = Run.open(path) if path.exists() else create(args.model, args.images, path, chosen, seed)
         start = time.monotonic()
         fit(run, lambda *_: None)

@@ -12,13 +12,13 @@ import time
 
 import torch
 
+from probscene.app.fitting.observer import Observer, feature_net
+from probscene.app.fitting.presets import QUICK
 from probscene.app.loading import load_model, renderer_for
-from probscene.app.view import View, feature_net
 from probscene.derive import derive_complete
-from probscene.inference.guide import make_guide
-from probscene.inference.presets import QUICK
-from probscene.inference.scenario_guide import ScenarioGuide
-from probscene.sampling import realise, seed_everything
+from probscene.inference.guides.lstm import make_guide
+from probscene.inference.guides.scenario import ScenarioGuide
+from probscene.sampling import run_program, seed_everything
 
 
 class Clock:
@@ -39,7 +39,7 @@ def step(model, guide, optimiser, net, view, real, num_scenes, clock):
     preset = QUICK
     with torch.no_grad():
         derivation, _ = clock("structures", lambda: derive_complete(guide.grammar, guide, num_scenes, guide.max_steps))
-        scenes = clock("parameters", lambda: realise(model, derivation))
+        scenes = clock("parameters", lambda: run_program(model, derivation))
         starts = range(0, num_scenes, 64)
         images = [clock("rendering", lambda i=i: view.render(scenes.drawing[i : i + 64]).image) for i in starts]
         features = clock("features", lambda: torch.cat([net.embed(some) for some in images]))
@@ -68,8 +68,8 @@ def main():
     columns = {}
     for features in args.features:
         seed_everything(0)
-        view = View(model, 1)
-        net = feature_net(QUICK.seeing(features), model).eval()
+        view = Observer(model, 1)
+        net = feature_net(QUICK.with_features(features), model).eval()
         if features == "count":
             net.fit_to(view.object_size())
         made = ScenarioGuide if model.scenarios else lambda g, steps: make_guide("lstm", g, steps)

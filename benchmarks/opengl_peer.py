@@ -8,10 +8,10 @@ import moderngl
 import numpy as np
 import opengl_shaders as glsl
 
-from probscene.renderers import mesh_tables as tables
-from probscene.renderers.mesh_atlas import MeshAtlas
-from probscene.renderers.mesh_instances import instances
-from probscene.renderers.mesh_scenes import view
+from probscene.renderers.mesh import tables
+from probscene.renderers.mesh.atlas import MeshAtlas
+from probscene.renderers.mesh.instances import instances
+from probscene.renderers.mesh.scenes import view
 from probscene.world import World
 
 

@@ -16,12 +16,12 @@ from pyro.infer import SVI
 from pyro.optim import LambdaLR
 
 from probscene.derive import derive_complete
-from probscene.inference.count_batches import CountSchedule
-from probscene.inference.count_net import CountNet
-from probscene.inference.count_training import CountTraining
 from probscene.inference.divergence import KDELogRatio
-from probscene.inference.features import class_table, examples
-from probscene.inference.guide import LSTMGuide
+from probscene.inference.features.base import class_table, examples
+from probscene.inference.features.counting.batches import CountSchedule
+from probscene.inference.features.counting.net import CountNet
+from probscene.inference.features.counting.training import CountTraining
+from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL

@@ -14,7 +14,7 @@ import torch
 from torch.utils.data import DataLoader
 from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_320_fpn
 
-from probscene.app.scene_dataset import SceneDataset
+from probscene.app.datasets.scene_dataset import SceneDataset
 
 
 def main():

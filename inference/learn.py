@@ -9,12 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from probscene.errors import ProbsceneError
-from probscene.inference.objective import ScoreFunction
-from probscene.inference.resume import batch_seed, restore_training, training_state
 from probscene.sampling import seed_everything
 
+from .objective import ScoreFunction
+from .training import batch_seed, restore_training, training_state
 
-class Learner:
+
+class Trainer:
     """Adam on a ``ScoreFunction``, resumable after every rendered batch.
 
     Args:
@@ -51,7 +52,7 @@ class Learner:
         self.optimiser = torch.optim.Adam(guide.parameters(), lr=learning_rate)
         self.done = 0
 
-    def run(self, each: Callable[["Learner", dict[str, float]], None] | None = None) -> None:
+    def run(self, each: Callable[["Trainer", dict[str, float]], None] | None = None) -> None:
         """Take the batches that are left; ``each`` sees the learner and its diagnostics after every one.
 
         Raises:

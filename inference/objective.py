@@ -39,15 +39,16 @@ from torch import Tensor
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.errors import ProbsceneError
-from probscene.inference.divergence import Divergence
 from probscene.policy import Policy
-from probscene.sampling import Scenes, realise
+from probscene.sampling import Scenes, run_program
+
+from .divergence import Divergence
 
 FAR = 20.0  # nats
 BASELINES = ("moving_average", "leave_one_out", "none")
 
 
-class Batch(NamedTuple):
+class SceneBatch(NamedTuple):
     """The generated scenes that updates are taken on.
 
     Attributes:
@@ -77,15 +78,15 @@ class ScoreFunction:
         clip: the importance ratio of those steps stays within ``1 +- clip``.
         scale: of the whole cost; under Adam it changes nothing but the weight of the rejections.
         reject_weight, reject_threshold: lambda and epsilon of section 3.3.
-        leak_weight: of half the squared number of failed attempts.
-        anchor, anchor_weight: a policy, and the weight of the reverse KL from it: ``log q(T) - log p(T)`` nats, at most
-            ``FAR``, are added to what a scene costs. What images cannot tell then stays as there, where it would drift:
-            cars behind cars are free (not in the paper).
+        incompletion_weight: of half the squared number of failed attempts.
+        prior, prior_kl_weight: a policy, and the weight of the reverse KL from it: ``log q(T) - log p(T)`` nats, at
+            most ``FAR``, are added to what a scene costs. Without it, what images cannot tell drifts, such as the
+            number of hidden cars (not in the paper).
         strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
             several guides learn together; all have one where None.
 
     Attributes:
-        batch: the last ``Batch``, for logging.
+        batch: the last ``SceneBatch``, for logging.
 
     Raises:
         ProbsceneError: an unknown baseline, or numbers out of range.
@@ -102,9 +103,9 @@ class ScoreFunction:
         scale: float = 1.0,
         reject_weight: float = 1e-2,
         reject_threshold: float = 1.0,
-        leak_weight: float = 1.0,
-        anchor: Policy | None = None,
-        anchor_weight: float = 0.0,
+        incompletion_weight: float = 1.0,
+        prior: Policy | None = None,
+        prior_kl_weight: float = 0.0,
         strata: Callable[[Derivation], Tensor] | None = None,
     ):
         if baseline not in BASELINES:
@@ -116,11 +117,11 @@ class ScoreFunction:
         self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
         self.updates, self.clip, self.scale = updates, clip, scale
         self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
-        self.leak_weight = leak_weight
-        self.anchor, self.anchor_weight = anchor, anchor_weight
+        self.incompletion_weight = incompletion_weight
+        self.prior, self.prior_kl_weight = prior, prior_kl_weight
         self.strata = strata
         self.averages: dict[int, float] = {}  # moving, by stratum
-        self.batch: Batch | None = None
+        self.batch: SceneBatch | None = None
         self._used = 0
         self._drawn_with: Tensor | None = None  # log q(T) under the guide that drew the batch
 
@@ -140,20 +141,20 @@ class ScoreFunction:
         surrogate = torch.maximum(batch.advantage * ratio, batch.advantage * clipped).mean()
         return batch.cost.mean() + surrogate - surrogate.detach()
 
-    def _draw(self, model, guide, num_scenes: int, real: Tensor) -> Batch:
+    def _draw(self, model, guide, num_scenes: int, real: Tensor) -> SceneBatch:
         with torch.no_grad():
             derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps)
-            features = self.observe(realise(model, derivation, failures=failures))
+            features = self.observe(run_program(model, derivation, failures=failures))
             cost = self.divergence(features, real)
             cost = cost + self.reject_weight * (failures > self.reject_threshold)
             strata = torch.zeros(len(cost), dtype=torch.int64) if self.strata is None else self.strata(derivation)
-            if self.anchor is not None and self.anchor_weight:
-                away = guide.log_prob(derivation) - self.anchor.log_prob(derivation)
-                cost = cost + self.anchor_weight * away.clamp(max=FAR)
+            if self.prior is not None and self.prior_kl_weight:
+                away = guide.log_prob(derivation) - self.prior.log_prob(derivation)
+                cost = cost + self.prior_kl_weight * away.clamp(max=FAR)
             failed = failures.float().mean().item()
-            leak = self.leak_weight * failed * (1 + failed)
+            leak = self.incompletion_weight * failed * (1 + failed)
             advantage = self.scale * (cost - self._baseline(cost, strata) - leak)
-            return Batch(derivation, features, cost, advantage, failed)
+            return SceneBatch(derivation, features, cost, advantage, failed)
 
     def _baseline(self, cost: Tensor, strata: Tensor) -> Tensor:
         baseline = torch.zeros_like(cost)

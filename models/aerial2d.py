@@ -23,10 +23,11 @@ from probscene.derive import derive
 from probscene.drawing import Drawing, Sprites
 from probscene.grammar import Grammar
 from probscene.model import Groups, SceneModel
-from probscene.models.aerial_sprites import CAR, ROAD, Scenery, drawn, folder
 from probscene.policy import Policy
 from probscene.scene import SceneGraph
 from probscene.structure import Counts, StructurePrior, counts, ranked
+
+from .aerial_sprites import CAR, ROAD, Scenery, drawn, folder
 
 GRAMMAR = Grammar("""
     Scene -> Roads
@@ -164,7 +165,7 @@ def assets() -> str:
     return f"pictures in {os.path.abspath(path)} (PROBSCENE_SPRITES)" if path else ""
 
 
-def drawn_with(path: str, prior: Policy) -> SceneModel:
+def with_assets(path: str, prior: Policy) -> SceneModel:
     """The model with the pictures in a folder."""
     folder(path)  # which finds what is wrong with it
     return aerial2d(partial(folder, path), f"pictures in {path}", prior)
@@ -175,15 +176,15 @@ def aerial2d(look=scenery, assets: str = "", prior: Policy = PRIOR) -> SceneMode
 
     def model(name, structure, spaced, **more):
         program = partial(aerial, spaced=spaced, scenery=look)
-        more = {"assets": assets, "groups": Groups("road", along="y", most=6), **more}
+        more = {"assets": assets, "groups": Groups("road", along="y", max_groups=6), **more}
         return SceneModel(name, GRAMMAR, structure, program, (CANVAS, CANVAS), MAX_STEPS, CLASSES, **more)
 
     def target(seed: int) -> SceneModel:
         """The experiment's truth; the paper has one, whatever the seed."""
         return model("aerial2d_target", TARGET, True)
 
-    other = partial(drawn_with, prior=prior)
-    return model("aerial2d", prior, False, pretraining=PRETRAINING, target=target, drawn_with=other)
+    other = partial(with_assets, prior=prior)
+    return model("aerial2d", prior, False, pretraining=PRETRAINING, target=target, with_assets=other)
 
 
 MODEL = aerial2d(assets=assets())

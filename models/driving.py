@@ -22,18 +22,19 @@ import pyro
 from probscene.derive import derive
 from probscene.mesh import Mesh, Surface
 from probscene.model import SceneModel
-from probscene.models import driving_grammars as structures
-from probscene.models.driving_backdrop import backdrop
-from probscene.models.driving_ground import fences, ground, slabs
-from probscene.models.driving_light import camera, light, photo
-from probscene.models.driving_nodes import Nodes
-from probscene.models.driving_things import things
-from probscene.models.mesh_folder import described, folder
-from probscene.models.street_assets import GROUPS, street
-from probscene.models.surfaces import surfaces
 from probscene.policy import Policy
 from probscene.scene import SceneGraph
 from probscene.world import Meshes, World
+
+from .assets.catalogue import GROUPS, street
+from .assets.meshes.folder import described, folder
+from .assets.surfaces import surfaces
+from .streets import grammars as structures
+from .streets.backdrop import backdrop
+from .streets.ground import fences, ground, slabs
+from .streets.light import camera, light, photo
+from .streets.nodes import Nodes
+from .streets.placement import things
 
 CANVAS = (188, 621)  # half of KITTI
 CLASSES = ("car", "van", "truck", "pedestrian", "cyclist", "pole", "sign", "object", "tree", "bush", "building")
@@ -72,7 +73,7 @@ def default_assets() -> str:
     return f"{described(os.path.abspath(path))} of PROBSCENE_ASSETS" if path else ""
 
 
-def drawn_with(path: str, scenario: str, **more) -> SceneModel:
+def with_assets(path: str, scenario: str, **more) -> SceneModel:
     """A scenario's model with meshes from a folder; ``more`` is as of ``driving``."""
     return driving(scenario, look=partial(assets, path=path), assets=described(path), **more)
 
@@ -131,9 +132,9 @@ def driving(
 
     name = f"driving_{scenario}" if prior == "tuned" else f"driving_{scenario}_{prior}"
     pretraining = structures.pretraining(scenario, prior, vehicles)
-    other = partial(drawn_with, scenario=scenario, prior=prior, canvas=canvas, vehicles=vehicles)
+    other = partial(with_assets, scenario=scenario, prior=prior, canvas=canvas, vehicles=vehicles)
     structure = structures.prior(scenario, prior, vehicles)
-    return model(name, structure, pretraining=pretraining, target=target, drawn_with=other)
+    return model(name, structure, pretraining=pretraining, target=target, with_assets=other)
 
 
 def scenarios(prior: str = "tuned", **more) -> dict[str, SceneModel]:

@@ -1,5 +1,5 @@
 """Driving scenes under the simple prior: 0 to 2 of everything, whatever the scenario (Meta-Sim2, supplement)."""
 
-from probscene.models.driving import SIMPLE
+from .driving import SIMPLE
 
 SCENARIOS = SIMPLE

@@ -19,10 +19,11 @@ from probscene.derive import derive
 from probscene.drawing import Drawing, Sprites
 from probscene.grammar import Grammar
 from probscene.model import SceneModel
-from probscene.models.digits import SIZE, Digits, Source, idx, shipped
 from probscene.policy import Policy
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, weights
+
+from .digits import SIZE, Digits, Source, idx, shipped
 
 GRAMMAR = Grammar("""
     Scene  -> bg Digits

@@ -4,8 +4,8 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from probscene.drawing import Drawing
-from probscene.world import World
+from .drawing import Drawing
+from .world import World
 
 
 class Space(NamedTuple):

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from probscene.grammar import Grammar
-from probscene.structure import StructurePrior
+from .grammar import Grammar
+from .structure import StructurePrior
 
 CRITICAL = 1 - 1e-6  # the table is float32: a spectral radius from here on counts as 1
 

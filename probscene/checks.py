@@ -9,14 +9,14 @@ import numpy as np
 import pyro
 import torch
 
-from probscene.branching import CRITICAL, Branching
-from probscene.derive import derive
-from probscene.enumeration import shortest_lengths
-from probscene.errors import GrammarError
-from probscene.grammar import Grammar
-from probscene.model import SceneModel
-from probscene.policy import Policy
-from probscene.structure import StructurePrior
+from .branching import CRITICAL, Branching
+from .derive import derive
+from .enumeration import shortest_lengths
+from .errors import GrammarError
+from .grammar import Grammar
+from .model import SceneModel
+from .policy import Policy
+from .structure import StructurePrior
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 LONGEST_LOOK = 1000  # rules; lengths beyond are not followed for a quantile

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from probscene.ahead import ahead
-from probscene.decoding import Fault, Part, Window, decoded, read, window
-from probscene.errors import DataError
+from .ahead import ahead
+from .decoding import Fault, Part, Window, decoded, read, window
+from .errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 LEAST_PART = 0.75  # of either side of an image, in its further views

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from probscene.errors import GrammarError
-from probscene.grammar import Grammar
+from .errors import GrammarError
+from .grammar import Grammar
 
 
 class Frontier(NamedTuple):

@@ -9,10 +9,10 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from probscene.derivation import Derivation, expand
-from probscene.errors import SamplingError
-from probscene.grammar import Grammar
-from probscene.policy import Policy, masked
+from .derivation import Derivation, expand
+from .errors import SamplingError
+from .grammar import Grammar
+from .policy import Policy, masked
 
 
 def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) -> Derivation:

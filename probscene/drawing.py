@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from probscene.errors import ModelError
+from .errors import ModelError
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,9 @@ Axis letters: N derivations, T steps.
 
 import torch
 
-from probscene.derivation import Derivation
-from probscene.errors import GrammarError
-from probscene.grammar import Grammar
+from .derivation import Derivation
+from .errors import GrammarError
+from .grammar import Grammar
 
 
 def enumerate_derivations(grammar: Grammar, max_steps: int, limit: int = 100_000) -> Derivation:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from probscene.errors import GrammarError
+from .errors import GrammarError
 
 _NAME = re.compile(r"[\w\-]+")
 _TOKEN = re.compile(r"\s*([\w\-]+|[()|])")

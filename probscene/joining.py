@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from probscene.drawing import Drawing, Layer
-from probscene.errors import ModelError
-from probscene.world import Ground, MeshLayer, World
+from .drawing import Drawing, Layer
+from .errors import ModelError
+from .world import Ground, MeshLayer, World
 
 
 def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor, Drawing | World]]) -> Drawing | World:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probscene.errors import ModelError
+from .errors import ModelError
 
 LARGEST = 200.0  # metres; what is larger was not made in metres
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from probscene.drawing import Drawing
-from probscene.errors import ModelError
-from probscene.grammar import Grammar
-from probscene.policy import Policy
-from probscene.world import World
+from .drawing import Drawing
+from .errors import ModelError
+from .grammar import Grammar
+from .policy import Policy
+from .world import World
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Groups:
         kind: the parent that makes a group, such as ``"road"``.
         along: the axis of the canvas along which groups follow one another, ``"x"`` or ``"y"``: from the left or from
             the top, by the middle of their boxes, in the order in which they are derived.
-        most: groups that are counted each for itself; objects of later ones are counted with the last.
+        max_groups: groups that are counted each for itself; objects of later ones are counted with the last.
 
     Raises:
         ModelError: another axis, or fewer than one group.
@@ -28,12 +28,13 @@ class Groups:
 
     kind: str
     along: str = "y"
-    most: int = 4
+    max_groups: int = 4
 
     def __post_init__(self):
-        if self.along not in ("x", "y") or self.most < 1:
+        if self.along not in ("x", "y") or self.max_groups < 1:
             raise ModelError(
-                f"Expected Groups along 'x' or 'y', at least 1 group, actual along {self.along!r}, most {self.most}."
+                f"Expected Groups along 'x' or 'y' with max_groups of at least 1, actual {self.along!r} and "
+                f"{self.max_groups}."
             )
 
 
@@ -52,7 +53,7 @@ class SceneModel:
         classes: the kinds that are labelled and counted, in the order of the categories.
         channels: 1 if colour carries nothing (images are then read as grey), else 3.
         assets: what it draws with beside its own code, in words; a run is bound to it.
-        drawn_with: ``drawn_with(folder)``, the same model drawn with what is in a folder, an absolute path; it looks
+        with_assets: ``with_assets(folder)``, the same model drawn with what is in a folder, an absolute path; it looks
             through all of it at once. None where there is nothing that could be replaced.
         groups: by what objects are counted; over the whole image where None.
         stuff: the classes of which photographs show no number: trees are a wood there, buildings a row. Where counts
@@ -76,7 +77,7 @@ class SceneModel:
     classes: tuple[str, ...]
     channels: int = 3
     assets: str = ""
-    drawn_with: Callable[[str], "SceneModel"] | None = None
+    with_assets: Callable[[str], "SceneModel"] | None = None
     groups: Groups | None = None
     stuff: tuple[str, ...] = ()
     pretraining: Policy | None = None

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from probscene.derivation import Derivation, Frontier
-from probscene.grammar import Grammar
+from .derivation import Derivation, Frontier
+from .grammar import Grammar
 
 MASKED = -1e9  # finite, so that a masked logit has no gradient that is NaN
 

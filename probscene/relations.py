@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from probscene.derivation import Derivation
-from probscene.grammar import Grammar
+from .derivation import Derivation
+from .grammar import Grammar
 
 
 class PerParent(NamedTuple):

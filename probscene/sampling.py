@@ -12,13 +12,13 @@ from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
-from probscene.derivation import Derivation
-from probscene.derive import derive_complete
-from probscene.drawing import Drawing
-from probscene.errors import ModelError
-from probscene.model import SceneModel
-from probscene.policy import Policy
-from probscene.world import World
+from .derivation import Derivation
+from .derive import derive_complete
+from .drawing import Drawing
+from .errors import ModelError
+from .model import SceneModel
+from .policy import Policy
+from .world import World
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Scenes:
     Attributes:
         derivation: their structures T.
         parameters: alpha, the values of the program's other sites, each ``(N, M)``, ``(N, 1)`` or with an event tail.
-        counted: where each parameter exists, the mask of its site, ``(N, M)`` or ``(N, 1)`` bool.
+        site_mask: where each parameter exists, the mask of its site, ``(N, M)`` or ``(N, 1)`` bool.
         log_prob: ``(N,)`` log q(alpha | T).
         drawing: what to render.
         failures: ``(N,)`` failed attempts at a complete derivation; zeros if the derivations were given.
@@ -36,7 +36,7 @@ class Scenes:
 
     derivation: Derivation
     parameters: dict[str, Tensor]
-    counted: dict[str, Tensor]
+    site_mask: dict[str, Tensor]
     log_prob: Tensor
     drawing: Drawing | World
     failures: Tensor
@@ -47,13 +47,13 @@ def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
 
     Raises:
         SamplingError: the policy hardly ever ends within the model's ``max_steps``.
-        ModelError: see ``realise``.
+        ModelError: see ``run_program``.
     """
     derivation, failures = derive_complete(model.grammar, policy, num_scenes, model.max_steps)
-    return realise(model, derivation, failures=failures)
+    return run_program(model, derivation, failures=failures)
 
 
-def realise(
+def run_program(
     model: SceneModel | Callable[[int], Drawing | World],
     derivation: Derivation,
     parameters: dict[str, Tensor] | None = None,
@@ -79,7 +79,7 @@ def realise(
             f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
             f"or scene.build(...)), actual {type(drawing).__name__}."
         )
-    values, counted = {}, {}
+    values, site_mask = {}, {}
     log_prob = torch.zeros(N)
     for key, site in trace.nodes.items():
         if site["type"] != "sample" or key in sites or site_is_subsample(site):
@@ -92,12 +92,12 @@ def realise(
             )
         logp = site["fn"].log_prob(value)
         mask = torch.ones(logp.shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(logp.shape)
-        values[key], counted[key] = value, mask
+        values[key], site_mask[key] = value, mask
         log_prob = log_prob + logp.where(mask, 0.0).sum(-1)
     return Scenes(
         derivation,
         values,
-        counted,
+        site_mask,
         log_prob,
         drawing,
         torch.zeros(N, dtype=torch.int64) if failures is None else failures,

@@ -16,17 +16,17 @@ from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from probscene.derivation import Derivation, Frontier, expand
-from probscene.derive import derive
-from probscene.drawing import Drawing
-from probscene.enumeration import shortest_lengths
-from probscene.errors import ModelError
-from probscene.grammar import Grammar, Node, Rule, is_nonterminal
-from probscene.joining import join_drawings
-from probscene.model import SceneModel
-from probscene.policy import Policy
-from probscene.structure import StructurePrior
-from probscene.world import World
+from .derivation import Derivation, Frontier, expand
+from .derive import derive
+from .drawing import Drawing
+from .enumeration import shortest_lengths
+from .errors import ModelError
+from .grammar import Grammar, Node, Rule, is_nonterminal
+from .joining import join_drawings
+from .model import SceneModel
+from .policy import Policy
+from .structure import StructurePrior
+from .world import World
 
 START = "Scenario"
 
@@ -181,9 +181,9 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         """The scenarios' own targets, joined."""
         return join(f"{name}_target", {key: model.target(seed) for key, model in models.items()}, weights)
 
-    def drawn_with(folder: str) -> SceneModel:
+    def with_assets(folder: str) -> SceneModel:
         """All scenarios drawn with one folder."""
-        return join(name, {key: model.drawn_with(folder) for key, model in models.items()}, weights)
+        return join(name, {key: model.with_assets(folder) for key, model in models.items()}, weights)
 
     return SceneModel(
         name,
@@ -195,7 +195,7 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         tuple(dict.fromkeys(c for model in each for c in model.classes)),
         channels=each[0].channels,
         assets="; ".join(dict.fromkeys(model.assets for model in each if model.assets)),
-        drawn_with=drawn_with if all(model.drawn_with for model in each) else None,
+        with_assets=with_assets if all(model.with_assets for model in each) else None,
         groups=groups.pop() if len(groups) == 1 else None,
         stuff=tuple(dict.fromkeys(c for model in each for c in model.stuff)),
         pretraining=pretraining,

@@ -11,22 +11,11 @@ import pyro
 import torch
 from torch import Tensor
 
-from probscene.derivation import Derivation
-from probscene.drawing import Drawing, Layer, Sprites, resolve
-from probscene.errors import ModelError
-from probscene.grammar import Grammar
-from probscene.world import (
-    Camera,
-    Ground,
-    Light,
-    Meshes,
-    MeshLayer,
-    Photo,
-    World,
-    resolve_ground,
-    resolve_meshes,
-    resolve_scene,
-)
+from .derivation import Derivation
+from .drawing import Drawing, Layer, Sprites, resolve
+from .errors import ModelError
+from .grammar import Grammar
+from .world import Camera, Ground, Light, Meshes, MeshLayer, Photo, World, resolve_ground, resolve_meshes, resolve_scene
 
 
 class SceneGraph:

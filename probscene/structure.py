@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from probscene.derivation import Frontier
-from probscene.errors import GrammarError
-from probscene.grammar import Grammar
-from probscene.policy import Policy
+from .derivation import Frontier
+from .errors import GrammarError
+from .grammar import Grammar
+from .policy import Policy
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from probscene.errors import ModelError
-from probscene.mesh import Mesh, Surface
+from .errors import ModelError
+from .mesh import Mesh, Surface
 
 KITTI_FOCAL, KITTI_CENTRE, KITTI_CANVAS, KITTI_HEIGHT = 721.5377, (609.5593, 172.854), (375, 1242), 1.65
 

@@ -20,15 +20,17 @@ import torch
 
 from probscene.batch import RenderBatch, Space
 from probscene.errors import ModelError
-from probscene.renderers import engine, shading_kernel
-from probscene.renderers import mesh_kernel as kernel
-from probscene.renderers import mesh_tables as tables
-from probscene.renderers.lane_kernel import LANES
-from probscene.renderers.mesh_atlas import MeshAtlas
-from probscene.renderers.mesh_instances import Instances, instances, names
-from probscene.renderers.shadow_kernel import SPARE
-from probscene.renderers.vertex_kernel import CORNER
 from probscene.world import World
+
+from . import engine
+from .mesh import tables
+from .mesh.atlas import MeshAtlas
+from .mesh.instances import Instances, instances, names
+from .mesh.kernels import draw as kernel
+from .mesh.kernels import shading as shading_kernel
+from .mesh.kernels.lanes import LANES
+from .mesh.kernels.shadows import SPARE
+from .mesh.kernels.vertices import CORNER
 
 _MAX_CANVAS = 1 << 24
 _SCENES = 64  # of one launch

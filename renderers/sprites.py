@@ -12,10 +12,11 @@ import torch
 
 from probscene.batch import RenderBatch
 from probscene.drawing import Drawing
-from probscene.renderers import engine
-from probscene.renderers import sprite_kernel as kernel
-from probscene.renderers.instances import Instances, instances
-from probscene.renderers.sheet import Sheet
+
+from . import engine
+from .sprite import kernel
+from .sprite.instances import Instances, instances
+from .sprite.sheet import Sheet
 
 _MAX_CANVAS = 1 << 26
 _CHUNK = 1 << 28  # pixels of one launch; the kernel's offsets are 32-bit

@@ -15,11 +15,12 @@ import typer
 from typer.core import TyperGroup
 
 import probscene
-from probscene.app.memory import keep_freed_memory
 from probscene.errors import ModelError, ProbsceneError
 
+from .memory import keep_freed_memory
+
 if TYPE_CHECKING:
-    from probscene.inference.presets import Preset
+    from .fitting.presets import Preset
 
 
 @dataclass
@@ -55,7 +56,7 @@ def explained(error: BaseException, words: list[str]) -> tuple[int, str]:
     if isinstance(error, KeyboardInterrupt):
         return 1, f"Interrupted; go on with: {again}"
     if isinstance(error, OSError):
-        from probscene.app.files import machine_error
+        from .files import machine_error
 
         error = machine_error(error, Path(error.filename or "the output"))
     if isinstance(error, ProbsceneError):
@@ -99,8 +100,9 @@ def _everywhere(
 @app.command()
 def check(model: Model, assets: Assets = None) -> None:
     """Say whether a model's grammar is sound, how long its derivations are, and what to mend."""
-    from probscene.app.loading import load_model
     from probscene.checks import check
+
+    from .loading import load_model
 
     report = check(load_model(model, assets))
     print(report)
@@ -118,7 +120,7 @@ def preview(
     assets: Assets = None,
 ) -> None:
     """Draw a grid of scenes: of a model's prior, or of what a run has learnt."""
-    from probscene.app.preview import preview
+    from .views.preview import preview
 
     preview(model_or_run, out, num, _seed(seed), boxes, assets)
     print(f"{num} scenes in {out}")
@@ -133,7 +135,7 @@ def view(
     assets: Assets = None,
 ) -> None:
     """Write scenes that one can turn: of a model's prior, or of what a run has learnt."""
-    from probscene.app.turnable import view
+    from .views.export import view
 
     view(model_or_run, out, num, _seed(seed), assets)
     print(f"{num} {'scene' if num == 1 else 'scenes'} in {out}")
@@ -169,9 +171,9 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Learn which structures occur in a folder of unlabelled images."""
-    from probscene.app import session
-    from probscene.app.display import Display
-    from probscene.app.loading import split_reference
+    from .fitting import session
+    from .loading import split_reference
+    from .progress import Display
 
     if seed is not None:
         _seed(seed)
@@ -217,9 +219,9 @@ def generate(
     workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
-    from probscene.app.display import Display
-    from probscene.app.generate import generate
-    from probscene.app.run import Run
+    from .datasets.generate import generate
+    from .fitting.run import Run
+    from .progress import Display
 
     with Display() as show:
         dataset = generate(Run.open(run), num, out, seed, workers, format or "coco", show.stage("generating"))
@@ -250,12 +252,14 @@ def evaluate(
     """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
     from rich.console import Console
 
-    from probscene.app import session, tables, verdict, verdict_text
-    from probscene.app.display import Display
-    from probscene.app.evaluate import evaluate
-    from probscene.app.files import make_folder, write_json
-    from probscene.app.labels import read_labels
-    from probscene.app.run import Run
+    from .evaluation import judge as verdict
+    from .evaluation.evaluate import evaluate
+    from .evaluation.labels import read_labels
+    from .files import make_folder, write_json
+    from .fitting import session
+    from .fitting.run import Run
+    from .progress import Display
+    from .views import tables, verdict_text
 
     opened = Run.open(run)
     opened.guide()
@@ -287,9 +291,9 @@ def report(
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
 ) -> None:
     """Write one self-contained HTML page about a run."""
-    from probscene.app.display import Display
-    from probscene.app.report import report
-    from probscene.app.run import Run
+    from .fitting.run import Run
+    from .progress import Display
+    from .views.report import report
 
     with Display() as show:
         path = report(Run.open(run), show, out, labels, num, scenes)
@@ -314,13 +318,15 @@ def compare(
     """Draw the prior, several runs and the truth side by side, and print how far each is from the truth."""
     from rich.console import Console
 
-    from probscene.app import compare, comparison_table, fit, mosaic, session
-    from probscene.app.display import Display
-    from probscene.app.files import make_folder, write_json
-    from probscene.app.labels import read_labels
+    from .evaluation import compare
+    from .evaluation.labels import read_labels
+    from .files import make_folder, write_json
+    from .fitting import fit, session
+    from .progress import Display
+    from .views import comparison, tables
 
     opened = compare.open_runs(runs)
-    mosaic.make_place(out)
+    comparison.make_place(out)
     first = next(iter(opened.values()))
     if json is not None:
         make_folder(json.parent)
@@ -332,8 +338,8 @@ def compare(
             images = fit.open_target(first, show)
         truth = None if labels is None else read_labels(labels, first.model, images, min_height=min_height)
         found = compare.compare(opened, images, truth, show, num)
-        mosaic.draw(found, out)
-    comparison_table.show(found, Console(highlight=False))
+        comparison.draw(found, out)
+    tables.show_comparison(found, Console(highlight=False))
     print(f"The picture is {out}")
     if json is not None:
         write_json(json, found.record())
@@ -344,7 +350,7 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")] = Path("demo"), seed: Seed = 0
 ) -> None:
     """The whole path on handwritten digits that come with the install; about five minutes on two cores."""
-    from probscene.app.demo import demo
+    from .demo import demo
 
     demo(out, _seed(seed))
 
@@ -364,16 +370,16 @@ def _seed(seed: int) -> int:
 def _preset(
     name: str | None, objective: str | None, guide: str | None, features: str | None, settings: list[str]
 ) -> "Preset":
-    from probscene.app.overrides import override
-    from probscene.inference.presets import preset
+    from .fitting.overrides import override
+    from .fitting.presets import preset
 
     chosen = preset(str(name or PresetName.default))
     if objective is not None:
-        chosen = chosen.toward(str(objective))
+        chosen = chosen.with_objective(str(objective))
     if guide is not None:
-        chosen = chosen.guided(str(guide))
+        chosen = chosen.with_guide(str(guide))
     if features is not None:
-        chosen = chosen.seeing(features)
+        chosen = chosen.with_features(features)
     return override(chosen, settings)
 
 

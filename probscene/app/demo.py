@@ -15,20 +15,23 @@ from pathlib import Path
 
 from rich.console import Console
 
-from probscene.app import report, session, tables
-from probscene.app.display import Display
-from probscene.app.evaluate import evaluate
-from probscene.app.files import make_folder, write_json
-from probscene.app.generate import generate, generate_scenes
-from probscene.app.labels import counts_of_dataset, read_labels, write_counts
-from probscene.app.loading import load_model
-from probscene.app.preview import pixels, scenes, side_by_side, write_picture
-from probscene.app.run import Run
-from probscene.app.verdict import judge
 from probscene.dataset import ImageFolder
 from probscene.errors import ModelError
-from probscene.inference.presets import QUICK, Preset
 from probscene.model import SceneModel
+
+from .datasets.generate import generate, generate_scenes
+from .evaluation.evaluate import evaluate
+from .evaluation.judge import judge
+from .evaluation.labels import counts_of_dataset, read_labels, write_counts
+from .files import make_folder, write_json
+from .fitting import session
+from .fitting.presets import QUICK, Preset
+from .fitting.run import Run
+from .loading import load_model
+from .pictures import pixels, side_by_side, write_picture
+from .progress import Display
+from .views import report, tables
+from .views.preview import scenes
 
 SAMPLES = 16  # images a grid
 

@@ -44,12 +44,12 @@ def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
     model = _loaded(reference)
     if assets is None:
         return model
-    if model.drawn_with is None:
+    if model.with_assets is None:
         raise ModelError(
             f"Expected a model that can be drawn with a folder of assets, actual {reference!r}, which has no "
-            "drawn_with; leave --assets out."
+            "with_assets; leave --assets out."
         )
-    return model.drawn_with(os.path.abspath(assets))
+    return model.with_assets(os.path.abspath(assets))
 
 
 def _loaded(reference: str) -> SceneModel:

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from probscene.app.cli import app
-from probscene.app.generate import generate_scenes
-from probscene.app.labels import counts_of_dataset, write_counts
+from probscene.app.datasets.generate import generate_scenes
+from probscene.app.evaluation.labels import counts_of_dataset, write_counts
 from probscene.app.loading import load_model
 
 DISCS = Path(__file__).with_name("discs.py")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from probscene.app.fitting.run import Run
 from probscene.app.loading import load_model
-from probscene.app.run import Run
 from probscene.errors import DataError, ModelError, RunError
-from probscene.models.street_assets import street
+from probscene.models.assets.catalogue import street
 
 SLAB = "".join(f"v {x} {y} {z}\n" for x in (-0.9, 0.9) for y in (0, 1.5) for z in (-2.2, 2.2)) + (
     "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
@@ -53,11 +53,11 @@ def test_aerial_pictures(tmp_path):
         Image.fromarray(np.full((*size[::-1], 4), 255, np.uint8)).save(tmp_path / kind / "a.png")
     model = load_model("aerial2d", tmp_path)
     assert model.assets == f"pictures in {tmp_path}" and model.target(0).assets == model.assets
-    assert model.drawn_with(str(tmp_path))(2).kinds == model.grammar.kinds
+    assert model.with_assets(str(tmp_path))(2).kinds == model.grammar.kinds
 
 
 def test_a_model_without_assets_says_so(tmp_path, discs):
-    with pytest.raises(ModelError, match="which has no drawn_with; leave --assets out"):
+    with pytest.raises(ModelError, match="which has no with_assets; leave --assets out"):
         load_model(str(discs.file), tmp_path)
 
 
@@ -87,7 +87,7 @@ def test_a_run_is_bound_to_what_is_in_the_folder(tmp_path, fresh_folders):
 @pytest.fixture
 def fresh_folders():
     """What a new process has: no folder read yet."""
-    from probscene.models.mesh_folder import described, folder
+    from probscene.models.assets.meshes.folder import described, folder
 
     def forget():
         folder.cache_clear()

@@ -17,12 +17,13 @@ import torch
 from PIL import Image
 
 import probscene
-from probscene.app import cli, fit
-from probscene.app.overrides import override
-from probscene.app.run import Run
+from probscene.app import cli
+from probscene.app.fitting import fit
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.presets import OBJECTIVES, PRESETS, QUICK
+from probscene.app.fitting.run import Run
 from probscene.errors import ProbsceneError
-from probscene.inference.guide import GUIDES
-from probscene.inference.presets import OBJECTIVES, PRESETS, QUICK
+from probscene.inference.guides.lstm import GUIDES
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -374,7 +375,7 @@ def test_an_output_that_cannot_be_written(call, discs, fitted, target, tmp_path)
 
 def test_a_bug_is_one_line_and_a_traceback_on_demand(call, discs, tmp_path, monkeypatch):
     monkeypatch.delenv("PROBSCENE_DEBUG", raising=False)
-    monkeypatch.setattr("probscene.app.preview.grid", lambda images: 1 / 0)
+    monkeypatch.setattr("probscene.app.views.preview.grid", lambda images: 1 / 0)
     words = ["preview", discs.file, "--out", tmp_path / "g.png"]
     check_fault(call(*words), 1, "A bug in probscene: ZeroDivisionError: division by zero", "--debug preview")
     for debugging in (["--debug", *words], words):
@@ -450,7 +451,7 @@ def test_interrupted_before_the_run_exists_the_same_command_is_named(call, discs
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("probscene.app.session.ImageFolder", interrupt)
+    monkeypatch.setattr("probscene.app.fitting.session.ImageFolder", interrupt)
     words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run"]
     result = call(*words)
     assert result.code == 1 and not (tmp_path / "run").exists()

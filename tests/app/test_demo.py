@@ -7,12 +7,12 @@ import pytest
 from PIL import Image
 
 from probscene.app import demo as module
-from probscene.app import session
 from probscene.app.demo import demo
-from probscene.app.overrides import override
-from probscene.app.run import Run
+from probscene.app.fitting import session
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.presets import QUICK
+from probscene.app.fitting.run import Run
 from probscene.errors import DataError, ModelError
-from probscene.inference.presets import QUICK
 
 SHORT = override(
     QUICK, ["count.steps=16", "count.images=4", "count.crops=4", "width=4,8,8", "batches=2", "num_scenes=20",

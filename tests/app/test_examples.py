@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from probscene.app.generate import generate_scenes
+from probscene.app.datasets.generate import generate_scenes
+from probscene.app.fitting.run import Run
 from probscene.app.loading import load_model
-from probscene.app.run import Run
 
 TABLETOP = Path(__file__).resolve().parents[2] / "examples" / "tabletop.py"
 

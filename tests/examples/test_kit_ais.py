@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probscene.app.labels import read_labels
+from probscene.app.evaluation.labels import read_labels
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 

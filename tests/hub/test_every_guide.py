@@ -9,7 +9,7 @@ from pyro import poutine
 
 from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
-from probscene.inference.guide import GUIDES, make_guide
+from probscene.inference.guides.lstm import GUIDES, make_guide
 from probscene.policy import Policy
 
 FLAT = Grammar("Scene -> A B | x\nA -> y(B) | z\nB -> y | B2 | ε\nB2 -> x | y")  # 21 derivations

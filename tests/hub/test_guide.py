@@ -13,7 +13,7 @@ from pyro import poutine
 from probscene.derivation import Derivation
 from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
-from probscene.inference.guide import LSTMGuide
+from probscene.inference.guides.lstm import LSTMGuide
 
 FLAT = Grammar("Scene -> A B | x\nA -> y(B) | z\nB -> y | B2 | ε\nB2 -> x | y")
 LISTS = Grammar("Scene -> bg Items\nItems -> Item Items | ε\nItem -> x(Things) | y\nThings -> z Things | ε")

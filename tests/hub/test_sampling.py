@@ -15,7 +15,7 @@ from probscene.drawing import Sprites
 from probscene.errors import ModelError, SamplingError
 from probscene.grammar import Grammar
 from probscene.model import SceneModel
-from probscene.sampling import log_prob, realise, sample, seed_everything
+from probscene.sampling import log_prob, run_program, sample, seed_everything
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, weights
 
@@ -78,12 +78,12 @@ def test_log_prob_of_structure_and_parameters(reference, seed, num_scenes):
 def test_the_same_parameters_make_the_same_scenes(seed):
     seed_everything(seed)
     scenes = sample(MODEL, PRIOR, 5)
-    again = realise(MODEL, scenes.derivation, scenes.parameters)
+    again = run_program(MODEL, scenes.derivation, scenes.parameters)
     assert torch.equal(again.log_prob, scenes.log_prob)
     for one, other in zip(scenes.drawing.layers, again.drawing.layers, strict=True):
         for name in ("present", "x", "y", "tint"):
             assert torch.equal(getattr(one, name), getattr(other, name))
-    fresh = realise(MODEL, scenes.derivation, {"plate.x": scenes.parameters["plate.x"]})
+    fresh = run_program(MODEL, scenes.derivation, {"plate.x": scenes.parameters["plate.x"]})
     assert torch.equal(fresh.drawing.layers[0].x, scenes.drawing.layers[0].x)
     assert not torch.equal(fresh.parameters["light"], scenes.parameters["light"])
 
@@ -91,9 +91,9 @@ def test_the_same_parameters_make_the_same_scenes(seed):
 def test_parameters_count_where_their_nodes_are():
     scenes = sample(MODEL, PRIOR, 30)
     kind = scenes.derivation.kind
-    assert torch.equal(scenes.counted["plate.x"], kind == GRAMMAR.kind("plate"))
-    assert torch.equal(scenes.counted["mug.dx"], (kind == GRAMMAR.kind("mug")) | (kind == GRAMMAR.kind("spoon")))
-    assert scenes.counted["light"].shape == (30, 1) and scenes.counted["light"].all()
+    assert torch.equal(scenes.site_mask["plate.x"], kind == GRAMMAR.kind("plate"))
+    assert torch.equal(scenes.site_mask["mug.dx"], (kind == GRAMMAR.kind("mug")) | (kind == GRAMMAR.kind("spoon")))
+    assert scenes.site_mask["light"].shape == (30, 1) and scenes.site_mask["light"].all()
     assert torch.equal(scenes.drawing.kind, kind) and (scenes.failures == 0).all()
 
 

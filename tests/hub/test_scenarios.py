@@ -17,10 +17,10 @@ from probscene.drawing import Sprites
 from probscene.enumeration import enumerate_derivations
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
-from probscene.inference.scenario_guide import ScenarioGuide
+from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.model import Groups, SceneModel
 from probscene.policy import Policy
-from probscene.sampling import log_prob, realise, sample
+from probscene.sampling import log_prob, run_program, sample
 from probscene.scenarios import JointGrammar, Mixture, join
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, ranked, weights
@@ -158,10 +158,10 @@ def test_scenes_of_the_joint_model_are_those_of_the_scenarios():
         sites = [site for site in scenes.parameters if site.startswith(f"{name}/")]
         assert len(sites) == len(model.grammar.kinds)
         values = {site.split("/")[1]: scenes.parameters[site][rows][:, :M] for site in sites}
-        alone = realise(model, own, values)
+        alone = run_program(model, own, values)
         total[rows] = alone.log_prob
         for site in sites:
-            counted = scenes.counted[site][rows]
+            counted = scenes.site_mask[site][rows]
             assert torch.equal(counted[:, :M], alone.counted[site.split("/")[1]]) and not counted[:, M:].any()
         drawn = {}
         for drawing, which, names in (

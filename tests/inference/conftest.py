@@ -9,7 +9,7 @@ from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
-from probscene.inference.features import class_table, examples
+from probscene.inference.features.base import class_table, examples
 from probscene.model import SceneModel
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample

@@ -10,7 +10,7 @@ from scipy.stats import gaussian_kde as scipy_kde
 from probscene.errors import ProbsceneError
 from probscene.inference import divergence as module
 from probscene.inference.divergence import MMD, Blockwise, JensenShannon, KDELogRatio, gaussian_kde
-from probscene.inference.guide import LSTMGuide
+from probscene.inference.guides.lstm import LSTMGuide
 
 
 @given(st.integers(1, 4), st.integers(6, 60), st.integers(2, 20), st.floats(0.05, 5.0), st.integers(0, 2**31))

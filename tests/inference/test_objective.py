@@ -8,13 +8,13 @@ import torch
 from pyro.infer import SVI
 from pyro.optim import Adam
 
+from probscene.app.fitting.presets import QUICK
 from probscene.enumeration import enumerate_derivations
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
-from probscene.inference.guide import LSTMGuide
-from probscene.inference.learn import Learner
+from probscene.inference.guides.lstm import LSTMGuide
+from probscene.inference.learn import Trainer
 from probscene.inference.objective import FAR, ScoreFunction
-from probscene.inference.presets import QUICK
 from probscene.structure import StructurePrior, counts
 
 
@@ -115,10 +115,10 @@ def test_each_objective_descends_toward_the_target(small, objective):
 def test_each_objective_learns_from_samples(small, objective):
     torch.manual_seed(0)
     guide = LSTMGuide(small.grammar, 4, hidden=16)
-    preset = replace(QUICK, variance=0.2, marginal_variance=None).toward(objective)
+    preset = replace(QUICK, variance=0.2, marginal_variance=None).with_objective(objective)
     loss = ScoreFunction(structure_features(small), preset.divergence(), preset.baseline, updates=preset.updates)
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
-    Learner(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=preset.learning_rate).run()
+    Trainer(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=preset.learning_rate).run()
     with torch.no_grad():
         assert 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item() < 0.12
 
@@ -170,7 +170,7 @@ def test_leaked_probability_is_drawn_back(dots):
     exact = gradients(0.5 * 3.0 * failures**2, guide)
     loss = ScoreFunction(
         lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
-        reject_weight=0.0, leak_weight=3.0,
+        reject_weight=0.0, incompletion_weight=3.0,
     )  # fmt: skip
     assert_estimates(lambda: gradients(loss(dots, guide, 4000, real=None), guide), exact)
 
@@ -178,11 +178,11 @@ def test_leaked_probability_is_drawn_back(dots):
 def test_an_anchor_draws_toward_its_policy(small):
     """The gradient of the weighted KL from the anchor, exactly."""
     pyro.set_rng_seed(4)
-    guide, anchor = LSTMGuide(small.grammar, 4, hidden=8), StructurePrior(small.grammar)
+    guide, prior = LSTMGuide(small.grammar, 4, hidden=8), StructurePrior(small.grammar)
     log_q = guide.log_prob(small.derivations)
-    exact = gradients(0.5 * (log_q.exp() * (log_q - anchor.log_prob(small.derivations))).sum(), guide)
+    exact = gradients(0.5 * (log_q.exp() * (log_q - prior.log_prob(small.derivations))).sum(), guide)
     loss = ScoreFunction(
-        structure_features(small), lambda g, r: torch.zeros(len(g)), anchor=anchor, anchor_weight=0.5
+        structure_features(small), lambda g, r: torch.zeros(len(g)), prior=prior, prior_kl_weight=0.5
     )  # fmt: skip
     assert_estimates(lambda: gradients(loss(small.program, guide, 4000, real=None), guide), exact)
 
@@ -190,7 +190,7 @@ def test_an_anchor_draws_toward_its_policy(small):
 def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
     loss = ScoreFunction(
         lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
-        anchor=StructurePrior(dots.grammar, Things=counts(1.0)), anchor_weight=0.1,
+        prior=StructurePrior(dots.grammar, Things=counts(1.0)), prior_kl_weight=0.1,
     )  # fmt: skip
     pyro.set_rng_seed(5)
     loss(dots, LSTMGuide(dots.grammar, 12, hidden=8), 200, real=None)

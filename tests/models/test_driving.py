@@ -13,10 +13,10 @@ from scipy.stats import kstest
 
 from probscene.app.loading import load_model, renderer_for
 from probscene.models.driving import SCENARIOS, SIMPLE, assets, driving
-from probscene.models.driving_grammars import grammar
-from probscene.models.driving_layout import STRIPS, in_line
-from probscene.models.driving_parameters import PARAMETERS
-from probscene.sampling import realise, sample, seed_everything
+from probscene.models.streets.grammars import grammar
+from probscene.models.streets.layout import STRIPS, in_line
+from probscene.models.streets.parameters import PARAMETERS
+from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
 
 TOLERANCE = 0.01  # metres by which rectangles on the ground may overlap
@@ -209,7 +209,7 @@ def test_a_seed_gives_the_same_scenes_and_parameters_keep_to_their_ranges(model)
         assert (value[counted] >= low).all() and (value[counted] <= high).all()
         expected -= counted.sum(1) * math.log(high - low)
     assert torch.allclose(a.log_prob, expected, atol=1e-2, rtol=1e-4)
-    again = realise(model, a.derivation, a.parameters)
+    again = run_program(model, a.derivation, a.parameters)
     assert torch.equal(again.drawing.layers[0].x, a.drawing.layers[0].x)
 
 
@@ -235,7 +235,7 @@ def test_a_canvas_of_any_size_sees_the_same_street():
     small, large = driving("city"), driving("city", canvas=(375, 1242))
     seed_everything(3)
     a = sample(small, small.prior, 3)
-    b = realise(large, a.derivation, a.parameters)
+    b = run_program(large, a.derivation, a.parameters)
     assert torch.allclose(2 * a.drawing.camera.focal, b.drawing.camera.focal)
     assert torch.equal(a.drawing.layers[0].x, b.drawing.layers[0].x)
 

@@ -10,7 +10,7 @@ from scipy.stats import chisquare
 from probscene.checks import check, check_grammar
 from probscene.derive import derive_complete
 from probscene.models.driving import SCENARIOS, SIMPLE
-from probscene.models.driving_grammars import (
+from probscene.models.streets.grammars import (  # fmt: skip
     BOUNDS,
     FAR,
     LONGEST,
@@ -22,10 +22,8 @@ from probscene.models.driving_grammars import (
     prior,
     target,
     vehicle_numbers,
-)  # fmt: skip
-from probscene.models.driving_grammars import (
-    SIMPLE as SIMPLE_BOUNDS,
 )
+from probscene.models.streets.grammars import SIMPLE as SIMPLE_BOUNDS
 from probscene.relations import per_parent, relations
 
 EACH = tuple(SCENARIOS)

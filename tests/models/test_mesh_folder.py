@@ -17,8 +17,8 @@ import trimesh
 from PIL import Image
 
 from probscene.errors import DataError
-from probscene.models.mesh_folder import SIZES, described, folder
-from probscene.models.street_assets import DECORATION, KINDS, street
+from probscene.models.assets.catalogue import DECORATION, KINDS, street
+from probscene.models.assets.meshes.folder import SIZES, described, folder
 
 TO_Y_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # x forward, y left, z up to z forward, x left, y up
 CAR = (4.4, 1.8, 1.5)
@@ -382,7 +382,7 @@ def test_folders_that_cannot_be_used(tmp_path):
 
 
 def test_trimesh_is_imported_only_to_read_a_mesh():
-    program = "import sys, probscene.models.mesh_folder; assert 'trimesh' not in sys.modules"
+    program = "import sys, probscene.models.assets.meshes.folder; assert 'trimesh' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
 
 

@@ -13,7 +13,7 @@ from probscene.checks import check
 from probscene.models.digits import shipped
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL, default_digits, target
 from probscene.renderers.sprites import SpriteRenderer
-from probscene.sampling import realise, sample, seed_everything
+from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
 
 DIGITS = [GRAMMAR.kind(name) for name in CLASSES]
@@ -64,7 +64,7 @@ def test_the_prior_places_digits_uniformly_and_independently():
     present = scenes.drawing.layers[0].present
     inside = {}
     for name, value in scenes.parameters.items():
-        assert (scenes.counted[name] == present).all()
+        assert (scenes.site_mask[name] == present).all()
         low, width = {"angle": (-math.pi / 6, math.pi / 3), "exemplar": (0, 1)}.get(name.split(".")[1], (20, 216))
         inside[name] = ((value[present] - low) / width).numpy()
         assert kstest(inside[name], "uniform").pvalue > 1e-3
@@ -85,7 +85,7 @@ def test_no_glyph_leaves_the_canvas_at_the_ends_of_the_range(x, angle):
     derivation = sample(MODEL, MODEL.prior, 8).derivation
     shape = derivation.kind.shape
     ends = {"digit.x": x, "digit.y": x, "digit.angle": angle}
-    layer = realise(MODEL, derivation, {k: torch.full(shape, v) for k, v in ends.items()}).drawing.layers[0]
+    layer = run_program(MODEL, derivation, {k: torch.full(shape, v) for k, v in ends.items()}).drawing.layers[0]
     assert ((corners(layer) >= 0) & (corners(layer) <= 256)).all()
 
 

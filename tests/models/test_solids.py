@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.models.solids import (
+from probscene.models.assets.solids import (
     ball,
     box,
     circle,

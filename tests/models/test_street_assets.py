@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from probscene.models.linings import LENGTHS
-from probscene.models.street_assets import DECORATION, GROUPS, KINDS, street
-from probscene.models.surfaces import ASPHALTS, DASH, MARKING, PITCH, surfaces
+from probscene.models.assets.catalogue import DECORATION, GROUPS, KINDS, street
+from probscene.models.assets.kerbs import LENGTHS
+from probscene.models.assets.surfaces import ASPHALTS, DASH, MARKING, PITCH, surfaces
 
 # Length, width and height in metres, and triangles: the least and the most.
 EXPECTED = {

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probscene.mesh import Surface
+from probscene.renderers.mesh.texture_atlas import TextureAtlas
 from probscene.renderers.meshes import MeshRenderer
-from probscene.renderers.texture_atlas import TextureAtlas
 from probscene.world import Camera, Ground, Light, Meshes, Photo
 
 CANVAS = (188, 300)

@@ -10,10 +10,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.meshes import MeshReference
 
 from probscene.errors import ModelError
 from probscene.renderers import meshes as meshes_module
-from probscene.renderers.mesh_reference import MeshReference
 from probscene.renderers.meshes import MeshRenderer
 from probscene.world import KITTI_CANVAS, Camera, Light, Meshes, Photo, resolve_scene
 
@@ -174,7 +174,7 @@ def test_nothing_is_left_of_the_world_before(shapes, monkeypatch):
     batches = [RENDERER(world) for world in worlds]
     renderer = MeshRenderer(CANVAS, threads=1)
     assert all(shapes.same(renderer(worlds[i]), batches[i]) for i in (0, 2, 1, 0))
-    monkeypatch.setattr("probscene.renderers.mesh_atlas._FACES", 0)  # forget the meshes at every call
+    monkeypatch.setattr("probscene.renderers.mesh.atlas._FACES", 0)  # forget the meshes at every call
     renderer = MeshRenderer(CANVAS, threads=1)
     assert all(shapes.same(renderer(worlds[i]), batches[i]) for i in (0, 2, 1, 0))
 

@@ -1,0 +1,1 @@
+"""Networks that count the objects of an image."""

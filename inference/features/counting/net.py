@@ -1,0 +1,168 @@
+"""A network that counts: how many objects of each class an image shows, wherever they stand.
+
+Fully convolutional, so it is indifferent to place. Every cell of a coarse map holds a distribution over background and
+classes; an object spreads one unit over the four cells nearest to its centre, and the features are the sums of the map:
+soft counts of each class, and their total; or, where the model counts by groups, the number of groups and the soft
+counts in each of them, in order: three more channels then say whether a cell shows a group, where its middle is,
+and where the middle of the group is that the cell's object belongs to (``grouping``). Not in the paper, whose presence
+network (``presence_net``) never learns which classes there are in the time that a laptop has, and whose totals keep
+nothing of what counts depend on. ``count_training`` trains it.
+"""
+
+import copy
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from probscene.model import Groups
+
+from ..base import enter
+from .grouping import tally_groups
+
+STRIDE = 8  # pixels of the reduced image a cell
+BORDER = STRIDE // 2  # clear pixels around a reduced image, so that objects at its edge have cells on either side
+
+
+class CountNet(nn.Module):
+    """Soft counts of the classes and their total, D = classes + 1; of groups, D = 1 + (classes - 1) * max_groups.
+
+    Args:
+        classes: the kinds that are counted.
+        channels: of the image, 1 or 3.
+        canvas: height and width of the images; they are reduced by 2, 4 or 8 to about 128, unless ``fit_to`` says less.
+        width: channels at strides 2, 4 and 8.
+        blocks: residual blocks at strides 4 and 8.
+        groups: by what objects are counted; over the whole image where None.
+
+    Attributes:
+        unit: objects that 1 in a feature stands for.
+    """
+
+    unit = 1.0
+
+    def __init__(
+        self,
+        classes: tuple[str, ...],
+        channels: int,
+        canvas: tuple[int, int],
+        width: tuple[int, int, int] = (16, 32, 64),
+        blocks: tuple[int, int] = (1, 1),
+        groups: Groups | None = None,
+    ):
+        super().__init__()
+        self.groups = groups
+        self.group_class = -1 if groups is None else classes.index(groups.kind)
+        self.objects = tuple(name for i, name in enumerate(classes) if i != self.group_class)
+        self.names = (*classes, "total")
+        if groups is not None:
+            each = (f"{name} {number + 1}" for number in range(groups.max_groups) for name in self.objects)
+            self.names = (groups.kind, *each)
+        self.channels, self.canvas = channels, canvas
+        reduction = min(8, 2 ** max(0, round(math.log2(max(canvas) / 128))))
+        self.register_buffer("reduction", torch.tensor(reduction))
+        a, b, c = width
+        self.body = nn.Sequential(
+            *_conv(channels, a, 5, 2),
+            *_conv(a, b, 3, 2),
+            *(_Residual(b) for _ in range(blocks[0])),
+            *_conv(b, c, 3, 2),
+            *(_Residual(c) for _ in range(blocks[1])),
+            nn.Conv2d(c, 1 + len(self.objects) + (0 if groups is None else 3), 1),
+        )
+        self.register_buffer("group_cells", torch.ones(()))  # cells that an ordinary group covers
+        with torch.no_grad():  # start from "nothing here", which nearly every cell holds
+            self.body[-1].weight.mul_(0.3)
+            self.body[-1].bias.zero_()
+            self.body[-1].bias[0] = 3.0
+        self._fused: nn.Module | None = None
+
+    @property
+    def reduce(self) -> int:
+        """By how much images are reduced."""
+        return int(self.reduction)
+
+    def fit_to(self, size: float) -> None:
+        """Reduce images so much less that objects of ``size`` pixels keep 6: below that too many share a cell."""
+        while self.reduce > 1 and size / self.reduce < 6:
+            self.reduction //= 2
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Logits of the cells ``(N, 1 + objects, h, w)`` of reduced images ``x (N, C, 8h, 8w)``.
+
+        If there are groups, three more channels: the logit that a cell shows a group, how many cells away that group's
+        middle is, and how many that of the group of the object that the cell holds.
+        """
+        return self.body(x.contiguous(memory_format=torch.channels_last))
+
+    def enter(self, images: Tensor) -> Tensor:
+        """Reduced images with a clear border, padded to whole cells."""
+        x = enter(images, self.channels, self.reduce)
+        right, below = ((-n - 2 * BORDER) % STRIDE + BORDER for n in (x.shape[-1], x.shape[-2]))
+        return F.pad(x, (BORDER, right, BORDER, below))
+
+    @torch.no_grad()
+    def embed(self, images: Tensor) -> Tensor:
+        """``(N, D)`` soft counts, drawn toward whole numbers, of ``(N, 1 or 3, H, W)`` uint8 images."""
+        if self._fused is None:
+            self._fused = _fuse(self.body)
+        out = []
+        for some in images.split(64):
+            x = self.enter(some).contiguous(memory_format=torch.channels_last)
+            out.append(self._read(self._fused(x)))
+        return toward_whole(torch.cat(out)) if out else torch.zeros(0, len(self.names))
+
+    def _read(self, logits: Tensor) -> Tensor:
+        number = 1 + len(self.objects)
+        objects = logits[:, :number].softmax(1)[:, 1:]
+        if self.groups is None:
+            counts = objects.sum((2, 3))
+            return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
+        height, width = logits.shape[2:]
+        size = height if self.groups.along == "y" else width
+        here = (torch.arange(size) + 0.5).view(-1, 1) if self.groups.along == "y" else torch.arange(size) + 0.5
+        surface, way, pull = logits[:, number:].unbind(1)
+        votes = STRIDE * (here + way), STRIDE * (here + pull)
+        length, mass, number = size * STRIDE, float(self.group_cells), self.groups.max_groups
+        return tally_groups(objects, surface.sigmoid(), *votes, length, mass, number)
+
+    def train(self, mode: bool = True) -> "CountNet":
+        """As in torch; what inference has fused is made anew."""
+        self._fused = None
+        return super().train(mode)
+
+
+def toward_whole(counts: Tensor) -> Tensor:
+    """Soft counts drawn toward the nearest whole number, smoothly and in order: ``x - sin(2 pi x) / (2 pi)``.
+
+    Objects unlike any in the prior's renders count a few hundredths less each; what adds up over an image is taken back
+    here, so that an image of seven is like a render of seven and not like a mixture of six and seven.
+    """
+    return counts - torch.sin(2 * math.pi * counts) / (2 * math.pi)
+
+
+def _conv(inner: int, outer: int, size: int, stride: int) -> list[nn.Module]:
+    convolution = nn.Conv2d(inner, outer, size, stride, size // 2, bias=False)
+    return [convolution, nn.BatchNorm2d(outer), nn.ReLU(inplace=True)]
+
+
+class _Residual(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.a, self.b = nn.Sequential(*_conv(width, width, 3, 1)), nn.Sequential(*_conv(width, width, 3, 1)[:2])
+        nn.init.zeros_(self.b[1].weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.b(self.a(x)), inplace=True)
+
+
+def _fuse(body: nn.Module) -> nn.Module:
+    """A copy for inference with every batch norm folded into the convolution before it."""
+    fused = copy.deepcopy(body).eval()
+    for parent in [m for m in fused.modules() if isinstance(m, nn.Sequential)]:
+        for i, (first, second) in enumerate(zip(list(parent), list(parent)[1:], strict=False)):
+            if isinstance(first, nn.Conv2d) and isinstance(second, nn.BatchNorm2d):
+                parent[i], parent[i + 1] = fuse_conv_bn_eval(first, second), nn.Identity()
+    return fused.to(memory_format=torch.channels_last)

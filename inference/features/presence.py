@@ -1,0 +1,154 @@
+"""The paper's feature network: which classes an image shows (Meta-Sim2, supplement).
+
+Six residual blocks of two 3x3 convolutions with batch norm and leaky ReLU, average pooling, three fully connected
+layers; binary presences under sigmoid cross-entropy. The features are the average pool and the first two fully
+connected layers. Widths are not given in the paper and are arguments here; grey images are copied to three channels.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from probscene.errors import ProbsceneError
+from probscene.sampling import seed_everything
+
+from ..training import batch_seed, restore_training, training_state
+from .base import Draw, Examples
+
+LAST = torch.channels_last  # in memory; half as fast again on a CPU
+
+
+class PresenceNet(nn.Module):
+    """Features: average pool, first and second fully connected layer, D = 4 width + 2 hidden.
+
+    Args:
+        classes: whose presence is learnt.
+        width: channels of the first two blocks; the next two have twice, the last two four times as many.
+        hidden: units of the first two fully connected layers.
+    """
+
+    def __init__(self, classes: tuple[str, ...], width: int = 8, hidden: int = 64):
+        super().__init__()
+        widths = [width, width, 2 * width, 2 * width, 4 * width, 4 * width]
+        inner = [3, *widths[:-1]]
+        self.blocks = nn.Sequential(*(_Block(i, o) for i, o in zip(inner, widths, strict=True)))
+        self.fc1, self.fc2 = nn.Linear(widths[-1], hidden), nn.Linear(hidden, hidden)
+        self.out = nn.Linear(hidden, len(classes))
+        self.names = tuple(
+            [f"pool_{i}" for i in range(widths[-1])] + [f"fc{j}_{i}" for j in (1, 2) for i in range(hidden)]
+        )
+
+    def layers(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Features ``(N, D)`` and presence logits ``(N, classes)`` of uint8 images ``(N, 1 or 3, H, W)``."""
+        pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous(memory_format=LAST).float() / 255).mean((2, 3))
+        first = F.leaky_relu(self.fc1(pool), 0.01)
+        second = F.leaky_relu(self.fc2(first), 0.01)
+        return torch.cat([pool, first, second], 1), self.out(second)
+
+    @torch.no_grad()
+    def embed(self, images: Tensor) -> Tensor:
+        """``(N, D)`` features of ``(N, 1 or 3, H, W)`` uint8 images."""
+        parts = [self.layers(some)[0] for some in images.split(50)]
+        return torch.cat(parts) if parts else torch.zeros(0, len(self.names))
+
+
+class _Block(nn.Module):
+    """Halves the image; a 1x1 convolution carries the shortcut."""
+
+    def __init__(self, inner: int, outer: int):
+        super().__init__()
+        self.a, self.na = nn.Conv2d(inner, outer, 3, 2, 1, bias=False), nn.BatchNorm2d(outer)
+        self.b, self.nb = nn.Conv2d(outer, outer, 3, 1, 1, bias=False), nn.BatchNorm2d(outer)
+        self.shortcut = nn.Conv2d(inner, outer, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.leaky_relu(self.na(self.a(x)), 0.01)
+        # Not a stride in the convolution: with 3 channels, last in memory, torch 2.14 then writes outside its buffers.
+        return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x[..., ::2, ::2].contiguous(memory_format=LAST)), 0.01)
+
+
+class PresenceTraining:
+    """Adam on one fixed set of prior renders until 75 % of the presences are right, at most ``epochs`` (supplement).
+
+    Args:
+        net: trained in place.
+        draw: labelled prior renders.
+        images, epochs, batch_size, learning_rate, accuracy: the paper's are the defaults.
+        seed: of everything random.
+
+    Attributes:
+        done: epochs taken; ``steps`` of them at most.
+    """
+
+    def __init__(
+        self,
+        net: PresenceNet,
+        draw: Draw,
+        images: int = 5000,
+        epochs: int = 10,
+        batch_size: int = 50,
+        learning_rate: float = 1e-3,
+        accuracy: float = 0.75,
+        seed: int = 0,
+    ):
+        self.net, self.draw, self.seed = net, draw, seed
+        self.images, self.steps, self.batch_size, self.accuracy = images, epochs, batch_size, accuracy
+        self.optimiser = torch.optim.Adam(net.parameters(), lr=learning_rate)
+        self.done, self.reached = 0, 0.0
+
+    def run(self, each: Callable[["PresenceTraining", float], None] | None = None) -> None:
+        """Take the epochs that are left; ``each`` sees the training and the mean loss after every one.
+
+        Raises:
+            ProbsceneError: the loss, or a parameter, is no longer finite.
+        """
+        seed_everything(batch_seed(self.seed, 0))
+        classes = self.net.out.out_features
+        image, present = None, torch.zeros(self.images, classes)
+        for start in range(0, self.images, 250):  # kept as bytes: 5,000 images of 256 x 256 are 1 GB
+            part = self.draw(min(250, self.images - start))
+            if image is None:
+                image = torch.empty(self.images, *part.image.shape[1:], dtype=torch.uint8)
+            image[start : start + 250] = part.image
+            present[start : start + 250] = _present(part, classes)
+        self.net.train()
+        while self.done < self.steps and self.reached < self.accuracy:
+            seed_everything(batch_seed(self.seed, 1, self.done))
+            total, right = 0.0, 0.0
+            for rows in torch.randperm(len(image)).split(self.batch_size):
+                logits = self.net.layers(image[rows])[1]
+                loss = F.binary_cross_entropy_with_logits(logits, present[rows])
+                self.optimiser.zero_grad()
+                loss.backward()
+                self.optimiser.step()
+                total += loss.item() * len(rows)
+                right += ((logits > 0) == (present[rows] > 0)).float().mean().item() * len(rows)
+            self.done += 1
+            if not math.isfinite(total) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
+                raise ProbsceneError(
+                    f"Expected a finite loss of the presence network, actual {total} in epoch {self.done}; begin again "
+                    "with features=count."
+                )
+            self.reached = right / len(image)
+            if each is not None:
+                each(self, total / len(image))
+        self.net.eval()
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        return training_state(self.net, {"adam": self.optimiser}, done=self.done, reached=self.reached)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        numbers = restore_training(self.net, {"adam": self.optimiser}, tensors)
+        self.done, self.reached = int(numbers["done"]), numbers["reached"]
+
+
+def _present(part: Examples, classes: int) -> Tensor:
+    """``(N, classes)`` float, 1 where a class is visible."""
+    counts = torch.zeros(len(part.label), classes + 1)
+    counts.scatter_(1, part.label.where(part.label >= 0, classes), 1.0)
+    return counts[:, :classes]

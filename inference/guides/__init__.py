@@ -1,0 +1,1 @@
+"""Guides: policies that learn."""

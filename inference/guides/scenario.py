@@ -1,0 +1,51 @@
+"""One guide a scenario, learnt together (Meta-Sim2, supplement): densities are estimated over the scenes of all of
+them, and each guide is scored on its own scenes."""
+
+from torch import Tensor, nn
+
+from probscene.derivation import Derivation, Frontier
+from probscene.scenarios import JointGrammar, Mixture
+
+from .base import Guide
+from .lstm import make_guide
+
+
+class ScenarioGuide(Guide):
+    """A guide of a joint grammar: a scenario by its fixed weight, then that scenario's own guide.
+
+    Args:
+        grammar: the joint grammar.
+        max_steps: T_max of the joint model.
+        weights: of the scenarios; equal if None, as in the paper.
+        kind, settings: of each scenario's guide, see ``make_guide``.
+    """
+
+    def __init__(
+        self,
+        grammar: JointGrammar,
+        max_steps: int,
+        weights: list[float] | None = None,
+        kind: str = "lstm",
+        **settings,
+    ):
+        super().__init__(grammar, max_steps)
+        self.guides = nn.ModuleList(
+            make_guide(kind, part, max_steps - 1, **settings) for part in grammar.parts.values()
+        )
+        self.mixture = Mixture(grammar, list(self.guides), weights)
+
+    def start(self, num_scenes: int) -> list:
+        """The memories of all guides."""
+        return self.mixture.start(num_scenes)
+
+    def step(self, memory: list, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, list]:
+        """Logits ``(N, K)``, see ``Mixture``."""
+        return self.mixture.step(memory, frontier, previous_rule)
+
+    def log_prob(self, derivation: Derivation) -> Tensor:
+        """``log q(T)``, ``(N,)``, marginal over the latent vectors of the scenario's guide."""
+        return self.mixture.log_prob(derivation)
+
+    def strata(self, derivation: Derivation) -> Tensor:
+        """``(N,)`` int64, whose guide's each scene is."""
+        return self.grammar.scenario(derivation)

@@ -1,0 +1,1 @@
+"""Distances between samples, their intervals, and the verdict."""

@@ -1,0 +1,1 @@
+"""Meshes from a folder of files."""

@@ -1,0 +1,1 @@
+"""Streets in 3D: their grammars, parameters and where things stand."""

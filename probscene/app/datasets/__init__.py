@@ -1,0 +1,1 @@
+"""Labelled images, their formats and provenance."""

@@ -1,0 +1,115 @@
+"""COCO: the labels of a dataset in the format of cocodataset.org, written one annotation at a time.
+
+Beyond the format's own keys an annotation has ``visible_fraction``, visible pixels over those of the whole silhouette,
+and ``amodal_bbox``, the box of the whole silhouette, which others may cover and the canvas may cut. Of a 3D scene it
+also has ``truncated``, the share of that box beyond the canvas, and ``box_3d``: height, width, length, x, y, z and
+rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within the canvas.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from pycocotools import mask as rle
+from torch import Tensor
+
+from probscene.batch import RenderBatch
+from probscene.model import SceneModel
+
+from .provenance import image_name
+
+
+def categories(model: SceneModel) -> list[dict[str, Any]]:
+    """The model's classes, with ids from 1."""
+    return [{"id": i, "name": name, "supercategory": model.name} for i, name in enumerate(model.classes, 1)]
+
+
+def labelled(model: SceneModel, batch: RenderBatch) -> Tensor:
+    """The category ids ``(N, M)`` int64 of the nodes that are labelled in every format: those of a class that have a
+    visible pixel; 0 at the others.
+    """
+    category = torch.tensor([_category(model, name) for name in model.grammar.kinds])
+    return torch.where((batch.kind >= 0) & (batch.pixels > 0), category[batch.kind.clamp(min=0)], 0)
+
+
+def annotations(model: SceneModel, batch: RenderBatch, first: int) -> list[dict[str, Any]]:
+    """Annotations of rendered scenes, but for their ids: one for each node of a class that has a visible pixel.
+
+    Args:
+        batch: the renders, of images ``first``, ``first + 1``, ...
+    """
+    category = labelled(model, batch)
+    found = []
+    for i in range(len(category)):
+        nodes = category[i].nonzero()[:, 0]
+        for node, mask in zip(nodes.tolist(), _masks(batch.instance[i], nodes), strict=True):
+            found.append(
+                {
+                    "image_id": first + i,
+                    "category_id": int(category[i, node]),
+                    "bbox": _corner_and_size(batch.box[i, node]),
+                    "segmentation": mask,
+                    "area": int(batch.pixels[i, node]),
+                    "iscrowd": 0,
+                    "visible_fraction": round(float(batch.visible[i, node]), 6),
+                    "amodal_bbox": _corner_and_size(batch.amodal_box[i, node]),
+                    **_in_space(batch, i, node),
+                }
+            )
+    return found
+
+
+def write(path: Path, model: SceneModel, num: int, info: dict[str, Any], found: Iterable[dict[str, Any]]) -> None:
+    """The whole file, for ``num`` images; annotations get ids from 1 in the order they come, and are not kept."""
+    height, width = model.canvas
+    images = (
+        {"id": i, "file_name": image_name(i).removeprefix("images/"), "height": height, "width": width}
+        for i in range(num)
+    )
+    numbered = ({"id": number, **annotation} for number, annotation in enumerate(found, 1))
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(f'{{"info": {json.dumps(info)},\n"licenses": [],\n"categories": {json.dumps(categories(model))}')
+        for key, entries in (("images", images), ("annotations", numbered)):
+            file.write(f',\n"{key}": [')
+            file.writelines(_lines(entries))
+            file.write("]")
+        file.write("}\n")
+
+
+def _lines(entries: Iterable[dict[str, Any]]) -> Iterator[str]:
+    for number, entry in enumerate(entries):
+        yield ("\n" if number == 0 else ",\n") + json.dumps(entry, separators=(",", ":"))
+
+
+def _category(model: SceneModel, kind: str) -> int:
+    """The id of a kind's category; 0 for a kind that is not labelled."""
+    return model.classes.index(kind) + 1 if kind in model.classes else 0
+
+
+def _masks(instance: Tensor, nodes: Tensor) -> list[dict[str, Any]]:
+    """Compressed run lengths of the visible masks of some nodes of one image, ``instance (H, W)``."""
+    if not len(nodes):
+        return []
+    columns = instance.T.contiguous()  # runs go down the columns
+    masks = columns == (nodes + 1).view(-1, 1, 1).to(columns.dtype)
+    encoded = rle.encode(masks.numpy().view("uint8").transpose(2, 1, 0))
+    return [{"size": mask["size"], "counts": mask["counts"].decode("ascii")} for mask in encoded]
+
+
+def _in_space(batch: RenderBatch, i: int, node: int) -> dict[str, Any]:
+    """What an annotation has beside the rest in 3D, where a silhouette's ends are between pixels."""
+    if batch.space is None:
+        return {}
+    x0, y0, x1, y1 = batch.amodal_box[i, node].tolist()
+    return {
+        "amodal_bbox": [round(v, 3) for v in (x0, y0, x1 - x0, y1 - y0)],
+        "truncated": round(float(batch.space.truncated[i, node]), 6),
+        "box_3d": [round(v, 5) for v in batch.space.box[i, node].tolist()],
+    }
+
+
+def _corner_and_size(box: Tensor) -> list[int]:
+    x0, y0, x1, y1 = (int(v) for v in box)
+    return [x0, y0, x1 - x0, y1 - y0]

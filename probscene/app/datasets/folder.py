@@ -1,0 +1,185 @@
+"""A dataset's folder, written chunk by chunk, that goes on where it stopped.
+
+    images/000000.png ...   and the other files of an image, each whole or absent
+    .parts/settings.json    what the dataset was begun with
+    .parts/000000.json      one record a chunk, written after the chunk's files
+    .parts/images           the images where they stay in shards alone
+    provenance.jsonl        and the other files of labels: written, whole, when every chunk is there; then .parts goes
+
+``provenance.jsonl`` comes last: it says that the dataset is finished, and each of its lines names the settings.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from probscene.errors import DataError
+
+from ..chunks import CHUNK
+from ..files import machine_error, make_folder, write_json, write_text, write_whole
+from .formats import found
+from .provenance import image_name
+
+LINES = "provenance.jsonl"
+
+
+class Parts:
+    """The folder of a dataset.
+
+    Args:
+        out: the folder.
+        origin: the settings that every line of provenance names.
+        num: how many images.
+        formats: see ``formats.chosen``.
+    """
+
+    def __init__(self, out: Path, origin: dict[str, Any], num: int, formats: tuple[str, ...]):
+        self.out, self.num = Path(out), num
+        self.settings = {**origin, "num": num, "format": ",".join(formats)}
+        self._kept = formats != ("webdataset",)
+        self._origin, self._parts = origin, self.out / ".parts"
+
+    def missing(self) -> list[int]:
+        """Make the folder ready; the chunks that it lacks, none where the dataset is finished.
+
+        Raises:
+            DataError: other files, or a dataset of other settings.
+            MachineError: the folder cannot be written.
+        """
+        make_folder(self.out)
+        if self.finished:
+            self._compare(self._finished_settings())
+            return []
+        record = self._parts / "settings.json"
+        if record.exists():
+            self._compare(json.loads(record.read_text(encoding="utf-8")))
+        else:
+            others = sorted(entry.name for entry in self.out.iterdir() if not entry.name.startswith("."))
+            if others:
+                raise DataError(
+                    f"Expected a new or empty folder for the dataset, actual {self.out} with {', '.join(others[:5])} "
+                    "in it; name another folder."
+                )
+            make_folder(self._parts)
+            write_json(record, self.settings)
+        return [chunk for chunk in self._chunks() if not self._done(chunk)]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the labels are written."""
+        return (self.out / LINES).exists()
+
+    def size(self, chunk: int) -> int:
+        """How many images a chunk gives; the last one may give fewer than it draws."""
+        return min(CHUNK, self.num - chunk * CHUNK)
+
+    def image(self, index: int) -> str:
+        """Where the file of image number ``index`` is while the work goes on, relative to the folder."""
+        return image_name(index) if self._kept else f"{self._parts.name}/{image_name(index)}"
+
+    def write(self, chunk: int, files: dict[str, bytes], links: dict[str, str], record: dict[str, Any]) -> None:
+        """Write a chunk: its files, then its record.
+
+        Args:
+            files: contents by name, relative to the folder.
+            links: further names, each with the file of this chunk that it is another name of.
+
+        Raises:
+            MachineError: the disk is full.
+        """
+        for folder in {(self.out / name).parent for name in (*files, *links)}:
+            make_folder(folder)
+        for name, data in files.items():
+            self._put(name, lambda temporary, data=data: temporary.write_bytes(data))
+        for name, other in links.items():
+            self._put(name, partial(_link, self.out / other))
+        sizes = {name: len(files[links.get(name, name)]) for name in (*files, *links)}
+        write_text(self._part(chunk), json.dumps({"bytes": sizes, **record}))
+
+    def records(self, chunks: range | None = None) -> Iterator[dict[str, Any]]:
+        """The chunks' records in order, one at a time; of all chunks where not said otherwise."""
+        for chunk in self._chunks() if chunks is None else chunks:
+            yield json.loads(self._part(chunk).read_text(encoding="utf-8"))
+
+    def finish(self, write: dict[str, Callable[[Path], Any]]) -> None:
+        """Write files of labels, by name, ``provenance.jsonl`` the last of them, and drop the records.
+
+        Raises:
+            MachineError: the disk is full.
+        """
+        if not self.finished:
+            for name, contents in write.items():
+                write_whole(self._parts / name, contents)
+            for name in write:
+                _move(self._parts / name, self.out / name)
+        shutil.rmtree(self._parts, ignore_errors=True)
+
+    def chunks(self, number: int) -> list[range]:
+        """All chunks, ``number`` at a time."""
+        whole = self._chunks()
+        return [whole[i : i + number] for i in range(0, len(whole), number)]
+
+    def _chunks(self) -> range:
+        return range(-(-self.num // CHUNK))
+
+    def _part(self, chunk: int) -> Path:
+        return self._parts / f"{chunk:06d}.json"
+
+    def _done(self, chunk: int) -> bool:
+        """Whether a chunk's record is there and its files are as long as it says."""
+        try:
+            sizes = json.loads(self._part(chunk).read_text(encoding="utf-8"))["bytes"]
+            return all((self.out / name).stat().st_size == size for name, size in sizes.items())
+        except (OSError, ValueError, KeyError, AttributeError):
+            return False
+
+    def _put(self, name: str, write: Callable[[Path], Any]) -> None:
+        """A file of an image by ``write(temporary path)``."""
+        path = self.out / name
+        temporary = self._parts / f"{path.name}.{os.getpid()}"
+        try:
+            temporary.unlink(missing_ok=True)  # an interrupted call's may be a link to a file that must not change
+            write(temporary)
+        except OSError as error:
+            raise machine_error(error, path) from error
+        _move(temporary, path)
+
+    def _finished_settings(self) -> dict[str, Any]:
+        try:
+            with open(self.out / LINES, encoding="utf-8") as file:
+                line = json.loads(next(file))
+                num = 1 + sum(1 for _ in file)
+            settings = {key: line[key] for key in self._origin}
+        except (OSError, StopIteration, ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                f"Expected lines of provenance in {self.out / LINES}, actual something else; name another folder."
+            ) from error
+        return {**settings, "num": num, "format": ",".join(found(self.out))}
+
+    def _compare(self, before: dict[str, Any]) -> None:
+        differing = [key for key in self.settings if before.get(key) != self.settings[key]]
+        if differing:
+            was, now = (", ".join(f"{key} {s.get(key)}" for key in differing) for s in (before, self.settings))
+            raise DataError(
+                f"Expected the settings that the dataset in {self.out} was begun with ({was}), actual {now}; "
+                "give the same, or name another folder; this one is left as it is."
+            )
+
+
+def _link(other: Path, path: Path) -> None:
+    """Make ``path`` another name of a file, or a copy of it where the file system has no second names."""
+    try:
+        os.link(other, path)
+    except OSError:
+        shutil.copyfile(other, path)
+
+
+def _move(file: Path, path: Path) -> None:
+    try:
+        os.replace(file, path)
+    except OSError as error:
+        raise machine_error(error, path) from error

@@ -1,0 +1,233 @@
+"""Write a labelled dataset: images, labels in one format or several, and provenance.
+
+    images/000000.png ...   grey where the model says that colour carries nothing, else RGB
+    annotations.json        COCO; ``formats`` says what the others add
+    provenance.jsonl        one line an image, from which it can be made again
+
+Masks and boxes come from one render and are the same in every format that has them.
+
+Whatever interrupts the work, the same call goes on with the chunks that are missing; the bytes depend on the settings
+alone, not on the interruptions, the number of workers or what else the process does.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+from torch import Tensor
+
+import probscene
+from probscene.batch import RenderBatch
+from probscene.errors import ProbsceneError
+from probscene.model import SceneModel
+from probscene.policy import Policy
+
+from ..chunks import CHUNK, as_written, draw_chunk
+from ..fitting.run import Run
+from ..loading import renderer_for
+from . import coco, kitti, shards, yolo
+from .folder import LINES, Parts
+from .formats import chosen
+from .provenance import provenance
+from .workers import spread
+
+Progress = Callable[[int, int], None]
+
+
+class Dataset(NamedTuple):
+    """A finished dataset: its folder, and how many images this call made; 0 where it was finished before."""
+
+    path: Path
+    made: int
+
+
+def generate(
+    run: Run,
+    num: int,
+    out: Path,
+    seed: int = 0,
+    workers: int = 1,
+    format: str | Iterable[str] = "coco",
+    progress: Progress | None = None,
+) -> Dataset:
+    """Write ``num`` images of the learnt structures.
+
+    Args:
+        workers: processes. More than one are spawned: a script calls this under ``if __name__ == "__main__":``.
+        format: names of ``formats.FORMATS``, such as ``"coco"``, ``"coco,yolo"`` or ``("coco", "yolo")``; ``"images"``
+            for no labels.
+        progress: called with the number of images there are and ``num``; first with what an interrupted call left.
+
+    Raises:
+        ProbsceneError: a number that is not positive, a negative seed, an unknown format, more classes or objects than
+            KITTI's masks can number.
+        DataError: the folder holds other files, or a dataset of other settings.
+        RunError: see ``Run.guide`` and ``Run.model``.
+        MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped.
+    """
+    if workers < 1:
+        raise ProbsceneError(f"Expected a positive number of workers, actual {workers}.")
+    settings = (run.path, num, Path(out), seed, chosen(format))
+    job = _of_run(*settings)
+    if workers == 1:
+        return job.run(job.each, progress)
+    return job.run(partial(spread, _worker, settings, workers), progress)
+
+
+def generate_scenes(
+    model: SceneModel,
+    policy: Policy,
+    num: int,
+    out: Path,
+    seed: int = 0,
+    format: str | Iterable[str] = "coco",
+    progress: Progress | None = None,
+) -> Dataset:
+    """``generate`` from any model and structure policy, in this process.
+
+    The folder's settings name the model and not the policy: write those of another policy to another folder.
+    """
+    job = Job(model, policy, num, out, seed, format)
+    return job.run(job.each, progress)
+
+
+def png(image: Tensor) -> bytes:
+    """The bytes of a file for ``image (C, H, W)`` uint8, grey or RGB."""
+    pixels = image.permute(1, 2, 0).numpy()
+    if pixels.shape[2] == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+class Job:
+    """A dataset to be written.
+
+    Args:
+        guide: SHA-256 of the policy's checkpoint, where it is a learnt one.
+
+    Raises:
+        ProbsceneError: a number that is not positive, a negative seed, an unknown format, more classes than KITTI's
+            masks can number.
+    """
+
+    def __init__(
+        self,
+        model: SceneModel,
+        policy: Policy,
+        num: int,
+        out: Path,
+        seed: int = 0,
+        format: str | Iterable[str] = "coco",
+        guide: str | None = None,
+    ):
+        if num < 1:
+            raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
+        if seed < 0:
+            raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
+        self.formats = chosen(format)
+        if "kitti" in self.formats:
+            kitti.check(model)
+        self.model, self.policy = model, policy
+        self.origin = {"seed": seed, "model": model.name, "guide": guide, "version": probscene.__version__}
+        self.parts = Parts(out, self.origin, num, self.formats)
+        self._renderer = renderer_for(model, threads=1)
+
+    def run(self, work: Callable[[list[int], Callable[[int], None]], None], progress: Progress | None) -> Dataset:
+        """Do what is missing by ``work(chunks, done)``, then write the labels."""
+        parts, made = self.parts, 0
+        chunks = parts.missing()
+        before = parts.num - sum(map(parts.size, chunks))
+
+        def done(chunk: int | None) -> None:
+            nonlocal made
+            made += 0 if chunk is None else parts.size(chunk)
+            if progress is not None:
+                progress(before + made, parts.num)
+
+        done(None)
+        work(chunks, done)
+        parts.finish(self._labels())
+        return Dataset(parts.out, made)
+
+    def each(self, chunks: list[int], done: Callable[[int], None]) -> None:
+        """Make chunks one after the other."""
+        for chunk in chunks:
+            done(self.make(chunk))
+
+    def make(self, chunk: int) -> int:
+        """Draw, render and write a chunk; returns its number.
+
+        Raises:
+            MachineError: the disk is full.
+        """
+        first, size = chunk * CHUNK, self.parts.size(chunk)
+        scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
+        batch = self._renderer(scenes.drawing[:size])
+        found = [] if self.formats == ("images",) else coco.annotations(self.model, batch, first)
+        record = {"annotations": found, "provenance": provenance(self.model, scenes, first, self.origin)[:size]}
+        self.parts.write(chunk, *self._files(batch, first, found), record)
+        return chunk
+
+    def _files(
+        self, batch: RenderBatch, first: int, found: list[dict[str, Any]]
+    ) -> tuple[dict[str, bytes], dict[str, str]]:
+        """What is written of each image at once, and further names of that; see ``Parts.write``."""
+        of_image: dict[int, list] = {first + i: [] for i in range(len(batch.image))}
+        for annotation in found:
+            of_image[annotation["image_id"]].append(annotation)
+        images = map(png, as_written(self.model, batch.image))
+        files = {self.parts.image(i): image for i, image in zip(of_image, images, strict=True)}
+        links = {}
+        if "yolo" in self.formats:
+            files |= {yolo.label_name(i): yolo.label(self.model, of_image[i]).encode() for i in of_image}
+        if "kitti" in self.formats:
+            masks = kitti.instances(self.model, batch, first)
+            files |= {kitti.file_name("label_2", i): kitti.label(self.model, of_image[i]).encode() for i in of_image}
+            files |= {kitti.file_name("instance", i): mask for i, mask in zip(of_image, masks, strict=True)}
+            if batch.space is not None:
+                calibs = map(kitti.calib, batch.space.intrinsics)
+                files |= {kitti.file_name("calib", i): text.encode() for i, text in zip(of_image, calibs, strict=True)}
+            links |= {kitti.file_name("image_2", i): self.parts.image(i) for i in of_image}
+        return files, links
+
+    def _labels(self) -> dict[str, Callable[[Path], Any]]:
+        """What is written when every chunk is there."""
+        model, parts = self.model, self.parts
+        labels = {}
+        if "coco" in self.formats:
+            found = (annotation for record in parts.records() for annotation in record["annotations"])
+            labels["annotations.json"] = lambda path: coco.write(path, model, parts.num, parts.settings, found)
+        if "yolo" in self.formats:
+            labels["data.yaml"] = lambda path: path.write_text(yolo.data(model), encoding="utf-8")
+        if "webdataset" in self.formats:
+            for number, chunks in enumerate(parts.chunks(shards.CHUNKS)):
+                labels[shards.shard_name(number)] = partial(self._write_shard, chunks)
+        lines = (line for record in parts.records() for line in record["provenance"])
+        labels[LINES] = lambda path: _write_lines(path, (json.dumps(line, ensure_ascii=False) + "\n" for line in lines))
+        return labels
+
+    def _write_shard(self, chunks: range, path: Path) -> None:
+        def samples() -> Iterator[tuple[int, dict[str, bytes]]]:
+            for record in self.parts.records(chunks):
+                for i, label in shards.labels(self.model, record):
+                    yield i, {"png": (self.parts.out / self.parts.image(i)).read_bytes(), "json": label}
+
+        shards.write(path, samples())
+
+
+def _of_run(run: Path, num: int, out: Path, seed: int, format: tuple[str, ...]) -> Job:
+    opened = Run.open(run)
+    return Job(opened.model, opened.guide(), num, out, seed, format, opened.guide_hash())
+
+
+def _worker(*settings) -> Callable[[int], int]:
+    """What a worker process does with a chunk's number."""
+    return _of_run(*settings).make
+
+
+def _write_lines(path: Path, lines: Iterable[str]) -> None:
+    with open(path, "w", encoding="utf-8") as file:
+        file.writelines(lines)

@@ -1,0 +1,183 @@
+"""KITTI's label files as the truth: a folder of text files, one an image of the same name, fifteen columns an object.
+
+    type  truncated  occluded  alpha  left top right bottom  height width length  x y z  rotation_y
+
+Boxes are in 0-based pixels of the image as it is in its file. A type counts as the class of the model that has its
+name, whatever the case, else by ``TYPES``; types that the model has no class for, and DontCare, are left out, which the
+notes say. So are objects whose middle lies where the target's image is cut, see ``ImageFolder``. Labelled are the
+classes that one of KITTI's own types counts as, and those that occur.
+"""
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from probscene.dataset import ImageFolder
+from probscene.decoding import Window
+from probscene.errors import DataError
+from probscene.model import SceneModel
+
+from ..evaluation.structure_counts import Counts
+
+COLUMNS = (
+    "type", "truncated", "occluded", "alpha", "left", "top", "right", "bottom", "height", "width", "length",
+    "x", "y", "z", "rotation_y",
+)  # fmt: skip
+TYPES = {
+    "Car": ("car",),
+    "Van": ("van",),
+    "Truck": ("truck",),
+    "Pedestrian": ("pedestrian", "person"),
+    "Person_sitting": ("pedestrian", "person"),
+    "Cyclist": ("cyclist", "bike", "bicycle", "bicyclist"),
+    "Tram": ("tram",),
+}
+"""Of KITTI's types, what a model may call them, the likeliest first."""
+DONT_CARE = "DontCare"
+
+
+class Object(NamedTuple):
+    """One line: its type and its box in pixels."""
+
+    type: str
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def on(self, size: tuple[int, int]) -> bool:
+        """Whether any of it lies on an image of a height and width."""
+        return self.left < size[1] and self.right >= 0 and self.top < size[0] and self.bottom >= 0
+
+    def within(self, seen: Window) -> bool:
+        """Whether its middle is in a part of the image."""
+        x, y = (self.left + self.right + 1) / 2 - seen.left, (self.top + self.bottom + 1) / 2 - seen.top
+        return 0 <= x < seen.width and 0 <= y < seen.height
+
+
+def read_objects(file: Path) -> list[Object]:
+    """What a label file says, in the order of its lines.
+
+    Raises:
+        DataError: a file that is no text, another number of columns, what is no finite number, or a box whose ends
+            are swapped; its line is named.
+    """
+    try:
+        lines = file.read_text(encoding="utf-8-sig").split("\n")
+    except OSError as error:
+        raise DataError(f"Expected a label file at {file}, actual none to be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"Expected a text file in UTF-8, actual {file}: {error}.") from error
+    return [
+        _object(line.split(), f"in line {number} of {file}") for number, line in enumerate(lines, 1) if line.strip()
+    ]
+
+
+def read_kitti(
+    folder: Path, model: SceneModel, target: ImageFolder, some: bool = False, min_height: float = 0.0
+) -> tuple[Counts, tuple[str, ...], tuple[str, ...]]:
+    """The counts ``(L, C)`` of a target's images, the C labelled classes in the model's order, and notes.
+
+    Files of images that are not in the target are not read, which the notes say.
+
+    Args:
+        some: there need not be one for every image; those without are left out.
+        min_height: of a box that is counted, pixels.
+
+    Raises:
+        DataError: see ``read_objects``; an image without a file, an object beside its image, or no type that the model
+            has a class for.
+    """
+    files = {path: folder / f"{path.stem}.txt" for path in target.paths}
+    found = {path: read_objects(file) for path, file in files.items() if file.is_file()}
+    missing = [file.name for file in files.values() if not file.is_file()]
+    if missing and not (some and found):
+        names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+        raise DataError(
+            f"Expected a label file in {folder} for every image of {target.path}, actual none named {names}"
+            f"{'' if some else '; if only some are labelled, add --some-labels'}."
+        )
+    occurring = Counter(one.type for objects in found.values() for one in objects)
+    of_type = {name: _class(name, model.classes) for name in (*TYPES, *occurring)}
+    classes = tuple(name for name in model.classes if name in of_type.values())
+    if not classes:
+        raise DataError(
+            f"Expected types in {folder} that model {model.name!r} has classes for ({', '.join(model.classes)}), "
+            f"actual {', '.join(occurring) or 'no object'}."
+        )
+    counts, small, cut = np.zeros((len(found), len(classes)), np.int64), 0, 0
+    images = dict(zip(target.paths, zip(target.sizes, target.windows, strict=True), strict=True))
+    for row, (path, objects) in zip(counts, found.items(), strict=True):
+        size, seen = images[path]
+        for one in objects:
+            name = of_type[one.type]
+            if name is None:
+                continue
+            if not one.on(size):
+                raise DataError(
+                    f"Expected boxes on the image of {size[1]}x{size[0]} in {files[path]}, actual {one.type} from "
+                    f"{one.left:g}, {one.top:g} to {one.right:g}, {one.bottom:g}; give the labels of these images, not "
+                    "of images of another size."
+                )
+            if seen is not None and not one.within(seen):
+                cut += 1
+            elif one.bottom - one.top < min_height:
+                small += 1
+            else:
+                row[classes.index(name)] += 1
+    notes = [*_unread(folder, target), *_notes(occurring, of_type)]
+    if cut:
+        notes.append(f"{cut} objects that lie where images are cut are not counted.")
+    if small:
+        notes.append(f"{small} objects of less than {min_height:g} pixels' height are not counted.")
+    return counts, classes, tuple(notes)
+
+
+def _object(fields: list[str], where: str) -> Object:
+    if len(fields) != len(COLUMNS):
+        longer = len(fields) == len(COLUMNS) + 1
+        remedy = "a type is one word, and labels have no score" if longer else "mend the line"
+        raise DataError(
+            f"Expected {len(COLUMNS)} columns ({' '.join(COLUMNS)}) {where}, actual {len(fields)}; {remedy}."
+        )
+    values = []
+    for name, text in zip(COLUMNS[1:], fields[1:], strict=True):
+        try:
+            values.append(float("nan" if "_" in text else text))  # Python reads 1_0 as 10
+        except ValueError:
+            values.append(math.nan)
+        if not math.isfinite(values[-1]):
+            raise DataError(f"Expected a number for {name} {where}, actual {text!r}; mend the line.")
+    found = Object(fields[0], *values[3:7])
+    if found.right < found.left or found.bottom < found.top:
+        raise DataError(
+            f"Expected a box from left to right and top to bottom {where}, actual {' '.join(fields[4:8])}; mend the "
+            "line."
+        )
+    return found
+
+
+def _class(type: str, classes: tuple[str, ...]) -> str | None:
+    """The class that a type counts as."""
+    own = {name.casefold(): name for name in reversed(classes)}
+    names = (type.casefold(), *TYPES.get(type, ()))
+    return next((own[name] for name in names if name in own and type != DONT_CARE), None)
+
+
+def _unread(folder: Path, target: ImageFolder) -> list[str]:
+    """Which files are of no image."""
+    images = {path.stem for path in (*target.paths, *target.bad)}
+    others = sorted(file.name for file in folder.glob("*.txt") if file.stem not in images)
+    more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+    return [f"Not read, since {target.path} has no such image: {others[0]}{more}."] if others else []
+
+
+def _notes(occurring: Counter, of_type: dict[str, str | None]) -> list[str]:
+    """Which types count as something of another name, and which not at all."""
+    renamed = [f"{name} as {own}" for name in occurring if (own := of_type[name]) and own.casefold() != name.casefold()]
+    out = [f"{number} {name}" for name, number in occurring.most_common() if of_type[name] is None]
+    notes = [f"Counted are {', '.join(sorted(renamed))}."] if renamed else []
+    return notes + ([f"Not counted, since the model has no such class: {', '.join(out)}."] if out else [])

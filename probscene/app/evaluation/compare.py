@@ -1,0 +1,211 @@
+"""``probscene compare``: what the prior and several runs of one model derive, beside the truth or an estimate of it.
+
+The sources are those of ``evaluate`` (see there), with one for each run, under the name of its folder, instead of the
+one that is learnt. The reference is the truth where there are labels, else what the feature network of the first run
+that counts sees in the target.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import probscene
+from probscene.dataset import ImageFolder
+from probscene.errors import ProbsceneError, RunError
+from probscene.inference.judging.metrics import Shares, histogram, pooled_shares, total_variation
+from probscene.inference.judging.tally import Tally
+
+from ..fitting.fit import Progress
+from ..fitting.run import Run
+from .evaluate import Evaluation, network_counts
+from .labels import Labels
+from .likelihood import Likelihood, likelihood
+from .sources import Source
+from .structure_counts import GROUPS, PARENTS, label
+from .visible import counted, number_of
+
+PRIOR, TRUTH, ESTIMATE = "prior", "truth", "estimate"
+SAME = ("model", "model_sha256", "assets")  # what runs of one model agree in
+
+
+class Row(NamedTuple):
+    """One kind of count of every source that has it.
+
+    Attributes:
+        label: in words.
+        shares: by source, ``(K,)`` shares by count, or by class.
+        means: by source; empty where a mean says nothing.
+        apart: by source other than the reference, the total variation to the reference.
+    """
+
+    label: str
+    shares: dict[str, Shares]
+    means: dict[str, float]
+    apart: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(Evaluation):
+    """An evaluation of several runs: ``sources`` are ``prior``, each run's, then ``truth`` or ``estimate``.
+
+    Attributes:
+        runs: by name.
+    """
+
+    runs: dict[str, Run] = field(default_factory=dict)
+
+    @property
+    def reference(self) -> str | None:
+        """``truth`` or ``estimate``; None where neither is known."""
+        return next((name for name in (TRUTH, ESTIMATE) if name in self.sources), None)
+
+    def distances(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """From prior and runs to the reference."""
+        b = self.reference
+        return {} if b is None else {b: {a: self.distance(a, b) for a in (PRIOR, *self.runs)}}
+
+    def record(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        return {
+            "version": probscene.__version__,
+            "model": self.run.record["model"],
+            "target": str(self.target),
+            "classes": list(self.classes),
+            "notes": list(self.notes),
+            "reference": self.reference,
+            "runs": {
+                name: {
+                    "path": str(run.path),
+                    "guide": run.record["guide"],
+                    "objective": run.record["preset"]["objective"],
+                    "seed": run.record["seed"],
+                    "guide_sha256": run.guide_hash(),
+                }
+                for name, run in self.runs.items()
+            },
+            "distances": self.distances(),
+            "sources": {name: self._source(source) for name, source in self.sources.items()},
+            "log_prob": {name: _nats(found) for name, found in self.likelihoods.items()},
+        }
+
+    def rows(self) -> list[Row]:
+        """The number of objects, every class, and where kinds nest the children by ``structure_counts.GROUPS``."""
+        sources = self.sources
+        found = [self._row("objects per image", *_of({name: s.total for name, s in sources.items()}))]
+        if len(self.classes) > 1:
+            for c, name in enumerate(self.classes):
+                columns = {a: source.counts[:, c] for a, source in sources.items()}
+                found.append(self._row(f"{name} per image", *_of(columns)))
+        for relation in sources[PRIOR].nested:
+            known = {name: source.nested[relation] for name, source in sources.items() if relation in source.nested}
+            for group in GROUPS:
+                each = {name: tallies[group] for name, tallies in known.items() if not tallies[group].empty}
+                if len(each) > 1 and not (group == PARENTS and relation[0] in self.classes):
+                    found.append(self._row(label(relation, group), *_of_tallies(each)))
+        return found
+
+    def shares_of_classes(self) -> Row:
+        """Each class's share of all objects, of the sources that have any."""
+        each = {name: pooled_shares(source.counts) for name, source in self.sources.items()}
+        return self._row("class of an object", {name: shares for name, shares in each.items() if shares.any()}, {})
+
+    def _row(self, words: str, shares: dict[str, Shares], means: dict[str, float]) -> Row:
+        known = shares.get(self.reference)
+        others = {} if known is None else {name: p for name, p in shares.items() if name != self.reference}
+        return Row(words, shares, means, {name: total_variation(p, known) for name, p in others.items()})
+
+
+def open_runs(paths: Sequence[Path]) -> dict[str, Run]:
+    """Finished runs of one model, by the names of their folders.
+
+    Raises:
+        RunError: see ``Run.open``; runs of different models or of the same name, or one that is not finished.
+    """
+    runs: dict[str, Run] = {}
+    for path in paths:
+        run, name = Run.open(path), path.resolve().name
+        if name in runs or name in (PRIOR, TRUTH, ESTIMATE):
+            raise RunError(
+                f"Expected runs in folders of different names, none of them {PRIOR}, {TRUTH} or {ESTIMATE}, actual "
+                f"another {name!r} at {path}; rename the folder."
+            )
+        first = next(iter(runs.values()), run)
+        if differs := next((key for key in SAME if run.record[key] != first.record[key]), None):
+            what = {"model": "", "model_sha256": " as another file", "assets": " with other assets"}[differs]
+            raise RunError(
+                f"Expected runs of one model, actual {first.path} of {first.record['model']} and {path} of "
+                f"{run.record['model']}{what}; compare runs of the same model."
+            )
+        run.guide()
+        runs[name] = run
+    return runs
+
+
+def compare(
+    runs: dict[str, Run],
+    target: ImageFolder | None,
+    truth: Labels | None,
+    progress: Progress,
+    num: int = 10000,
+    seed: int = 0,
+) -> Comparison:
+    """Sample structures of the prior and of every guide, and count.
+
+    Args:
+        runs: from ``open_runs``.
+        target: its images; without them, what the first run's network saw in the images that it was fitted to.
+        truth: the labels of the target's images.
+        num: structures a source.
+
+    Raises:
+        ProbsceneError: a number that is not positive.
+        RunError: there are no target images, and the runs were fitted to different ones.
+    """
+    if num < 1:
+        raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
+    first = next(iter(runs.values()))
+    path = Path(first.record["target"]) if target is None else target.path
+    if target is None and (other := next((r for r in runs.values() if Path(r.record["target"]) != path), None)):
+        raise RunError(
+            f"Expected runs that were fitted to the same images, actual {first.path} to {path} and {other.path} to "
+            f"{other.record['target']}; say with --target which to compare with."
+        )
+    model, done = first.model, 0
+    columns = list(range(len(model.classes))) if truth is None else truth.columns(model)
+
+    def each(scenes):
+        nonlocal done
+        done += scenes
+        progress("counting", done, (1 + len(runs)) * number_of(truth, num), "")
+
+    sources: dict[str, Source] = {}
+    likelihoods: dict[str, Likelihood] = {}
+    for name, policy in {PRIOR: model.prior, **{name: run.guide() for name, run in runs.items()}}.items():
+        found = counted(model, policy, num, seed, truth, each)
+        sources[name] = Source.of(found.counts, found.children).only(columns)
+        if truth is not None and truth.derivation is not None:
+            likelihoods[name] = likelihood(policy, truth.derivation)
+    if truth is not None:
+        sources[TRUTH] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
+    else:
+        seen = (network_counts(run, target, progress) for run in runs.values())
+        if (estimate := next((source for source in seen if source is not None), None)) is not None:
+            sources[ESTIMATE] = estimate
+    classes, notes = tuple(model.classes[c] for c in columns), () if truth is None else truth.notes
+    return Comparison(first, path, classes, sources, likelihoods, notes=notes, runs=runs)
+
+
+def _of(counts: dict[str, np.ndarray]) -> tuple[dict[str, Shares], dict[str, float]]:
+    return {name: histogram(n) for name, n in counts.items()}, {name: float(n.mean()) for name, n in counts.items()}
+
+
+def _of_tallies(each: dict[str, Tally]) -> tuple[dict[str, Shares], dict[str, float]]:
+    shares = {name: tally.histogram().share for name, tally in each.items()}
+    return shares, {name: tally.mean().value for name, tally in each.items()}
+
+
+def _nats(found: Likelihood) -> dict[str, Any]:
+    return {"nats": None if found.nats is None else found.nats._asdict(), "impossible": found.impossible}

@@ -1,0 +1,218 @@
+"""``probscene evaluate``: which structures are learnt, beside the prior's, the truth's and what the network sees.
+
+Sources of counts: ``prior`` and ``learnt`` are sampled structures; ``truth`` is a file of labels of the target's
+images; ``estimate`` is what the run's feature network counts in them, rounded. The last is no truth: the network learnt
+on prior renders alone and errs where objects crowd, but it is there without a single label.
+
+Where kinds nest (cars on roads), children are counted by node and by the node's rank: which no context-free prior can
+weigh, and totals hide.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import probscene
+from probscene.dataset import ImageFolder
+from probscene.errors import ProbsceneError
+from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation, wasserstein
+from probscene.inference.judging.tally import Tally
+
+from ..fitting.fit import Progress
+from ..fitting.observer import feature_net
+from ..fitting.presets import Preset
+from ..fitting.run import Run
+from ..fitting.scene_features import features_in, kept_features, own_net
+from .estimate import estimated
+from .image_distances import IMAGES, Distances, image_distances
+from .labels import Labels
+from .likelihood import Likelihood, likelihood
+from .sources import Source
+from .structure_counts import Relation
+from .visible import counted, number_of
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Counts by source; see the module.
+
+    Attributes:
+        run: the run.
+        target: path of the target's images.
+        classes: the C names; only those that are labelled, where there are labels.
+        sources: ``prior``, ``learnt``, then ``truth`` and ``estimate`` where they are known.
+        likelihoods: of the truth's structures under ``prior`` and ``learnt``, where they are known.
+        images: FID and KID by the features' name; see ``image_distances``.
+        notes: of the labels.
+    """
+
+    run: Run
+    target: Path
+    classes: tuple[str, ...]
+    sources: dict[str, Source]
+    likelihoods: dict[str, Likelihood] = field(default_factory=dict)
+    images: dict[str, Distances] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def distance(self, a: str, b: str) -> dict[str, Any]:
+        """How far source ``a`` is from ``b``: total variation of the number of objects and of the pooled class shares,
+        Wasserstein-1 of the number in objects an image, and the total variation of each class's own counts. Shares of
+        a source without objects are not compared: None.
+
+        ``kinds`` and ``children`` have both distances with their intervals, of each class's counts and, where kinds
+        nest, of the children by ``structure_counts.GROUPS``; None where a source has no such node."""
+        one, other = self.sources[a], self.sources[b]
+        number = histogram(one.total), histogram(other.total)
+        shares = pooled_shares(one.counts), pooled_shares(other.counts)
+        each = {
+            name: total_variation(histogram(one.counts[:, c]), histogram(other.counts[:, c]))
+            for c, name in enumerate(self.classes)
+        }
+        return {
+            "number": total_variation(*number),
+            "number_wasserstein": wasserstein(*number),
+            "classes": total_variation(*shares) if shares[0].any() and shares[1].any() else None,
+            "each_class": each,
+            "kinds": {name: _apart(x, y) for name, x, y in zip(self.classes, one.kinds, other.kinds, strict=True)},
+            "children": {
+                _key(relation): {group: _apart(found, other.nested[relation][group]) for group, found in each.items()}
+                for relation, each in one.nested.items()
+                if relation in other.nested
+            },
+        }
+
+    def distances(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """From prior and learnt to the truth and to the estimate, where there are such."""
+        known = [name for name in ("truth", "estimate") if name in self.sources]
+        return {b: {a: self.distance(a, b) for a in ("prior", "learnt")} for b in known}
+
+    def record(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        return {
+            "version": probscene.__version__,
+            "run": str(self.run.path),
+            "guide_sha256": self.run.guide_hash(),
+            "model": self.run.record["model"],
+            "target": str(self.target),
+            "classes": list(self.classes),
+            "notes": list(self.notes),
+            "distances": self.distances(),
+            "sources": {name: self._source(source) for name, source in self.sources.items()},
+            "log_prob": {name: _plain(found) for name, found in self.likelihoods.items()},
+            "images": {
+                name: {source: {figure.name: _plain(figure) for figure in found} for source, found in each.items()}
+                for name, each in self.images.items()
+            },
+        }
+
+    def _source(self, source: Source) -> dict[str, Any]:
+        return {
+            "scenes": len(source.total),
+            "mean_number": float(source.total.mean()),
+            "number": _plain(source.number()),
+            "classes": _plain(source.classes()),
+            "each_class": {name: histogram(source.counts[:, c]).tolist() for c, name in enumerate(self.classes)},
+            "children": {
+                _key(relation): {
+                    group: _plain(found.histogram()) | {"mean": _plain(found.mean())} for group, found in each.items()
+                }
+                for relation, each in source.nested.items()
+            },
+        }
+
+
+def evaluate(
+    run: Run,
+    target: ImageFolder | None,
+    truth: Labels | None,
+    progress: Progress,
+    num: int = 10000,
+    seed: int = 0,
+    features: Sequence[str] = (),
+    images: int = IMAGES,
+) -> Evaluation:
+    """Sample structures of the prior and of the guide and count, beside the truth and the network's estimate.
+
+    Args:
+        target: its images; without them there is only the run's own record of what the network saw.
+        truth: the labels of the target's images.
+        num: structures a source; see ``shown.SHOWN`` where they are rendered for it.
+        features: networks to compare images by, see ``seen.network``; none, as it renders.
+        images: how many are compared at most, where they are.
+
+    Raises:
+        ProbsceneError: a number that is not positive; see ``image_distances``.
+        RunError: the fit is not finished.
+    """
+    if num < 1:
+        raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
+    if features and target is None:
+        raise ProbsceneError("Expected the target's images to compare features with, actual none.")
+    policies = {"prior": run.model.prior, "learnt": run.guide()}
+    done = 0
+
+    def each(scenes):
+        nonlocal done
+        done += scenes
+        progress("counting", done, 2 * number_of(truth, num), "")
+
+    columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
+    compared = image_distances(run, target, features, progress, images, seed) if features else {}
+    sources, likelihoods = {}, {}
+    for name, policy in policies.items():
+        found = counted(run.model, policy, num, seed, truth, each)
+        sources[name] = Source.of(found.counts, found.children).only(columns)
+        if truth is not None and truth.derivation is not None:
+            likelihoods[name] = likelihood(policy, truth.derivation)
+    if truth is not None:
+        sources["truth"] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
+    estimate = network_counts(run, target, progress)
+    if estimate is not None:
+        sources["estimate"] = estimate.only(columns)
+    path = Path(run.record["target"]) if target is None else target.path
+    classes, notes = tuple(run.model.classes[c] for c in columns), () if truth is None else truth.notes
+    return Evaluation(run, path, classes, sources, likelihoods, compared, notes)
+
+
+def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> Source | None:
+    """What the run's feature network counts in the target's images, rounded; None where it does not count.
+
+    The features that the fit kept are taken where the images are the fit's, else the images are embedded anew.
+    """
+    model = run.model
+    names = feature_net(Preset.of(run.record["preset"]), model).names
+    if estimated(model, names, torch.zeros(0, len(names))) is None:
+        return None
+    features, done = kept_features(run, target), 0
+
+    def each(images):
+        nonlocal done
+        done += images
+        progress("target", done, len(target), "")
+
+    if target is None and features is None:
+        return None
+    net = own_net(run)
+    if features is None:
+        features = features_in(run, target, net, each)
+    return Source(*estimated(model, names, features * net.unit), seed=1)
+
+
+def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:
+    return _plain(one.distance(other))
+
+
+def _key(relation: Relation) -> str:
+    return f"{relation[1]} per {relation[0]}"
+
+
+def _plain(found: Any) -> dict[str, Any] | None:
+    """A tuple with names for JSON, and the tuples in it."""
+    if found is None:
+        return None
+    inner = {key: _plain(x) if isinstance(x, tuple) else x for key, x in found._asdict().items()}
+    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in inner.items()}

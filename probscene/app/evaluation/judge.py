@@ -1,0 +1,166 @@
+"""Can a run be trusted? Its scenes, the prior's and the target's images through its own network, judged without labels.
+
+Scenes are drawn and looked at as the fit has looked at them. For another domain the images' looks are asked, by
+EfficientNet-Lite: counts of a strange image may be quite ordinary. Axis letters: N scenes, L images, D features.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from probscene.dataset import ImageFolder
+from probscene.errors import DataError, ProbsceneError
+from probscene.inference.features.base import FeatureNet
+from probscene.inference.judging.trust import Trust, trust
+from probscene.inference.judging.two_sample import NEEDED
+from probscene.policy import Policy
+from probscene.sampling import sample
+
+from ..chunks import CHUNK, chunk_randomness
+from ..fitting.fit import Progress
+from ..fitting.observer import Observer
+from ..fitting.presets import Preset
+from ..fitting.run import Run
+from ..fitting.scene_features import features_in, kept_features, own_net, threads
+from ..pictures import Pixels, pixels, shrunk
+from .evaluate import Evaluation
+from .label_agreement import Agreement, agreement
+
+SCENES = 1000  # of the guide, and as many of the prior
+LOOKS = 32  # images of each source that are compared by their looks, twice as many of the target's
+SHOWN = 8  # images in each picture
+THUMB = 128  # pixels
+COUNT = 0.5  # of a count: what differs by less is the same
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A verdict and what it was made from.
+
+    Attributes:
+        trust: the verdict and its figures; None where there is none.
+        absent: why there is none.
+        real_unmatched: the real images farthest from any generated scene, indices of the target's images.
+        generated_unmatched: the generated scenes farthest from any real image, ``(H, W, 3)``.
+        names: the files of ``real_unmatched``.
+        agreement: with the labels, where there are such.
+    """
+
+    trust: Trust | None
+    absent: str = ""
+    real_unmatched: tuple[int, ...] = ()
+    generated_unmatched: tuple[Pixels, ...] = ()
+    names: tuple[str, ...] = ()
+    agreement: Agreement | None = None
+
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        if self.trust is None:
+            return {"verdict": None, "because": self.absent}
+        more = {"unlike_images": list(self.names)}
+        if self.agreement is not None:
+            more["labels"] = self.agreement.record(self.trust.verdict)
+        return self.trust.record() | more
+
+
+def judge(
+    run: Run,
+    target: ImageFolder,
+    progress: Progress,
+    num: int = SCENES,
+    evaluation: Evaluation | None = None,
+    seed: int = 0,
+) -> Judged:
+    """Judge a finished run by a folder of real images.
+
+    Args:
+        num: scenes of the guide, and as many of the prior.
+        evaluation: with labels, what to hold the verdict against.
+
+    Raises:
+        ProbsceneError: fewer scenes than a verdict needs.
+        RunError: see ``Run.guide`` and ``own_net``.
+    """
+    if num < NEEDED:
+        raise ProbsceneError(f"Expected at least {NEEDED} scenes to judge by, actual {num}; or 0 for no verdict.")
+    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
+
+    if len(target) < NEEDED:
+        return Judged(
+            None, f"Expected at least {NEEDED} real images for a verdict, actual {len(target)} in {target.path}."
+        )
+    preset, model, net, looks = Preset.of(run.record["preset"]), run.model, own_net(run), EfficientNetLite()
+    policies = (run.guide(), model.pretraining_policy)
+    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target)
+
+    def each(images: int) -> None:
+        nonlocal done
+        done += images
+        progress("judging", done, total, "")
+
+    eyes = [_Eyes(net, looks, each, keep) for keep in (True, False)]
+    draws = preset.draws_per_structure
+    scenes = [_features(run, policy, eye, draws, num, seed) for policy, eye in zip(policies, eyes, strict=True)]
+    real = _real(run, target, net, each)
+    with threads(run.record["threads"]):
+        spread = np.linspace(0, len(target) - 1, min(2 * LOOKS, len(target))).astype(int)
+        seen = looks.embed(torch.stack([target.load(i) for i in spread]))
+    try:
+        found = trust(
+            scenes[0].numpy(),
+            real.numpy(),
+            scenes[1].numpy(),
+            tuple(net.names),
+            resolution=COUNT if preset.features == "count" else 0.0,
+            looks=(seen.numpy(), torch.cat([look for eye in eyes for look in eye.looks]).numpy()),
+            seed=seed,
+        )
+    except DataError as error:
+        return Judged(None, str(error))
+    real_unmatched = tuple(int(i) for i in found.figures.real_unmatched.worst[:SHOWN])
+    generated_unmatched = tuple(eyes[0].thumbs[i] for i in found.figures.generated_unmatched.worst[:SHOWN])
+    names = tuple(target.paths[i].name for i in real_unmatched)
+    by_labels = None
+    if evaluation is not None and "truth" in evaluation.sources:
+        by_labels = agreement(*(evaluation.sources[name] for name in ("learnt", "truth")), evaluation.classes)
+    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels)
+
+
+class _Eyes:
+    """A run's network that keeps small pictures of what it was shown, and the looks of the first few."""
+
+    def __init__(self, net: FeatureNet, appearance: FeatureNet, each, keep: bool):
+        self.net, self.appearance, self.each, self.keep = net, appearance, each, keep
+        self.names, self.thumbs, self.looks, self.looked = net.names, [], [], 0
+
+    def embed(self, images: Tensor) -> Tensor:
+        if self.keep:
+            self.thumbs += [shrunk(image, THUMB).copy() for image in pixels(images)]
+        some = images[: max(0, LOOKS - self.looked)]
+        if len(some):
+            self.looks.append(self.appearance.embed(some))
+            self.looked += len(some)
+        self.each(len(images))
+        return self.net.embed(images)
+
+
+def _features(run: Run, policy: Policy, net: FeatureNet, draws_per_structure: int, num: int, seed: int) -> Tensor:
+    """``(num, D)`` features of scenes, seen as the fit has seen them; the same for the same seed."""
+    view = Observer(run.model, run.record["threads"])
+    observe, parts = view.observe(net, draws_per_structure), []
+    for chunk in range(-(-num // CHUNK)):
+        with threads(1), chunk_randomness(seed, chunk):
+            parts.append(observe(sample(run.model, policy, CHUNK)))
+    return torch.cat(parts)[:num]
+
+
+def _real(run: Run, target: ImageFolder, net: FeatureNet, each) -> Tensor:
+    """The features that the fit kept where the images are the fit's, else new ones."""
+    kept = kept_features(run, target)
+    if kept is None:
+        return features_in(run, target, net, each)
+    each(len(target))
+    return kept

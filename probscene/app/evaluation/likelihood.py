@@ -1,0 +1,31 @@
+"""How likely a policy would have derived given structures: the one figure that knows all of a structure at once."""
+
+from typing import NamedTuple
+
+import torch
+
+from probscene.derivation import Derivation
+from probscene.inference.judging.tally import Interval, mean_interval, resamples
+from probscene.policy import MASKED, Policy
+
+
+class Likelihood(NamedTuple):
+    """Held-out structures under a policy.
+
+    Attributes:
+        nats: mean log q(T) of the structures that the policy can derive, nats a scene; None if there is none.
+        impossible: share of the structures that it never derives; the mean over all is -inf where this is not 0.
+    """
+
+    nats: Interval | None
+    impossible: float
+
+
+@torch.no_grad()
+def likelihood(policy: Policy, derivation: Derivation) -> Likelihood:
+    """The likelihood of structures (L of them)."""
+    logp = policy.log_prob(derivation).double()
+    possible = logp > MASKED / 2
+    known = logp[possible].numpy()
+    nats = mean_interval(known, resamples(len(known))) if len(known) else None
+    return Likelihood(nats, 1 - float(possible.double().mean()))

@@ -1,0 +1,48 @@
+"""Checkpoints of a training in a run folder, and the log that goes with them."""
+
+import json
+import time
+
+from ..files import write_text
+from .run import Run
+
+SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
+
+
+class Keeper:
+    """Checkpoints of one training, at most every ``SAVE_EVERY`` seconds, with the lines of the log that belong to them.
+
+    The log is written before the checkpoint, and lines past the checkpoint are dropped when a run goes on.
+    """
+
+    def __init__(self, run: Run, name: str, training):
+        self.run, self.name, self.training = run, f"{name}-checkpoint", training
+        self.log = run.path / "log.jsonl"
+        self.lines = self.log.read_text(encoding="utf-8").splitlines() if self.log.exists() else []
+        self.saved = time.monotonic()
+        tensors = run.load(self.name)
+        if tensors is not None:
+            training.restore(tensors)
+        stage = {"features": "features", "guide": "structure"}[name]
+        self.lines = [line for line in self.lines if not self._is_past(json.loads(line), stage)]
+
+    def __call__(self, line: dict[str, float | str]) -> None:
+        self.lines.append(json.dumps(line))
+        if time.monotonic() - self.saved > SAVE_EVERY:
+            self._save()
+            self.saved = time.monotonic()
+
+    def finish(self) -> None:
+        """Write the log to its end."""
+        write_text(self.log, "".join(f"{line}\n" for line in self.lines))
+
+    def forget(self) -> None:
+        """Delete the checkpoint of a finished training."""
+        (self.run.path / f"{self.name}.safetensors").unlink(missing_ok=True)
+
+    def _save(self) -> None:
+        self.finish()
+        self.run.save(self.name, self.training.state())
+
+    def _is_past(self, line: dict, stage: str) -> bool:
+        return line["stage"] == stage and line.get("step", line.get("batch")) > self.training.done

@@ -1,0 +1,131 @@
+"""A model seen through its renderer and a feature network, as a fit sees it.
+
+Axis letters: N scenes, M nodes, D features, C H W.
+"""
+
+import hashlib
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from probscene.batch import RenderBatch
+from probscene.dataset import grey
+from probscene.inference.features.base import Examples, FeatureNet, class_table, examples
+from probscene.inference.features.counting.grouping import group_of
+from probscene.inference.features.counting.net import CountNet
+from probscene.inference.features.presence import PresenceNet
+from probscene.inference.features.projection import Projected
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.relations import relations
+from probscene.sampling import Scenes, run_program, sample
+
+from ..loading import renderer_for
+from .presets import COUNT_ON_PRETRAINED, Preset
+
+RENDERED_AT_ONCE = 64  # images in memory
+
+
+class Observer:
+    """A model seen through its renderer: labelled prior renders to train on, and features of scenes."""
+
+    def __init__(self, model: SceneModel, threads: int):
+        self.model, self.threads = model, threads
+        self.render = renderer_for(model, threads)
+        self.classes = class_table(model.grammar.kinds, model.classes)
+        carriers = {parent for parent, _ in relations(model.grammar)}
+        self.covered = torch.tensor([kind in carriers for kind in model.grammar.kinds] + [True])  # the last is padding
+
+    def draw(self, num: int) -> Examples:
+        """``num`` labelled renders of the prior."""
+        return self._labelled(sample(self.model, self.model.prior, num))
+
+    def draw_twice(self, num: int, policy: Policy) -> Examples:
+        """Labelled renders of ``num`` structures, and as many more of the same structures, their parameters anew."""
+        scenes = sample(self.model, policy, num)
+        both = self._labelled(scenes), self._labelled(run_program(self.model, scenes.derivation))
+        return Examples(*(torch.cat(parts) for parts in zip(*both, strict=True)))
+
+    def _labelled(self, scenes: Scenes) -> Examples:
+        groups, grammar = self.model.groups, self.model.grammar
+        by = ()
+        if groups is not None:
+            by = (group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind)), groups.along)
+        drawn = examples(self.render(scenes.drawing), self.classes, *by)
+        return drawn._replace(image=self._as_read(drawn.image))
+
+    def object_size(self, num: int = 64) -> float:
+        """How small objects are in the prior's renders, pixels: a tenth of those that can be seen have boxes of less
+        than the square of this; infinite where there are none."""
+        batch = self.render(sample(self.model, self.model.prior, num).drawing)
+        seen = (self.classes[batch.kind] >= 0) & (batch.pixels > 0)
+        size = (batch.amodal_box[..., 2:] - batch.amodal_box[..., :2]).prod(-1)[seen].sqrt()
+        return float(size.quantile(0.1)) if len(size) else math.inf
+
+    def observe(self, net: FeatureNet, draws_per_structure: int = 1) -> Callable[[Scenes], Tensor]:
+        """Render and embed, a few images at a time.
+
+        Args:
+            draws_per_structure: parameters are drawn so many times for each structure, and the drawing in which the
+                least visible object shows most is kept: what covers an object says nothing about its structure.
+        """
+
+        def features(scenes: Scenes) -> Tensor:
+            torch.set_num_threads(self.threads)
+            starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
+            images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
+            parts = [net.embed(self._as_read(some)) for some in images]
+            torch.set_num_threads(1)
+            return torch.cat(parts)
+
+        return features
+
+    def _as_read(self, images: Tensor) -> Tensor:
+        """Renders ``(N, 3, H, W)`` as ``ImageFolder`` would read them from files, ``(N, channels, H, W)``."""
+        return grey(images) if self.model.channels == 1 else images
+
+    def _clearest(self, scenes: Scenes, rows: slice, draws_per_structure: int) -> Tensor:
+        """Images ``(N, 3, H, W)``, each of the drawing that covers least of its least visible object."""
+        batch, derivation = self.render(scenes.drawing[rows]), scenes.derivation[rows]
+        image, best = batch.image, self._least_visible(batch)
+        for _ in range(draws_per_structure - 1):
+            again = (best < 1).nonzero().flatten()  # nothing is clearer than what is whole
+            if not len(again):
+                break
+            batch = self.render(run_program(self.model, derivation[again]).drawing)
+            least = self._least_visible(batch)
+            better = least > best[again]
+            image[again[better]], best[again[better]] = batch.image[better], least[better]
+        return image
+
+    def _least_visible(self, batch: RenderBatch) -> Tensor:
+        """``(N,)`` visible fraction of the least visible object; what can have others on it is meant to be covered."""
+        return batch.visible.where(~self.covered[batch.kind], 1.0).amin(1)
+
+
+def feature_net(preset: Preset, model: SceneModel) -> FeatureNet:
+    """The feature network of a preset, untrained, or pretrained with an empty projection or head.
+
+    Raises:
+        DataError: see ``pretrained``.
+    """
+    if preset.features == "presence":
+        return PresenceNet(model.classes)
+    if preset.features == COUNT_ON_PRETRAINED:
+        from probscene.inference.features.counting.pretrained import (
+            PretrainedCountNet,  # torchvision takes seconds to import
+        )
+
+        return PretrainedCountNet(model.classes, preset.directions, model.canvas, model.stuff)
+    if preset.features != "count":
+        from probscene.inference.features.pretrained import (  # torchvision takes seconds to import
+            pretrained,
+            weights_file,
+        )
+
+        net, file = pretrained(preset.features), weights_file(preset.features)
+        digest = bytes(32) if file is None else hashlib.sha256(file.read_bytes()).digest()
+        return Projected(net, preset.directions, digest)
+    return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)

@@ -1,0 +1,82 @@
+"""``--set key=value``: other values for single fields of a preset."""
+
+import math
+import types
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from probscene.errors import ProbsceneError
+from probscene.inference.guides.lstm import GUIDES
+from probscene.inference.objective import BASELINES
+
+from .presets import OBJECTIVES, TRAINED, Preset
+
+CHOICES = {
+    "features": TRAINED,
+    "objective": OBJECTIVES,
+    "baseline": BASELINES,
+    "guide": GUIDES,
+}
+LEAST = {"num_scenes": 2}
+ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate")
+
+
+def override(preset: Preset, settings: list[str]) -> Preset:
+    """A preset with ``settings`` such as ``"batches=2"``, ``"count.steps=32"`` or ``"width=8,16,32"``.
+
+    ``none`` stands for no value, ``true`` and ``false`` for themselves.
+
+    Raises:
+        ProbsceneError: no ``=``, an unknown field, or a value of another type or out of range.
+    """
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals:
+            raise ProbsceneError(f"Expected --set key=value, actual {setting!r}.")
+        preset = _replaced(preset, key.strip().split("."), text.strip(), key.strip())
+    return preset
+
+
+def _replaced(value: Any, path: list[str], text: str, key: str) -> Any:
+    name, *rest = path
+    known = [field.name for field in fields(value)]
+    if name not in known:
+        where = f" of {key.rpartition('.')[0]}" if "." in key else ""
+        raise ProbsceneError(f"Expected a setting{where} among {', '.join(known)}, actual {key!r} in --set.")
+    inner = getattr(value, name)
+    if rest and not is_dataclass(inner):
+        raise ProbsceneError(f"Expected --set {key.removesuffix('.' + '.'.join(rest))}=..., actual {key!r}.")
+    if is_dataclass(inner):
+        if not rest:
+            raise ProbsceneError(f"Expected --set {key}.{fields(inner)[0].name}=..., actual {key!r} alone.")
+        return replace(value, **{name: _replaced(inner, rest, text, key)})
+    new = _read(text, get_type_hints(type(value))[name], key)
+    _check(name, new, key)
+    return replace(value, **{name: new})
+
+
+def _read(text: str, wanted: Any, key: str) -> Any:
+    if isinstance(wanted, types.UnionType) or get_origin(wanted) is Union:
+        if text.lower() == "none":
+            return None
+        (wanted,) = (kind for kind in get_args(wanted) if kind is not types.NoneType)
+    try:
+        if get_origin(wanted) is tuple:
+            parts = [part.strip() for part in text.strip("()").split(",")]
+            return tuple(kind(part) for kind, part in zip(get_args(wanted), parts, strict=True))
+        if wanted is bool:
+            return {"true": True, "false": False}[text.lower()]
+        return wanted(text)
+    except (KeyError, ValueError):
+        kind = wanted.__name__ if isinstance(wanted, type) else str(wanted)
+        raise ProbsceneError(f"Expected --set {key}=<{kind}>, actual {text!r}.") from None
+
+
+def _check(name: str, value: Any, key: str) -> None:
+    if isinstance(value, str) and value not in CHOICES[name]:
+        raise ProbsceneError(f"Expected --set {key}=... among {', '.join(CHOICES[name])}, actual {value!r}.")
+    if type(value) is int and value < LEAST.get(name, 1):
+        raise ProbsceneError(f"Expected --set {key}=... of at least {LEAST.get(name, 1)}, actual {value}.")
+    if type(value) is float and not (math.isfinite(value) and (value > 0 or (value == 0 and name not in ABOVE_ZERO))):
+        least = "above 0" if name in ABOVE_ZERO else "of at least 0"
+        raise ProbsceneError(f"Expected --set {key}=... {least}, actual {value}.")

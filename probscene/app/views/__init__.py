@@ -1,0 +1,1 @@
+"""What a person looks at: reports, tables, pictures, scenes to turn."""

@@ -1,0 +1,165 @@
+"""Charts for a page: matplotlib's SVG, inline, in the colours of the page's style sheet, for light and dark alike.
+
+A colour here is a stand-in that becomes ``var(--name)``.
+"""
+
+import io
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+from probscene.inference.judging.metrics import Histogram
+
+from ..evaluation.evaluate import Evaluation
+from ..evaluation.structure_counts import GROUPS, PARENTS, label
+
+INK, FAINT = "#010203", "#010204"
+SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
+VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
+SMALL = 1e-3  # a share that would be no pixel high
+WIDE, SMALLER = (9.6, 2.9), (5.6, 2.5)  # inches
+STYLE = {
+    "svg.fonttype": "none",  # text stays text, in the page's font
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": INK,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.5,
+    "axes.grid.axis": "y",
+    "axes.axisbelow": True,
+}
+
+
+def numbers(evaluation: Evaluation) -> str:
+    """The share of images by number of objects."""
+    return _counts(
+        {name: source.number() for name, source in evaluation.sources.items()},
+        "objects in an image",
+        "share of images",
+        "number",
+    )
+
+
+def classes(evaluation: Evaluation) -> str:
+    """The share of objects by class."""
+    each = {name: source.classes() for name, source in evaluation.sources.items()}
+    return _bars(each, list(evaluation.classes), "class", "share of objects", "class")
+
+
+def nested(evaluation: Evaluation) -> list[str]:
+    """Where kinds nest: images by the number of each class, then parents by the number of their children."""
+    sources, charts = evaluation.sources, []
+    if not sources["learnt"].nested:
+        return charts
+    for c, kind in enumerate(evaluation.classes):
+        each = {name: source.kinds[c].histogram() for name, source in sources.items()}
+        charts.append(_counts(each, f"{kind} per image", "share of images", kind, SMALLER))
+    for relation in sources["learnt"].nested:
+        known = {name: source.nested[relation] for name, source in sources.items() if relation in source.nested}
+        for group in GROUPS:
+            each = {name: found[group].histogram() for name, found in known.items() if not found[group].empty}
+            if len(each) > 1 and not (group == PARENTS and relation[0] in evaluation.classes):  # that one is above
+                what = label(relation, group)
+                charts.append(_counts(each, what, "share of images" if group == PARENTS else "share", what, SMALLER))
+    return charts
+
+
+def curves(log: list[dict]) -> list[str]:
+    """Learning curves, one chart each: the feature network's loss, and what each batch of structures was like."""
+    features = [line for line in log if line["stage"] == "features"]
+    structure = [line for line in log if line["stage"] == "structure"]
+    charts = []
+    if features:
+        loss = _column(features, "loss")
+        charts.append(_curve("Feature network: loss", "step", _column(features, "step"), loss, log=loss.min() > 0))
+    if structure:
+        batch = _column(structure, "batch")
+        titles = {
+            "cost": "Structure: mean cost, and its spread",
+            "rejections": "Structure: rejected derivations a scene",
+            "length": "Structure: rules a derivation",
+        }
+        for key, title in titles.items():
+            spread = _column(structure, "cost_sd") if key == "cost" else None
+            charts.append(_curve(title, "batch", batch, _column(structure, key), spread))
+    return charts
+
+
+def _counts(each: dict[str, Histogram], x: str, y: str, salt: str, size: tuple[float, float] = WIDE) -> str:
+    """Shares by count, up to the last that can be seen."""
+    bins = 1 + max(int(np.flatnonzero(found.share >= SMALL).max(initial=0)) for found in each.values())
+    each = {name: Histogram(*(x[:bins] for x in found)) for name, found in each.items()}
+    step = 1 if size == WIDE else -(-bins // 12)
+    return _bars(each, [str(k) if k % step == 0 else "" for k in range(bins)], x, y, salt, size)
+
+
+def _bars(
+    each: dict[str, Histogram], ticks: list[str], x: str, y: str, salt: str, size: tuple[float, float] = WIDE
+) -> str:
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt, "axes.grid": True}):
+        figure, axes = _figure(*size)
+        width = 0.82 / len(each)
+        for i, (name, found) in enumerate(each.items()):
+            at = np.arange(len(found.share)) + (i - (len(each) - 1) / 2) * width
+            axes.bar(at, found.share, width * 0.92, color=SOURCES[name])
+            error = np.clip([found.share - found.low, found.high - found.share], 0, None)
+            axes.errorbar(at, found.share, error, fmt="none", ecolor=INK, elinewidth=0.8)
+        axes.set_xticks(range(len(ticks)), ticks)
+        axes.set_xlim(-0.6, len(ticks) - 0.4)
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel(x)
+        axes.set_ylabel(y)
+        axes.tick_params(length=0)
+        return _svg(figure)
+
+
+def _curve(
+    title: str, x: str, at: np.ndarray, value: np.ndarray, spread: np.ndarray | None = None, log: bool = False
+) -> str:
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": title, "axes.grid": True}):
+        figure, axes = _figure(3.8, 2.1)
+        if spread is not None:
+            axes.fill_between(at, value - spread, value + spread, color=SOURCES["learnt"], alpha=0.15, linewidth=0)
+        axes.plot(at, value, color=SOURCES["learnt"], linewidth=1.6)
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        if log:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_locator(NullLocator())
+        elif value.min() >= 0 and spread is None:
+            axes.set_ylim(0, max(1e-6, 1.05 * value.max()))
+        axes.set_title(title)
+        axes.set_xlabel(x)
+        axes.tick_params(length=0)
+        return _svg(figure)
+
+
+def _figure(width: float, height: float) -> tuple[Figure, Axes]:
+    figure = Figure((width, height), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _svg(figure: Figure) -> str:
+    out = io.StringIO()
+    figure.savefig(out, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = out.getvalue()
+    text = text[text.index("<svg") :]
+    for stand_in, variable in VARIABLES.items():
+        text = text.replace(stand_in, variable)
+    return text
+
+
+def _column(lines: list[dict], key: str) -> np.ndarray:
+    return np.array([line[key] for line in lines], float)

@@ -1,0 +1,104 @@
+"""A comparison as one picture: a column for each source, a row for each kind of count, the reference as an outline."""
+
+import textwrap
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from probscene.errors import DataError
+
+from ..evaluation.compare import ESTIMATE, PRIOR, TRUTH, Comparison, Row
+from ..evaluation.structure_counts import ALL, OTHERS, label
+from ..files import make_folder, write_whole
+
+COLOURS = {PRIOR: "#9aa3ad", TRUTH: "#30363d", ESTIMATE: "#30363d"}
+RUNS = ("#2b7bba", "#e07b39", "#3a9a5b", "#b04f9e", "#c9a227", "#5c6bc0")
+INK, FAINT = "#1f2328", "#d0d7de"
+SEPARATE = 4  # classes that get a row each; more share one
+SMALL = 2e-3  # a share that would be no pixel high
+CELL = (2.15, 1.25)  # inches
+
+
+def make_place(out: Path) -> None:
+    """See that a picture can be written to ``out``, before the work is done that it shows.
+
+    Raises:
+        DataError: ``out`` is a folder.
+        MachineError: its folder cannot be made.
+    """
+    if out.is_dir():
+        raise DataError(f"Expected a file to write the picture to, actual the folder {out}; name a file in it.")
+    make_folder(out.parent)
+
+
+def draw(comparison: Comparison, out: Path) -> None:
+    """Write the picture, a PNG, whole or not at all.
+
+    Raises:
+        MachineError: it cannot be written.
+    """
+    figure = picture(comparison)
+    write_whole(out, lambda temporary: figure.savefig(temporary, format="png", dpi=130, metadata={"Software": None}))
+
+
+def picture(comparison: Comparison) -> Figure:
+    """The figure: column heads are the sources' names, row heads say what is counted; every row has one scale."""
+    names, rows = list(comparison.sources), shown(comparison)
+    figure = Figure((1.5 + CELL[0] * len(names), 0.7 + CELL[1] * len(rows)), layout="constrained", facecolor="white")
+    grid = figure.subplots(len(rows), len(names), squeeze=False)
+    run_colours = dict(zip(comparison.runs, (RUNS[i % len(RUNS)] for i in range(len(comparison.runs))), strict=True))
+    for i, row in enumerate(rows):
+        bins = 1 + max(int(np.flatnonzero(share >= SMALL).max(initial=0)) for share in row.shares.values())
+        highest = max(share.max() for share in row.shares.values())
+        for j, name in enumerate(names):
+            axes = grid[i, j]
+            _cell(axes, row, name, comparison.reference, {**COLOURS, **run_colours}[name], bins, highest)
+            if row.label == "class of an object":
+                axes.set_xticks(range(bins), comparison.classes[:bins], rotation=90 if bins > 12 else 0)
+            if i == 0:
+                axes.annotate(
+                    textwrap.fill(_head(name), 22), (0.5, 1), (0, 18), "axes fraction", "offset points",
+                    ha="center", va="bottom", fontsize=10, fontweight="bold", color=INK,
+                )  # fmt: skip
+        grid[i, 0].set_ylabel(
+            textwrap.fill(row.label, 16), rotation=0, ha="right", va="center", fontsize=9, labelpad=8, color=INK
+        )
+    return figure
+
+
+def shown(comparison: Comparison) -> list[Row]:
+    """The rows of the picture: parents by rank, not pooled, and only ranks that the reference has; where there are many
+    classes, their shares alone."""
+    pooled = {label(relation, g) for relation in comparison.sources[PRIOR].nested for g in (ALL, OTHERS)}
+    reference, C = comparison.reference, len(comparison.classes)
+    rows = [row for row in comparison.rows() if row.label not in pooled and (not reference or reference in row.shares)]
+    return rows if C <= SEPARATE else [rows[0], comparison.shares_of_classes(), *rows[1 + C :]]
+
+
+def _head(name: str) -> str:
+    return "estimate, no labels" if name == ESTIMATE else name
+
+
+def _cell(axes: Axes, row: Row, name: str, reference: str | None, colour: str, bins: int, highest: float) -> None:
+    known = row.shares.get(reference)
+    if name in row.shares:
+        share = row.shares[name][:bins]
+        axes.bar(np.arange(len(share)), share, 0.86, color=colour)
+        said = [f"mean {row.means[name]:.2f}"] if name in row.means else []
+        said += [f"TV {row.apart[name]:.3f}"] if name in row.apart else []
+        axes.set_title("   ".join(said), loc="right", fontsize=7.5, color=INK, pad=3)
+    else:
+        axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", va="center", fontsize=8, color=INK)
+    if known is not None and name != reference:
+        outline = np.pad(known, (0, max(0, bins - len(known))))[:bins]
+        axes.stairs(outline, np.arange(bins + 1) - 0.5, color=COLOURS[reference], linewidth=1.0)
+    axes.set_xlim(-0.7, bins - 0.3)
+    axes.set_ylim(0, 1.05 * highest)
+    axes.xaxis.set_major_locator(MaxNLocator(min(8, bins), integer=True))
+    axes.set_yticks([])
+    axes.tick_params(length=2, labelsize=7.5, color=FAINT, labelcolor=INK)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(FAINT)

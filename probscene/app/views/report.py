@@ -1,0 +1,221 @@
+"""``probscene report``: one self-contained HTML page about a run: samples, histograms, curves, configuration."""
+
+import base64
+import html
+import io
+import json
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from PIL import Image
+
+from probscene.dataset import ImageFolder
+from probscene.errors import DataError
+
+from ..evaluation.evaluate import Evaluation, evaluate
+from ..evaluation.judge import SCENES, Judged, judge
+from ..evaluation.labels import read_labels
+from ..files import make_folder, write_text
+from ..fitting import session
+from ..fitting.run import Run
+from ..pictures import Pixels, grid, pixels, shrunk
+from ..progress import STAGES, Display
+from . import charts, tables, verdict_text
+from .preview import scenes
+
+SAMPLES = 16  # images a grid
+LEGEND = {
+    "prior": "prior",
+    "learnt": "learnt",
+    "truth": "truth (labels)",
+    "estimate": "estimate: what the feature network counts in the target's images, without labels",
+}
+
+
+def report(
+    run: Run,
+    show: Display,
+    out: Path | None = None,
+    labels: Path | None = None,
+    num: int = 10000,
+    judged_by: int = SCENES,
+) -> Path:
+    """Write the page.
+
+    Args:
+        out: ``report.html`` in the run folder where None.
+        labels: of the run's target, see ``read_labels``.
+        num: structures sampled a source.
+        judged_by: scenes rendered for the verdict, none where 0.
+
+    Returns:
+        Where it is.
+
+    Raises:
+        RunError: the fit is not finished.
+        DataError: labels that do not fit the target. Without labels, a target that is gone only leaves a gap.
+        MachineError: the page cannot be written.
+    """
+    run.guide()
+    images, absent = None, ""
+    try:
+        images = session.open_images(Path(run.record["target"]), run.model, run.record["skip_bad"], show)
+    except DataError as error:
+        if labels is not None:
+            raise
+        absent = str(error)
+    truth = None if labels is None else read_labels(labels, run.model, images)
+    evaluation = evaluate(run, images, truth, show, num)
+    judged = judge(run, images, show, judged_by, evaluation) if images and judged_by else None
+    return write(run, evaluation, images, out, absent, judged)
+
+
+def write(
+    run: Run,
+    evaluation: Evaluation,
+    images: ImageFolder | None,
+    out: Path | None = None,
+    absent: str = "",
+    judged: Judged | None = None,
+) -> Path:
+    """``report`` from what is known already; ``absent`` says why there are no target images."""
+    out = Path(out) if out is not None else run.path / "report.html"
+    make_folder(out.parent)
+    record, model = run.record, run.model
+    target = f"{len(images)} target images in {images.path}" if images else f"target {record['target']}"
+    page = Template(resources.files("probscene.app").joinpath("report.html").read_text(encoding="utf-8"))
+    write_text(
+        out,
+        page.substitute(
+            title=html.escape(f"probscene: {model.name}"),
+            subtitle=html.escape(
+                f"Run {run.path.resolve()}, {target}, seed {record['seed']}, version {record['version']}"
+            ),
+            trust=_trust(judged, images),
+            headline=_headline(evaluation),
+            samples=_samples(run, images, absent),
+            legend="".join(
+                f'<span><i style="background: var(--{name})"></i>{html.escape(LEGEND[name])}</span>'
+                for name in evaluation.sources
+            ),
+            numbers=charts.numbers(evaluation),
+            classes=charts.classes(evaluation),
+            nested=_nested(evaluation),
+            figures=_figures(evaluation),
+            note=_note(evaluation),
+            curves="".join(f'<div class="chart card">{chart}</div>' for chart in charts.curves(_log(run))),
+            grammar=html.escape(str(model.grammar)),
+            timing=_timing(run),
+            configuration=_table(["setting", "value"], _flat(record)),
+        ),
+    )
+    return out
+
+
+def _trust(judged: Judged | None, images: ImageFolder | None) -> str:
+    if judged is None or images is None:
+        return "<p>There is no verdict: no scenes were rendered to compare with target images.</p>"
+    if judged.trust is None:
+        return verdict_text.section(judged, "", "")
+    real = [pixels(images.load(i)[None])[0] for i in judged.real_unmatched]
+    return verdict_text.section(
+        judged,
+        _picture(real, f"Target images least like any generated scene: {', '.join(judged.names)}"),
+        _picture(list(judged.generated_unmatched), "Generated scenes least like any target image"),
+    )
+
+
+def _headline(evaluation: Evaluation) -> str:
+    rows = []
+    for b, found in evaluation.distances().items():
+        to = "to the truth" if b == "truth" else "to the network's estimate"
+        for key, what in (("number", "number of objects"), ("classes", "classes")):
+            prior, learnt = (_figure(found[a][key]) for a in ("prior", "learnt"))
+            rows.append(f'<div class="card">{what}, {to}<b>{prior} → {learnt}</b></div>')
+    if not rows:
+        return "<p>There are neither labels nor an estimate to compare with.</p>"
+    note = "Total variation: first the prior's, then that of what was learnt."
+    return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>'
+
+
+def _samples(run: Run, images: ImageFolder | None, absent: str) -> str:
+    model, parts = run.model, []
+    if images is None:
+        parts.append(f"<p>{html.escape(absent or 'The target images were not read.')}</p>")
+    else:
+        step = max(1, len(images) // SAMPLES)
+        some = [images.load(i) for i in range(0, len(images), step)][:SAMPLES]
+        parts.append(_picture([pixels(image[None])[0] for image in some], "Target: some of the images"))
+    for policy, caption in ((model.prior, "Prior: before learning"), (run.guide(), "Learnt: structures of the target")):
+        parts.append(_picture(pixels(scenes(model, policy, SAMPLES, 0).image), caption))
+    return "".join(parts)
+
+
+def _picture(images: list[Pixels], caption: str) -> str:
+    data = io.BytesIO()
+    Image.fromarray(grid([shrunk(image, 128) for image in images])).save(data, "PNG", optimize=True)
+    source = base64.b64encode(data.getvalue()).decode("ascii")
+    caption = html.escape(caption)
+    return (
+        f'<figure><img alt="{caption}" src="data:image/png;base64,{source}"><figcaption>{caption}</figcaption></figure>'
+    )
+
+
+def _note(evaluation: Evaluation) -> str:
+    notes = [f"Labels: {html.escape(note)}" for note in evaluation.notes]
+    if "estimate" in evaluation.sources:
+        notes.append(
+            "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; "
+            "its counts are rounded."
+        )
+    return " ".join(notes)
+
+
+def _nested(evaluation: Evaluation) -> str:
+    found = "".join(f'<div class="chart card">{chart}</div>' for chart in charts.nested(evaluation))
+    return f'<h3>By what counts depend on</h3><div class="row two">{found}</div>' if found else ""
+
+
+def _figures(evaluation: Evaluation) -> str:
+    """Every table of the evaluation that the charts do not hold."""
+    parts = []
+    for table in (*tables.nested(evaluation), *tables.likelihoods(evaluation), *tables.images(evaluation)):
+        head = [str(column.header).removesuffix(" *") for column in table.columns]
+        rows = list(zip(*(column.cells for column in table.columns), strict=True))
+        parts.append(
+            f'<h3>{html.escape(str(table.title).replace(" *", ""))}</h3><div class="chart">{_table(head, rows)}</div>'
+        )
+    return "".join(parts)
+
+
+def _log(run: Run) -> list[dict[str, Any]]:
+    path = run.path / "log.jsonl"
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+
+
+def _timing(run: Run) -> str:
+    spent = session.timing(run)
+    if not spent:
+        return "<p>No times were recorded.</p>"
+    rows = [(STAGES[stage][0], f"{spent[stage]:.1f} s") for stage in STAGES if stage in spent]
+    return _table(["stage", "time"], [*rows, ("All", f"{sum(spent.values()):.1f} s")])
+
+
+def _flat(record: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    rows = []
+    for key, value in sorted(record.items()):
+        inner = isinstance(value, dict)
+        rows += _flat(value, f"{prefix}{key}.") if inner else [(f"{prefix}{key}", str(value))]
+    return rows
+
+
+def _table(head: list[str], rows: list[tuple[str, str]]) -> str:
+    first = "".join(f"<th>{html.escape(name)}</th>" for name in head)
+    body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    return f"<table><tr>{first}</tr>{body}</table>"
+
+
+def _figure(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"

@@ -1,0 +1,1 @@
+"""The sprite renderer's tables and kernel."""

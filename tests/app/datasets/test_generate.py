@@ -1,0 +1,469 @@
+"""Datasets: labels that are the renderer's, bytes that depend on the settings alone, and work that is never lost."""
+
+import errno
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyro
+import pytest
+import torch
+from PIL import Image
+from pycocotools.coco import COCO
+
+import probscene
+from probscene.app.datasets import coco
+from probscene.app.datasets.generate import generate, generate_scenes, png
+from probscene.app.datasets.provenance import remake
+from probscene.app.fitting.run import Run
+from probscene.app.loading import load_model
+from probscene.dataset import ImageFolder
+from probscene.errors import DataError, MachineError, ProbsceneError, SamplingError
+from probscene.grammar import Rule
+from probscene.inference.guides.lstm import LSTMGuide
+
+PLATES = Path(__file__).parents[1] / "plates.py"
+GUIDE = {"hidden": 8}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder, by its relative path."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "provenance.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+def rng_states() -> str:
+    """The state of torch's, numpy's and Python's generators."""
+    states = pyro.util.get_rng_state()
+    return repr([states["torch"].tolist(), states["random"], states["numpy"][1].tolist(), states["numpy"][2:]])
+
+
+def a_run(path: Path, plates: float) -> Run:
+    """A run with a guide that nothing has taught; ``plates`` is a bias towards more of them."""
+    run = Run.create(path, str(PLATES), {"guide": GUIDE})
+    guide = LSTMGuide(run.model.grammar, run.model.max_steps, **GUIDE)
+    guide.out.bias.data[run.model.grammar.rules.index(Rule("Plates", "Plate", "Plates"))] += plates
+    run.save("guide", guide.state_dict())
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Run:
+    torch.manual_seed(0)
+    return a_run(tmp_path_factory.mktemp("run") / "run", 0.5)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model(str(PLATES))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(run, tmp_path_factory) -> Path:
+    """130 images: two chunks and two images of a third."""
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    generate(run, 130, out, seed=3)
+    return out
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation doesn't accept a copy:DeprecationWarning")  # pycocotools
+def test_coco_masks_and_boxes_are_the_renderers(model, tmp_path):
+    generate_scenes(model, model.prior, 80, tmp_path / "out", seed=1)
+    dataset = COCO(tmp_path / "out" / "annotations.json")
+    assert [c["name"] for c in dataset.loadCats(dataset.getCatIds())] == ["mug", "plate"]
+    assert sorted(dataset.getCatIds()) == [1, 2] and sorted(dataset.getImgIds()) == list(range(80))
+    seen = set()
+    for line in lines(tmp_path / "out"):
+        image, batch = remake(model, line)
+        info = dataset.loadImgs(line["index"])[0]
+        assert line["image"] == f"images/{info['file_name']}" and (info["height"], info["width"]) == (64, 64)
+        file = cv2.imread(str(tmp_path / "out" / line["image"]))
+        assert (file[..., ::-1] == image.permute(1, 2, 0).numpy()).all()
+        shown = np.setdiff1d(batch.instance[0].numpy(), 0)
+        found = dataset.loadAnns(dataset.getAnnIds(line["index"]))
+        assert len(found) == len(shown)
+        for annotation, instance in zip(found, shown, strict=True):
+            mask = batch.instance[0].numpy() == instance
+            assert (dataset.annToMask(annotation) == mask).all()
+            rows, columns = np.nonzero(mask)
+            x, y, w, h = annotation["bbox"]
+            extent = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+            assert (x, y, x + w, y + h) == extent
+            assert annotation["area"] == mask.sum() and annotation["iscrowd"] == 0
+            kind = batch.kind[0, instance - 1]
+            assert dataset.cats[annotation["category_id"]]["name"] == model.grammar.kinds[kind]
+            X, Y, W, H = annotation["amodal_bbox"]
+            assert X <= x and Y <= y and X + W >= x + w and Y + H >= y + h
+            visible = annotation["visible_fraction"]
+            assert 0 < visible <= 1 and abs(visible - float(batch.visible[0, instance - 1])) < 1e-6
+            seen |= {("cut", visible < 1), ("beyond", X < 0 or Y < 0 or X + W > 64 or Y + H > 64)}
+    assert len(dataset.getAnnIds()) == len(set(dataset.getAnnIds())) and min(dataset.getAnnIds()) == 1
+    assert len(seen) == 4
+
+
+def test_an_object_without_a_visible_pixel_has_no_annotation(model, tmp_path):
+    generate_scenes(model, model.prior, 256, tmp_path / "out", seed=1)
+    dataset = json.loads((tmp_path / "out" / "annotations.json").read_text())
+    spelt = [line["derivation"] for line in lines(tmp_path / "out")]
+    objects = sum(text.count("Plate -> plate") + text.count("Mugs -> mug") for text in spelt)
+    assert 0 < len(dataset["annotations"]) < objects
+    assert all(annotation["area"] > 0 for annotation in dataset["annotations"])
+
+
+def test_grey_where_colour_carries_nothing(model, tmp_path):
+    dull = replace(model, channels=1)
+    generate_scenes(model, model.prior, 5, tmp_path / "colour", format="images")
+    generate_scenes(dull, model.prior, 5, tmp_path / "grey", format="images")
+    assert not (tmp_path / "grey" / "annotations.json").exists()
+    assert not (tmp_path / "grey" / ".parts").exists()
+    names = sorted(path.name for path in (tmp_path / "grey" / "images").iterdir())
+    assert names == [f"00000{i}.png" for i in range(5)]
+    colour = ImageFolder(tmp_path / "colour" / "images", (64, 64), 1)
+    for i, line in enumerate(lines(tmp_path / "grey")):
+        path = tmp_path / "grey" / line["image"]
+        image, _ = remake(dull, line)
+        assert png(image) == path.read_bytes() and (image == colour.load(i)).all()
+        with Image.open(path) as pillow:
+            assert pillow.mode == "L" and (np.asarray(pillow.convert("RGB")) == image[0, ..., None].numpy()).all()
+        assert (cv2.imread(str(path)) == image[0, ..., None].numpy()).all()
+
+
+def test_provenance_says_where_an_image_comes_from(run, undisturbed):
+    for i, line in enumerate(lines(undisturbed)):
+        assert line["index"] == i and line["seed"] == 3 and line["model"] == "plates"
+        assert line["guide"] == run.guide_hash() and line["version"] == probscene.__version__
+        spelt = line["derivation"].split("; ")
+        assert spelt == [str(run.model.grammar.rules[rule]) for rule in line["rules"]]
+        nodes = {"plate": spelt.count("Plate -> plate(Mugs)"), "mug": spelt.count("Mugs -> mug Mugs")}
+        for site, values in line["parameters"].items():
+            assert len(values) == nodes.get(site.partition(".")[0], 1)
+
+
+def test_every_image_is_made_again_from_its_line(run, undisturbed):
+    for line in lines(undisturbed):
+        image, batch = remake(run.model, line)
+        assert png(image) == (undisturbed / line["image"]).read_bytes()
+        assert image.shape == (3, 64, 64) and batch.instance.shape == (1, 64, 64)
+
+
+def test_a_line_that_is_not_the_models_is_refused(run, undisturbed):
+    line = next(line for line in lines(undisturbed) if len(line["parameters"]["plate.x"]) == 1)
+    wrong = [
+        {},
+        "text",
+        {**line, "rules": [99]},
+        {**line, "rules": line["rules"][1:]},
+        {**line, "rules": line["rules"][::-1], "derivation": "; ".join(line["derivation"].split("; ")[::-1])},
+        {**line, "derivation": line["derivation"].replace("plate", "dish")},
+        {**line, "parameters": {**line["parameters"], "plate.x": []}},
+        {**line, "parameters": {**line["parameters"], "plate.x": ["left"]}},
+        {**line, "parameters": {**line["parameters"], "cup.x": []}},
+        {**line, "parameters": {site: v for site, v in line["parameters"].items() if site != "plate.x"}},
+    ]
+    for bad in wrong:
+        with pytest.raises(DataError, match="Expected"):
+            remake(run.model, bad)
+
+
+def test_same_bytes_for_two_workers(run, undisturbed, tmp_path):
+    told = []
+    made = generate(run, 130, tmp_path / "out", seed=3, workers=2, progress=lambda *now: told.append(now))
+    assert made == (tmp_path / "out", 130)
+    assert contents(tmp_path / "out") == contents(undisturbed)
+    assert told[0] == (0, 130) and told[-1] == (130, 130) and len(told) == 4
+    assert not multiprocessing.active_children()
+
+
+def test_same_bytes_whatever_the_process_does(run, undisturbed, tmp_path):
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        torch.rand(3)
+        generate(run, 130, tmp_path / "out", seed=3)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert contents(tmp_path / "out") == contents(undisturbed)
+
+
+def test_the_callers_random_numbers_are_left_alone(model, tmp_path):
+    before = rng_states()
+    generate_scenes(model, model.prior, 1, tmp_path / "out")
+    remake(model, lines(tmp_path / "out")[0])
+    assert rng_states() == before
+
+
+@pytest.mark.parametrize("num", [1, 64, 70])
+def test_a_shorter_dataset_is_the_beginning_of_a_longer_one(run, undisturbed, tmp_path, num):
+    generate(run, num, tmp_path / "out", seed=3)
+    short, long = contents(tmp_path / "out"), contents(undisturbed)
+    images = [name for name in short if name.startswith("images/")]
+    assert len(images) == num and all(short[name] == long[name] for name in images)
+    assert lines(tmp_path / "out") == lines(undisturbed)[:num]
+    short, long = (json.loads(c["annotations.json"])["annotations"] for c in (short, long))
+    assert short == [annotation for annotation in long if annotation["image_id"] < num]
+
+
+def test_seeds_and_chunks_differ(run, undisturbed, tmp_path):
+    generate(run, 64, tmp_path / "out", seed=4)
+    first = [line["parameters"]["light"] for line in lines(undisturbed)]
+    assert len(set(map(tuple, first))) == 130
+    assert not set(map(tuple, first)) & {tuple(line["parameters"]["light"]) for line in lines(tmp_path / "out")}
+
+
+class Cut(KeyboardInterrupt):
+    """An interrupt at a chosen moment."""
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_interrupted_at_every_step_it_goes_on(run, tmp_path, monkeypatch, after):
+    generate(run, 3, tmp_path / "whole", seed=3)
+    whole = contents(tmp_path / "whole")
+    rename = os.replace
+    for step in range(20):
+        left = step
+        out = tmp_path / f"cut{step}"
+
+        def replace_once(source, target):
+            nonlocal left
+            left -= 1
+            if left == -1 and not after:
+                raise Cut
+            rename(source, target)
+            if left == -1:
+                raise Cut
+
+        monkeypatch.setattr(os, "replace", replace_once)
+        try:
+            generate(run, 3, out, seed=3)
+        except Cut:
+            shown = {name: data for name, data in contents(out).items() if not name.startswith(".")}
+            assert shown.items() <= whole.items()  # whole or absent
+            monkeypatch.setattr(os, "replace", rename)
+            generate(run, 3, out, seed=3)
+            assert contents(out) == whole
+        else:
+            assert step == 9 and contents(out) == whole  # settings, 3 images, a record, 2 labels written and 2 moved
+            return
+    pytest.fail("the work never ended")
+
+
+def half(write):
+    """A write that fills the disk half-way."""
+
+    def fill(path, data, *args, **kwargs):
+        write(path, data[: len(data) // 2], *args, **kwargs)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    return fill
+
+
+def half_labels(path, *args):
+    path.write_text('{"info": ')
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize(
+    "where, name, call, full",
+    [
+        (Path, "write_bytes", 70, half(Path.write_bytes)),  # an image of the second chunk
+        (Path, "write_text", 1, half(Path.write_text)),  # the settings
+        (Path, "write_text", 3, half(Path.write_text)),  # the second chunk's record
+        (coco, "write", 1, half_labels),
+    ],
+)
+def test_a_full_disk_leaves_nothing_half_written(run, undisturbed, tmp_path, monkeypatch, where, name, call, full):
+    out, writes = tmp_path / "out", getattr(where, name)
+    calls = 0
+
+    def fills(*args, **kwargs):
+        nonlocal calls
+        calls += 1
+        return (full if calls == call else writes)(*args, **kwargs)
+
+    monkeypatch.setattr(where, name, fills)
+    with pytest.raises(MachineError, match="The disk is full") as error:
+        generate(run, 130, out, seed=3)
+    assert error.value.exit_code == 1
+    monkeypatch.setattr(where, name, writes)
+    shown = {name: data for name, data in contents(out).items() if not name.startswith(".")}
+    assert shown.items() <= contents(undisturbed).items() and not (out / "annotations.json").exists()
+    generate(run, 130, out, seed=3)
+    assert contents(out) == contents(undisturbed)
+
+
+PROGRAM = """
+import multiprocessing, sys, time
+from pathlib import Path
+from probscene.app.datasets.generate import generate
+from probscene.app.fitting.run import Run
+
+def progress(done, num):
+    if 0 < done < num:
+        print(*(process.pid for process in multiprocessing.active_children()), flush=True)
+        time.sleep(300)
+
+if __name__ == "__main__":
+    generate(Run.open(Path(sys.argv[1])), 130, Path(sys.argv[2]), seed=3, workers=2, progress=progress)
+"""
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended; one that nobody has waited for counts."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_killed_in_mid_run_it_goes_on_to_the_same_bytes(run, undisturbed, tmp_path, how):
+    script, out = tmp_path / "script.py", tmp_path / "out"
+    script.write_text(PROGRAM)
+    environment = {**os.environ, "PYTHONPATH": str(Path(probscene.__file__).parents[1])}
+    with subprocess.Popen(
+        [sys.executable, script, run.path, out],
+        env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    ) as process:  # fmt: skip
+        workers = [int(pid) for pid in process.stdout.readline().split()]
+        if how == signal.SIGINT:
+            os.killpg(process.pid, how)  # as a terminal does: to every process of the group
+        else:
+            process.send_signal(how)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == -how and "in a worker" not in said
+    assert said.count("Traceback") == (how == signal.SIGINT)  # of the parent's KeyboardInterrupt alone
+    assert workers and not (out / "provenance.jsonl").exists()
+    for pid in workers:
+        for _ in range(600):
+            if gone(pid):
+                break
+            signal.sigtimedwait([], 0.1)
+        assert gone(pid)
+    told = []
+    made = generate(run, 130, out, seed=3, progress=lambda *now: told.append(now)).made
+    assert 0 < told[0][0] == 130 - made
+    assert contents(out) == contents(undisturbed)
+
+
+def test_a_killed_worker_is_one_clear_message(run, undisturbed, tmp_path):
+    def kill(done, num):
+        for process in multiprocessing.active_children() if done else ():
+            process.kill()
+
+    with pytest.raises(MachineError, match="A worker process was killed.*same command again"):
+        generate(run, 300, tmp_path / "out", seed=3, workers=2, progress=kill)
+    assert not multiprocessing.active_children()
+    made = generate(run, 300, tmp_path / "out", seed=3).made
+    assert 0 < made < 300
+    assert contents(undisturbed)["images/000129.png"] == contents(tmp_path / "out")["images/000129.png"]
+
+
+def test_a_workers_error_is_the_same_as_without_workers(tmp_path):
+    endless = a_run(tmp_path / "run", 50.0)
+    messages = []
+    for workers in (1, 2):
+        with pytest.raises(SamplingError, match="max_steps = 40") as error:
+            generate(endless, 2, tmp_path / f"out{workers}", workers=workers)
+        messages.append(str(error.value))
+    assert messages[0] == messages[1]
+
+
+def test_a_finished_dataset_is_left_alone(run, undisturbed):
+    before = {path: path.stat().st_mtime_ns for path in undisturbed.rglob("*")}
+    assert generate(run, 130, undisturbed, seed=3).made == 0
+    assert {path: path.stat().st_mtime_ns for path in undisturbed.rglob("*")} == before
+    for settings in ({"seed": 4}, {"num": 131}, {"num": 64}, {"format": "images"}):
+        with pytest.raises(DataError, match="settings that the dataset .* was begun with"):
+            generate(run, **{"num": 130, "seed": 3, **settings}, out=undisturbed)
+    (undisturbed / ".parts").mkdir()  # interrupted while it tidied up
+    assert generate(run, 130, undisturbed, seed=3).made == 0
+    assert not (undisturbed / ".parts").exists()
+
+
+def test_an_unfinished_dataset_is_of_its_own_settings(run, tmp_path, monkeypatch):
+    def cut(path, *args):
+        raise Cut
+
+    monkeypatch.setattr(coco, "write", cut)
+    with pytest.raises(Cut):
+        generate(run, 3, tmp_path / "out", seed=3)
+    with pytest.raises(DataError, match=r"begun with \(seed 3, num 3\), actual seed 4, num 5; give the same"):
+        generate(run, 5, tmp_path / "out", seed=4)
+    other = a_run(tmp_path / "other", 0.2)
+    with pytest.raises(DataError, match=r"begun with \(guide "):
+        generate(other, 3, tmp_path / "out", seed=3)
+
+
+def test_damaged_parts_are_made_again(run, tmp_path, monkeypatch):
+    write = coco.write
+
+    def cut(path, *args):
+        raise Cut
+
+    generate(run, 130, tmp_path / "whole", seed=3)
+    monkeypatch.setattr(coco, "write", cut)
+    out = tmp_path / "out"
+    with pytest.raises(Cut):
+        generate(run, 130, out, seed=3)
+    (out / "images" / "000001.png").write_bytes(b"")
+    (out / ".parts" / "000001.json").write_text("{")
+    monkeypatch.setattr(coco, "write", write)
+    assert generate(run, 130, out, seed=3).made == 128
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_folders_that_cannot_take_a_dataset(run, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".hidden").write_text("")
+    (tmp_path / "out" / "thesis.tex").write_text("")
+    with pytest.raises(DataError, match="new or empty folder for the dataset.*thesis.tex"):
+        generate(run, 1, tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [".hidden", "thesis.tex"]
+    with pytest.raises(DataError, match="a file in the way"):
+        generate(run, 1, tmp_path / "out" / "thesis.tex")
+    (tmp_path / "out" / "provenance.jsonl").write_text("a poem\n")
+    with pytest.raises(DataError, match="lines of provenance"):
+        generate(run, 1, tmp_path / "out")
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / ".hidden").write_text("")
+    assert generate(run, 1, tmp_path / "new" / "deeper" / "out").made == 1
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"num": 0}, "positive number of images, actual 0"),
+        ({"num": -3}, "positive number of images, actual -3"),
+        ({"workers": 0}, "positive number of workers, actual 0"),
+        ({"seed": -1}, "seed of 0 or more, actual -1"),
+        ({"format": "voc"}, "formats among coco, yolo, kitti, webdataset, images, actual 'voc'"),
+    ],
+)
+def test_wrong_numbers(run, tmp_path, wrong, message):
+    with pytest.raises(ProbsceneError, match=message) as error:
+        generate(run, **{"num": 1, "out": tmp_path / "out", **wrong})
+    assert error.value.exit_code == 2 and not (tmp_path / "out").exists()
+
+
+def test_memory_is_flat(model, tmp_path):
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("no /proc on this machine")
+    large = replace(model, canvas=(256, 256))  # a chunk's renders are 21 MB
+    resident = []
+
+    def measure(done, num):
+        resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20)
+
+    generate_scenes(large, model.prior, 20 * 64, tmp_path / "out", progress=measure)
+    assert max(resident) - resident[4] < 100

@@ -1,0 +1,82 @@
+"""FID and KID of a run: of as many images on either side, against one half of the target, and that half's other."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from probscene.app.evaluation.image_distances import image_distances
+from probscene.app.fitting.run import Run
+from probscene.app.fitting.scene_features import features_in, features_of, own_net
+from probscene.dataset import ImageFolder
+from probscene.errors import DataError, ProbsceneError
+from probscene.inference.judging.image_metrics import fid, kid
+
+
+@pytest.fixture(scope="module")
+def run(fitted) -> Run:
+    return Run.open(fitted)
+
+
+@pytest.fixture(scope="module")
+def images(run, target) -> ImageFolder:
+    return ImageFolder(target.images, run.model.canvas, run.model.channels)
+
+
+def test_figures_are_those_of_the_features(run, images):
+    told = []
+    found = image_distances(run, images, ["run"], lambda *said: told.append(said[:3]), 15, seed=2)
+    assert told[-1] == ("comparing", 70, 70) and list(found) == ["run"]
+    assert list(found["run"]) == ["prior", "learnt", "floor"]
+    net = own_net(run)
+    real = features_in(run, images, net)[torch.randperm(40, generator=torch.Generator().manual_seed(2))]
+    sides = {
+        "prior": features_of(run, run.model.prior, 15, net, 2),
+        "learnt": features_of(run, run.guide(), 15, net, 2),
+        "floor": real[15:30],
+    }
+    for source, side in sides.items():
+        for figure, distance in zip(found["run"][source], (fid, kid), strict=True):
+            expected = distance(real[:15], side, "run", seed=2)
+            assert figure.value == pytest.approx(expected.value, rel=1e-3) and figure.images == 15
+            assert figure[:2] == expected[:2] and figure.low <= figure.value <= figure.high
+
+
+def test_no_more_than_half_of_the_target(run, images):
+    found = image_distances(run, images, ["run"], lambda *_: None, 1000)
+    assert {figure.images for each in found["run"].values() for figure in each} == {20}
+
+
+def test_faults_come_before_any_work(run, images, target, tmp_path):
+    def never(*_):
+        raise AssertionError
+
+    assert image_distances(run, images, [], never) == {}
+    with pytest.raises(ProbsceneError, match="run, efficientnet, .* or resnet50=FILE, actual 'vgg'"):
+        image_distances(run, images, ["run", "vgg"], never)
+    with pytest.raises(ProbsceneError, match="at least 2 images to compare, actual 1"):
+        image_distances(run, images, ["run"], never, 1)
+    for name in ("000000.png", "000001.png", "000002.png"):
+        (tmp_path / name).write_bytes((target.images / name).read_bytes())
+    few = ImageFolder(tmp_path, run.model.canvas, run.model.channels)
+    with pytest.raises(DataError, match="at least 4 images .* actual 3"):
+        image_distances(run, few, ["run"], never)
+
+
+def test_the_command_prints_and_writes_them(call, fitted, target, tmp_path):
+    words = ["evaluate", fitted, "--target", target.images, "--num", 50, "--images", 10, "--scenes", 0]
+    shown = call(*words, "--features", "run", "--features", "efficientnet", "--json", tmp_path / "e.json")
+    assert shown.code == 0, shown.err
+    record = json.loads((tmp_path / "e.json").read_text())["images"]
+    assert list(record) == ["efficientnet-lite0", "run"]  # written in order
+    for name, each in record.items():
+        for source in ("prior", "learnt", "floor"):
+            for metric in ("FID", "KID"):
+                figure = each[source][metric]
+                assert figure["features"] == name and figure["images"] == 10 and math.isfinite(figure["value"])
+                assert f"{figure['value']:.4g} ±" in shown.out
+    assert "in the features of efficientnet-lite0" in shown.out and "FID, 10 images a side" in shown.out
+    assert "FID of 10 images in 1280 dimensions" in shown.out and "two halves of the target" in shown.out
+    wrong = call(*words, "--features", "resnet", "--json", tmp_path / "f.json")
+    assert wrong.code == 2 and "actual 'resnet'" in wrong.err and not (tmp_path / "f.json").exists()

@@ -1,0 +1,196 @@
+"""The verdict on real renders: right where one knows it, held against labels, shown by both commands."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from probscene.app.datasets.generate import generate_scenes
+from probscene.app.evaluation import judge as verdict
+from probscene.app.evaluation.evaluate import evaluate
+from probscene.app.evaluation.judge import judge
+from probscene.app.evaluation.label_agreement import agreement
+from probscene.app.evaluation.labels import counts_of_dataset, read_labels, write_counts
+from probscene.app.evaluation.sources import Source
+from probscene.app.fitting.run import Run
+from probscene.app.loading import load_model
+from probscene.dataset import ImageFolder
+from probscene.errors import DataError, ProbsceneError
+from probscene.inference.judging.verdict import Verdict
+from probscene.structure import StructurePrior, counts, weights
+
+IMAGES, SCENES = 200, 300
+
+
+def quiet(*_):
+    pass
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fewer_looks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verdict, "LOOKS", 12)
+        yield
+
+
+class Guided(Run):
+    """A run whose guide is any policy."""
+
+    policy = None
+
+    def guide(self):
+        return self.policy or super().guide()
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory, discs):
+    """Folders of images: of the truth, with more discs than anything here makes, and of another domain."""
+    folder, model = tmp_path_factory.mktemp("drawn"), load_model(str(discs.file))
+
+    def images(name, of, policy):
+        generate_scenes(of, policy, IMAGES, folder / name, format="images")
+        return ImageFolder(folder / name / "images", model.canvas, 3)
+
+    truth, elsewhere = model.target(0), load_model("aerial2d")
+    crowd = structure(model, (0, 0, 0, 0, 0, 1), (1, 1))
+    target = images("target", truth, truth.prior)
+    write_counts(folder / "counts.csv", *counts_of_dataset(truth, folder / "target"), truth.classes)
+    return SimpleNamespace(
+        target=target,
+        labels=folder / "counts.csv",
+        crowd=images("crowd", model, crowd),
+        aerial=images("aerial", elsewhere, elsewhere.prior),
+    )
+
+
+@pytest.fixture(scope="module")
+def seeing(call, drawn, discs, tmp_path_factory):
+    """A run whose network has learnt to tell five discs from three; the one that all tests share has not."""
+    out = tmp_path_factory.mktemp("seeing") / "run"
+    settings = [word.replace("count.steps=48", "count.steps=300") for word in discs.settings]
+    done = call("fit", discs.file, "--target", drawn.target.path, "--out", out, *settings)
+    assert done.code == 0, done.err
+    return out
+
+
+def structure(model, number, colour) -> StructurePrior:
+    return StructurePrior(model.grammar, Discs=counts(*number), Disc=weights(*colour))
+
+
+def guided(path, policy) -> Guided:
+    run = Guided.open(path)
+    run = Guided(run.path, run.record)
+    run.policy = policy(run.model)
+    return run
+
+
+CASES = {
+    "a good fit": (lambda m: m.target(0).prior, "target", Verdict.GOOD),
+    "the prior": (lambda m: m.prior, "target", Verdict.NOT_FITTED),
+    "one mode": (lambda m: structure(m, (0, 1), (4, 1)), "target", Verdict.MODES_LOST),
+    "more than can be made": (lambda m: structure(m, (0, 0, 0, 1), (1, 1)), "crowd", Verdict.OUT_OF_REACH),
+    "another domain": (lambda m: m.target(0).prior, "aerial", Verdict.ANOTHER_DOMAIN),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_verdict_on_renders_is_right(case, seeing, drawn):
+    policy, folder, expected = CASES[case]
+    target = getattr(drawn, folder)
+    told = []
+    found = judge(guided(seeing, policy), target, lambda *said: told.append(said), SCENES)
+    assert found.trust.verdict == expected, found.trust.because
+    assert told[-1][0] == "judging" and told[-1][1] == told[-1][2]
+    assert len(found.real_unmatched) == len(found.generated_unmatched) == verdict.SHOWN
+    assert found.names == tuple(target.paths[i].name for i in found.real_unmatched)
+    assert all(picture.shape == (64, 64, 3) for picture in found.generated_unmatched)
+    record = json.loads(json.dumps(found.record(), allow_nan=False))
+    assert record["verdict"] == str(expected) and "labels" not in record
+    assert set(record["single_features"]) == {"red", "blue", "total"}
+
+
+def test_the_same_run_has_the_same_verdict(seeing, drawn):
+    run = Run.open(seeing)
+    one, other = (judge(run, drawn.target, quiet, 100) for _ in range(2))
+    assert one.record() == other.record()
+    assert all(np.array_equal(a, b) for a, b in zip(one.generated_unmatched, other.generated_unmatched, strict=True))
+
+
+@pytest.mark.parametrize(("some", "close"), [(True, True), (False, False)])
+def test_labels_say_whether_the_verdict_was_right(some, close, seeing, drawn, tmp_path):
+    lines = drawn.labels.read_text().splitlines()
+    (tmp_path / "c.csv").write_text("\n".join(lines[:61] if some else lines))
+    model = load_model(Run.open(seeing).record["model"])
+    labels = read_labels(tmp_path / "c.csv", model, drawn.target, some)
+    assert len(labels.structures) == (60 if some else IMAGES)
+    run = guided(seeing, lambda m: m.target(0).prior if close else m.prior)
+    found = judge(run, drawn.target, quiet, SCENES, evaluate(run, drawn.target, labels, quiet, 2000))
+    assert found.agreement.close == close and found.agreement.agrees(found.trust.verdict)
+    record = json.loads(json.dumps(found.record(), allow_nan=False))["labels"]
+    assert record["agree"] and record["because"].startswith("The labels agree")
+    assert record["images"] == len(labels.structures)
+    assert set(record["each"]) == {"number of objects", "red", "blue"}
+
+
+def test_labels_disagree_where_the_network_counts_wrongly():
+    rng = np.random.default_rng(0)
+    truth = Source.of(rng.multinomial(6, [0.5, 0.5], 300))
+    same, other = Source.of(rng.multinomial(6, [0.5, 0.5], 5000)), Source.of(rng.multinomial(6, [0.8, 0.2], 5000))
+    right, wrong = (agreement(side, truth, ("a", "b")) for side in (same, other))
+    assert right.close and right.agrees(Verdict.GOOD) and not right.agrees(Verdict.APART)
+    assert not wrong.close and wrong.agrees(Verdict.APART) and not wrong.agrees(Verdict.GOOD)
+    assert "counts wrongly" in wrong.sentence(Verdict.GOOD) and "it is the features" in right.sentence(Verdict.APART)
+    assert wrong.worst != "number of objects"  # that is always six
+
+
+def test_labels_of_one_distribution_rarely_disagree():
+    rng = np.random.default_rng(0)
+    close = 0
+    for seed in range(40):
+        truth, learnt = (Source.of(rng.poisson([2, 0.3, 5], (n, 3))) for n in (120, 3000))
+        close += agreement(learnt, truth, ("a", "b", "c"), seed).close
+    assert close >= 38
+
+
+def test_both_commands_say_it(call, seeing, drawn, tmp_path):
+    words = ["evaluate", seeing, "--target", drawn.target.path, "--num", 300, "--scenes", 120]
+    done = call(*words, "--labels", drawn.labels, "--json", tmp_path / "e.json")
+    assert done.code == 0, done.err
+    record = json.loads((tmp_path / "e.json").read_text())["trust"]
+    assert done.out.startswith(f"Verdict: {record['verdict']}.\n{record['because']}\n{record['remedy']}\n")
+    assert record["labels"]["because"] in done.out and record["unlike_images"][0] in done.out
+    done = call("report", seeing, "--out", tmp_path / "r.html", "--num", 300, "--scenes", 120)
+    assert done.code == 0, done.err
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Can this fit be trusted?" in page and "Target images least like any generated scene: 000" in page
+
+
+def test_too_few_images_have_no_verdict_and_are_still_compared(call, seeing, drawn, tmp_path):
+    (tmp_path / "few").mkdir()
+    for path in drawn.target.paths[:12]:
+        (tmp_path / "few" / path.name).write_bytes(path.read_bytes())
+    done = call("evaluate", seeing, "--target", tmp_path / "few", "--num", 100, "--json", tmp_path / "e.json")
+    assert done.code == 0 and "No verdict. Expected at least 40 real images for a verdict, actual 12" in done.out
+    assert json.loads((tmp_path / "e.json").read_text())["trust"]["verdict"] is None
+
+
+def test_images_that_are_all_the_same_have_no_verdict(seeing, drawn, tmp_path):
+    for i in range(40):
+        (tmp_path / f"{i}.png").write_bytes(drawn.target.paths[0].read_bytes())
+    found = judge(Run.open(seeing), ImageFolder(tmp_path, (64, 64), 3), quiet, 64)
+    assert found.trust is None and "identical" in found.absent
+
+
+def test_wrong_numbers_and_no_labels_at_all(call, seeing, drawn, tmp_path):
+    with pytest.raises(ProbsceneError, match="at least 40 scenes to judge by, actual 39"):
+        judge(Run.open(seeing), drawn.target, quiet, 39)
+    (tmp_path / "c.csv").write_text("image,red,blue\n")
+    with pytest.raises(DataError, match="a row for every image"):
+        read_labels(tmp_path / "c.csv", load_model(Run.open(seeing).record["model"]), drawn.target, some=True)
+    short = "\n".join(drawn.labels.read_text().splitlines()[:20])
+    (tmp_path / "c.csv").write_text(short)
+    words = ["evaluate", seeing, "--target", drawn.target.path, "--num", 100, "--scenes", 0]
+    refused = call(*words, "--labels", tmp_path / "c.csv")
+    assert refused.code == 2 and "--some-labels" in refused.err
+    assert call(*words, "--labels", tmp_path / "c.csv", "--some-labels").code == 0

@@ -1,0 +1,178 @@
+"""A fit by a pretrained network's features, through the command line."""
+
+import json
+import shutil
+
+import pytest
+import safetensors.torch
+import torch
+from torchvision.models import inception_v3
+
+from probscene.app.fitting.observer import feature_net
+from probscene.app.fitting.presets import QUICK, preset
+from probscene.app.fitting.run import Run
+from probscene.app.fitting.scene_features import own_net
+from probscene.dataset import ImageFolder
+from probscene.errors import RunError
+from probscene.inference.features.base import embed_all
+from probscene.inference.features.projection import SHARE
+
+FEW = {"pairs": 40, "directions": 3, "batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
+WORDS = ["--preset", "quick", "--threads", "1", *(w for k, v in FEW.items() for w in ("--set", f"{k}={v}"))]
+
+
+@pytest.fixture(scope="module")
+def run(call, discs, target, tmp_path_factory):
+    out = tmp_path_factory.mktemp("pretrained") / "run"
+    words = ["fit", discs.file, "--target", target.images, "--out", out, "--features", "efficientnet", *WORDS]
+    done = call(*words)
+    assert done.code == 0, done.err
+    return Run.open(out), words
+
+
+def test_the_network_is_recorded_and_only_its_projection_kept(run, target):
+    run, _ = run
+    assert run.record["preset"]["features"] == "efficientnet" and run.record["preset"]["marginal_variance"] is None
+    net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
+    assert (run.path / "features.safetensors").stat().st_size < 40_000
+    seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
+    assert seen.shape == (9, len(net.names)) == (9, 3)
+    assert torch.allclose(seen, run.load("real")["features"][:9], atol=1e-4)
+
+
+def test_the_log_says_how_the_projection_came_out(run):
+    first, *rest = map(json.loads, (run[0].path / "log.jsonl").read_text().splitlines())
+    assert first["stage"] == "projection" and first["ratio"] == sorted(first["ratio"], reverse=True)
+    assert first["self_share"] == pytest.approx(SHARE, rel=0.05) and first["ratio"][0] > 2
+    assert [line["stage"] for line in rest] == ["structure"] * 2
+
+
+def test_it_goes_on_to_the_same_result(run, call, tmp_path, discs, target):
+    run, words = run
+    again = tmp_path / "again"
+    words = [again if word == run.path else word for word in words]
+    assert call(*words).code == 0
+    guide = (again / "guide.safetensors").read_bytes()
+    assert guide == (run.path / "guide.safetensors").read_bytes()
+    for name in ("guide", "real"):
+        (again / f"{name}.safetensors").unlink()
+    done = call("fit", "--out", again, "--resume", "--features", "count", *WORDS)
+    assert done.code == 2 and "features" in done.err and "efficientnet" in done.err
+    done = call("fit", "--out", again, "--resume")
+    assert done.code == 0, done.err
+    assert (again / "guide.safetensors").read_bytes() == guide
+
+
+def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
+    run, _ = run
+    words = [
+        "--target",
+        target.images,
+        "--labels",
+        target.labels,
+        "--num",
+        200,
+        "--scenes",
+        40,
+        "--json",
+        tmp_path / "e.json",
+    ]
+    done = call("evaluate", run.path, *words)
+    assert done.code == 0, done.err
+    found = json.loads((tmp_path / "e.json").read_text())
+    assert found["trust"] is not None
+    assert "estimate" not in found["sources"] and "truth" in found["sources"]  # a direction is no count
+    assert call("report", run.path, "--num", 200, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
+
+
+def test_further_views_of_the_target_are_learnt_from_and_not_judged(run, call, target, tmp_path):
+    run, words = run
+    again = tmp_path / "again"
+    assert call(*[again if word == run.path else word for word in words], "--set", "views=3").code == 0
+    one, other = run.load("real"), Run.open(again).load("real")
+    assert torch.equal(one["features"], other["features"]) and other["views"].shape == (80, 3) and "views" not in one
+    net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
+    assert torch.allclose(embed_all(net, images.batches(64, 2)), other["views"][40:], atol=1e-4)
+    guide = (again / "guide.safetensors").read_bytes()
+    assert guide != (run.path / "guide.safetensors").read_bytes()
+    (again / "guide.safetensors").unlink()
+    done = call("fit", "--out", again, "--resume")  # with the features that are kept
+    assert done.code == 0 and (again / "guide.safetensors").read_bytes() == guide
+    done = call("evaluate", again, "--target", target.images, "--num", 50, "--scenes", 40)
+    assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize(
+    ("features", "part"),
+    [("vgg", "presence, efficientnet, inception, inception=FILE"), ("inception=", "inception=FILE"),
+     ("count=vgg", "count, count=efficientnet, presence"),
+     ("inception=none.pth", "a file of weights"), ("resnet50=none.pth", "a file of weights"),
+     ("efficientnet=x", "'efficientnet=x'")],
+)  # fmt: skip
+def test_another_network_is_refused_before_a_folder_is_made(features, part, call, discs, target, tmp_path):
+    words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--features", features]
+    done = call(*words, *WORDS)
+    assert done.code == 2 and part in done.err and not (tmp_path / "run").exists()
+
+
+def test_a_trained_network_keeps_the_presets_scenes():
+    for name in ("quick", "paper"):
+        assert preset(name).with_features("count").num_scenes == preset(name).num_scenes
+    assert QUICK.with_features("presence").features == "presence"
+    assert QUICK.with_features("efficientnet").num_scenes < QUICK.num_scenes
+
+
+def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_path):
+    model, chosen = run[0].model, QUICK.with_features(f"inception={tmp_path / 'w.safetensors'}")
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        weights = inception_v3(weights=None, aux_logits=False, init_weights=False).state_dict()
+        safetensors.torch.save_file(weights, tmp_path / "w.safetensors")
+        net = feature_net(chosen, model)
+        if seed == 0:
+            assert net.embed(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).shape == (2, 8)
+            state = net.state_dict()
+            feature_net(chosen, model).load_state_dict(state)
+    with pytest.raises(RunError, match="put that file back"):
+        net.load_state_dict(state)
+
+
+def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call, discs, target, tmp_path):
+    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=2"]
+    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
+    assert done.code == 0 and "Looking at images" in done.err and "epochs" in done.err, done.err
+    run = Run.open(tmp_path / "run")
+    net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
+    seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
+    assert len(net.names) == len(run.model.classes) + 3
+    assert torch.allclose(seen, run.load("real")["features"][:9], atol=1e-3)
+    lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+    assert [line["stage"] for line in lines] == ["features"] * 3 + ["counts"] + ["structure"] * 2
+    assert len(lines[3]["correlation"]) == len(run.model.classes) and len(lines[3]["ratio"]) == 3
+    guide = (run.path / "guide.safetensors").read_bytes()
+    for name in ("guide", "real", "features"):
+        (run.path / f"{name}.safetensors").unlink()
+    assert call("fit", "--out", run.path, "--resume").code == 0
+    assert (run.path / "guide.safetensors").read_bytes() == guide
+    words = ["--target", target.images, "--num", 50, "--scenes", 40, "--json", tmp_path / "e.json"]
+    done = call("evaluate", run.path, *words)
+    assert done.code == 0, done.err
+    estimate = json.loads((tmp_path / "e.json").read_text())["sources"]["estimate"]
+    counts = run.load("real")["features"][:, :2]
+    number = (counts * net.unit[:2]).round().sum(1)  # objects, whatever the unit of the features is
+    assert estimate["mean_number"] == pytest.approx(number.mean().item(), abs=1e-6)
+    assert not torch.equal(number, counts.round().sum(1))
+    assert call("report", run.path, "--num", 50, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
+
+
+def test_heads_that_taught_themselves_are_of_the_runs_images(call, discs, target, tmp_path):
+    images = tmp_path / "images"
+    shutil.copytree(target.images, images)
+    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=1"]
+    assert call("fit", discs.file, "--target", images, "--out", tmp_path / "run", *words).code == 0
+    for name in ("guide", "real"):
+        (tmp_path / f"run/{name}.safetensors").unlink()
+    next(images.iterdir()).unlink()
+    done = call("fit", "--out", tmp_path / "run", "--resume")
+    assert done.code == 2 and "as they were when the run began" in done.err and "Traceback" not in done.err
+    assert not (tmp_path / "run/real.safetensors").exists()

@@ -1,0 +1,130 @@
+"""The report: one page that needs nothing else, says what the run holds, and stands where the target is gone."""
+
+import base64
+import html
+import io
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+
+import pytest
+from PIL import Image
+
+from probscene.app.fitting.run import Run
+from probscene.app.progress import Display
+from probscene.app.views import charts
+from probscene.app.views.report import report
+from probscene.errors import DataError, RunError
+
+VOID = {"meta", "img", "br"}
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order; collects references, pictures and text."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open, self.references, self.text = [], [], ""
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in VOID:
+            self.open.append(tag)
+        self.references += [value for key, value in attributes if key in ("src", "href", "xlink:href")]
+
+    def handle_startendtag(self, tag, attributes):
+        self.references += [value for key, value in attributes if key in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def text(call, fitted, target) -> str:
+    done = call("report", fitted, "--labels", target.labels, "--num", 300, "--scenes", 0)
+    assert done.code == 0 and done.out == f"The report is {fitted / 'report.html'}\n"
+    return (fitted / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_page_needs_nothing_else(text):
+    page = Page(text)
+    outside = [x for x in page.references if not x.startswith(("data:image/png;base64,", "#"))]
+    assert not outside and "@import" not in text and "<script" not in text
+    assert not re.findall(r"url\((?!#)", text)
+    identifiers = re.findall(r'\bid="([^"]+)"', text)
+    assert {x[1:] for x in page.references if x[0] == "#"} <= set(identifiers)
+
+
+def test_the_page_shows_target_prior_and_learnt(text):
+    pictures = re.findall(r'<img alt="([^"]+)" src="data:image/png;base64,([^"]+)"', text)
+    assert [caption.split(":")[0] for caption, _ in pictures] == ["Target", "Prior", "Learnt"]
+    for _, data in pictures:
+        with Image.open(io.BytesIO(base64.b64decode(data, validate=True))) as picture:
+            assert picture.size == (4 * 66 + 2, 4 * 66 + 2)
+            assert len(picture.convert("RGB").getcolors(1 << 16)) > 10
+
+
+def test_the_page_shows_figures_curves_grammar_time_and_configuration(text, fitted):
+    run = Run.open(fitted)
+    words = Page(text).text
+    assert str(run.model.grammar) in words
+    assert text.count("<svg") == 2 + 4
+    for what in (
+        "truth (labels)",
+        "without labels",
+        "loss",
+        "mean cost",
+        "rejected",
+        "objects in an image",
+        "Pretraining",
+    ):
+        assert what in words, what
+    for key in ("seed", "threads", "version", "target", "preset.count.steps", "preset.batches"):
+        assert f"<td>{key}</td>" in text
+    assert f"<td>{html.escape(run.record['target'])}</td>" in text and f"version {run.record['version']}" in words
+    assert len(re.findall(r"<b>\d\.\d{3} → \d\.\d{3}</b>", text)) == 4
+
+
+def test_colours_are_the_pages_own(text):
+    assert not any(stand_in in text for stand_in in charts.VARIABLES)
+    used = set(re.findall(r"var\((--\w+)\)", text))
+    light, dark = text.split("@media (prefers-color-scheme: dark)")
+    for name in used:
+        assert f"{name}: #" in light and f"{name}: #" in dark.split("</style>")[0], name
+
+
+def test_the_same_run_gives_the_same_page(text, call, fitted, target, tmp_path):
+    call("report", fitted, "--labels", target.labels, "--num", 300, "--scenes", 0, "--out", tmp_path / "new" / "r.html")
+    assert (tmp_path / "new" / "r.html").read_text(encoding="utf-8") == text
+
+
+def test_names_are_escaped_and_a_target_that_is_gone_leaves_a_gap(fitted, target, tmp_path):
+    folder = tmp_path / "<b>&amp;"
+    shutil.copytree(fitted, folder)
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(record | {"target": str(tmp_path / "<i>gone")}))
+    path = report(Run.open(folder), Display(), num=100, judged_by=0)
+    page = Page(path.read_text(encoding="utf-8"))
+    assert "<i>gone, which is not there" in page.text and "<b>&amp;" in page.text
+    assert page.text.count("before learning") == 1 and "Target: some" not in page.text
+    with pytest.raises(DataError, match="not there"):
+        report(Run.open(folder), Display(), labels=target.labels, num=100, judged_by=0)
+
+
+def test_a_run_without_log_and_times_has_a_report_and_an_unfinished_one_has_none(fitted, tmp_path):
+    shutil.copytree(fitted, tmp_path / "run")
+    for name in ("log.jsonl", "timing.json"):
+        (tmp_path / "run" / name).unlink()
+    text = report(Run.open(tmp_path / "run"), Display(), num=100, judged_by=0).read_text(encoding="utf-8")
+    assert "No times were recorded." in text and text.count("<svg") == 2
+    (tmp_path / "run" / "report.html").unlink()
+    (tmp_path / "run" / "guide.safetensors").unlink()
+    with pytest.raises(RunError, match="finished"):
+        report(Run.open(tmp_path / "run"), Display())
+    assert not (tmp_path / "run" / "report.html").exists()

@@ -1,0 +1,164 @@
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given
+from hypothesis import strategies as st
+
+from probscene.errors import ProbsceneError
+from probscene.inference.features.base import enter
+from probscene.inference.features.counting.batches import FEWEST, FULL, CountBatches, CountSchedule, cells
+from probscene.inference.features.counting.net import STRIDE, CountNet, toward_whole
+from probscene.inference.features.counting.training import CountTraining, count_loss
+from probscene.inference.features.presence import PresenceNet, PresenceTraining
+
+
+@given(st.sampled_from([1, 2, 4, 8]), st.integers(9, 40), st.integers(9, 40), st.integers(0, 2**31))
+def test_entering_is_average_pooling(reduce, H, W, seed):
+    image = torch.randint(0, 256, (2, 3, H, W), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
+    padded = F.pad(image.float(), (0, -W % reduce, 0, -H % reduce)) / 255
+    assert torch.allclose(enter(image, 3, reduce), F.avg_pool2d(padded, reduce), atol=1e-6)
+
+
+@given(st.integers(0, 2**31), st.integers(1, 6))
+def test_cells_hold_every_object_once(seed, M):
+    """Objects that stand apart and inside: the map sums to one a class object, and cells are distributions."""
+    generator = torch.Generator().manual_seed(seed)
+    spots = torch.randperm(9, generator=generator)[:M]  # a 3 x 3 raster of 5 cells, so that no two share a cell
+    raster = torch.stack([spots % 3, spots // 3], -1) * 5 * STRIDE + 2.5 * STRIDE
+    centre = (raster + torch.rand(M, 2, generator=generator) * STRIDE).unsqueeze(0)
+    label = torch.randint(0, 3, (1, M), generator=generator)
+    label[0, 0] = -1
+    target = cells(centre, label, 3, 15, 15)
+    assert torch.allclose(target.sum(1), torch.ones(1, 15, 15), atol=1e-5)
+    expected = torch.stack([(label == c).sum() for c in range(3)]).float()
+    assert torch.allclose(target[0, 1:].sum((1, 2)), expected, atol=1e-4)
+
+
+def test_crowded_cells_stay_distributions():
+    centre = torch.full((1, 5, 2), 12.0)
+    target = cells(centre, torch.tensor([[0, 0, 1, 1, 1]]), 2, 4, 4)
+    assert (target >= 0).all()
+    assert torch.allclose(target.sum(1), torch.ones(1, 4, 4), atol=1e-6)
+
+
+def test_loss_is_least_at_the_target():
+    target = cells(torch.tensor([[[13.0, 20.0]]]), torch.tensor([[1]]), 2, 6, 6)
+    best = count_loss(target.clamp(min=1e-9).log(), target, 1, 0.5)
+    for _ in range(5):
+        assert count_loss(target.clamp(min=1e-9).log() + torch.randn_like(target), target, 1, 0.5) > best
+
+
+def test_embedding_is_the_map_summed_and_indifferent_to_place(dots):
+    torch.manual_seed(0)
+    net = CountNet(dots.classes, 3, (128, 128))
+    for module in net.modules():  # as if trained: statistics that are not the initial ones
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(0, 0.1)
+            module.running_var.uniform_(0.5, 2)
+            module.weight.data.uniform_(0.5, 1.5)
+    net.eval()
+    image = torch.zeros(1, 3, 128, 128, dtype=torch.uint8)
+    image[:, 0, 40:56, 40:56] = 255
+    moved = image.roll((2 * STRIDE, 3 * STRIDE), (2, 3))
+    one, other = net.embed(image), net.embed(moved)
+    direct = net(net.enter(image)).softmax(1)[:, 1:].sum((2, 3))
+    assert torch.allclose(one[:, :2], toward_whole(direct), atol=1e-4)
+    assert torch.allclose(one[:, 2], toward_whole(direct.sum(1)), atol=1e-4)
+    assert torch.allclose(one, other, atol=1e-3)
+
+
+def test_counts_are_drawn_toward_whole_numbers_in_order():
+    x = torch.linspace(0, 12, 2401, dtype=torch.float64)
+    y = toward_whole(x)
+    assert (y.diff() >= -1e-12).all()
+    assert torch.allclose(toward_whole(torch.arange(13.0) / 1), torch.arange(13.0), atol=1e-5)
+    assert torch.equal(y.round()[x % 1 != 0.5], x.round()[x % 1 != 0.5])
+    near = (x - x.round()).abs() < 0.3
+    assert ((y - x.round()).abs()[near] <= 0.6 * (x - x.round()).abs()[near] + 1e-12).all()
+
+
+SHORT = CountSchedule(steps=260, whole=0.5, images=16, crops=24, crop=32, window=2)
+
+
+def test_it_learns_to_count(dots, draw_dots):
+    torch.manual_seed(0)
+    net = CountNet(dots.classes, 3, dots.canvas, width=(8, 16, 16), blocks=(1, 0))
+    CountTraining(net, draw_dots, SHORT, seed=1).run()
+    torch.manual_seed(99)
+    fresh = draw_dots(300)
+    counts = torch.stack([(fresh.label == c).sum(1) for c in range(2)], 1).float()
+    seen = net.embed(fresh.image)[:, :2]
+    assert ((seen - counts).square().mean(0) < 0.35 * counts.var(0)).all()
+
+
+@pytest.mark.parametrize("kind", ["count", "presence"])
+def test_training_goes_on_to_the_same_bits(dots, draw_dots, kind, goes_on_to_the_same_bits):
+    def training():
+        torch.manual_seed(0)
+        if kind == "count":
+            net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
+            schedule = CountSchedule(steps=48, images=4, crops=4, crop=32, window=2)
+            return CountTraining(net, draw_dots, schedule, seed=1)
+        return PresenceTraining(PresenceNet(dots.classes, 4, 8), draw_dots, 60, 4, 20, accuracy=1.1, seed=1)
+
+    goes_on_to_the_same_bits(training)
+
+
+def test_what_goes_wrong_while_drawing_ahead_ends_the_training(dots, draw_dots):
+    calls = []
+
+    def draw(num):
+        calls.append(num)
+        if len(calls) == 3:
+            raise ProbsceneError("no more ink")
+        return draw_dots(num)
+
+    net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
+    training = CountTraining(net, draw, CountSchedule(steps=72, images=2, crops=4, crop=32, window=2))
+    with pytest.raises(ProbsceneError, match="no more ink"):
+        training.run()
+    assert training.done == 32
+
+
+def test_the_last_draw_is_as_long_as_the_steps_that_are_left(dots, draw_dots):
+    calls = []
+    net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
+    schedule = CountSchedule(steps=20, images=2, crops=4, crop=32, window=2)
+    training = CountTraining(net, lambda num: calls.append(num) or draw_dots(num), schedule)
+    training.run()
+    training.run()
+    assert training.done == 20 and calls == [32, 8]
+
+
+def test_presence_net_stops_at_its_accuracy(dots, draw_dots):
+    net = PresenceNet(dots.classes, 4, 8)
+    training = PresenceTraining(net, draw_dots, 40, 5, 20, accuracy=0.0)
+    training.run()
+    assert training.done == 0
+    features = net.embed(draw_dots(3).image)
+    assert features.shape == (3, len(net.names))
+
+
+def test_small_objects_are_reduced_less(dots):
+    net = CountNet(dots.classes, 3, (188, 621))
+    assert net.reduce == 4
+    for size, reduce in ((40.0, 4), (24.0, 4), (23.0, 2), (12.0, 2), (11.0, 1), (1.0, 1)):
+        net = CountNet(dots.classes, 3, (188, 621))
+        net.fit_to(size)
+        assert net.reduce == reduce
+        again = CountNet(dots.classes, 3, (188, 621))
+        again.load_state_dict(net.state_dict())
+        assert again.reduce == reduce
+        image = torch.zeros(1, 3, 188, 621, dtype=torch.uint8)
+        assert again.enter(image).shape[-1] >= 621 / reduce and again.eval().embed(image).shape == (1, len(net.names))
+
+
+@given(st.integers(16, 1300), st.integers(16, 1300), st.integers(1, 24))
+def test_a_step_takes_no_more_pixels_of_large_images(height, width, images):
+    """Than of 128 x 128 reduced ones, but for a few images at least; of those it takes what the schedule says."""
+    net = CountNet(("a",), 1, (height, width), (2, 2, 2))
+    taken = CountBatches(net, None, CountSchedule(images=images), 0).images
+    area = height * width / net.reduce**2
+    assert 1 <= taken <= images
+    assert taken == images or area > FULL
+    assert taken <= FEWEST or taken * area <= images * FULL + area / 2

@@ -1,0 +1,82 @@
+"""Nearest neighbours by brute force and by scikit-learn; empty balls as often as theory says."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from sklearn.neighbors import NearestNeighbors
+
+from probscene.inference.judging.support import fidelity, foreign, likeness, radii, unlike_floor
+
+SETS = st.tuples(st.integers(8, 25), st.integers(8, 25)).flatmap(
+    lambda s: st.tuples(*(arrays(np.float64, (n, 2), elements=st.integers(-9, 9).map(float)) for n in s))
+)
+
+
+def reach(points, k):
+    """Distance to the k-th other point."""
+    return NearestNeighbors(n_neighbors=k + 1, algorithm="brute").fit(points).kneighbors(points)[0][:, k]
+
+
+@given(SETS, st.integers(1, 6))
+def test_balls_and_likes_are_scikit_learns(sets, k):
+    a, b = sets
+    assert radii(a, k) == pytest.approx(reach(a, k), abs=1e-6)
+    assert (radii(a, k, 3.0) >= 3).all()
+    grown = max(k, round(k * len(a) / len(b)))
+    radius = reach(a, min(grown, len(a) - 1))
+    nearest = NearestNeighbors(n_neighbors=1, algorithm="brute").fit(b).kneighbors(a)[0][:, 0]
+    sure = ~np.isclose(nearest, radius)
+    found = likeness(a, b, k)
+    assert np.array_equal(found.like[sure], (nearest <= radius)[sure])
+    assert found.nearest == pytest.approx(nearest, abs=1e-6)
+
+
+@given(SETS, st.integers(1, 6))
+def test_precision_recall_density_and_coverage_by_definition(sets, k):
+    generated, real = (each + np.random.default_rng(s).normal(size=each.shape) / 100 for s, each in enumerate(sets))
+    ball, theirs = reach(real, k), reach(generated, k)
+    near = np.linalg.norm(real[:, None] - generated, axis=-1)
+    L, N = near.shape
+    found = fidelity(generated, real, k)
+    assert found.precision == pytest.approx(np.mean([any(near[i, j] <= ball[i] for i in range(L)) for j in range(N)]))
+    assert found.recall == pytest.approx(np.mean([any(near[i, j] <= theirs[j] for j in range(N)) for i in range(L)]))
+    assert found.density == pytest.approx(sum(near[i, j] <= ball[i] for i in range(L) for j in range(N)) / (k * N))
+    assert found.coverage == pytest.approx(np.mean([any(near[i, j] <= ball[i] for j in range(N)) for i in range(L)]))
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 2**16), st.sampled_from([1.0, 0.3, 0.1]))
+def test_balls_are_empty_as_often_as_theory_says(seed, density):
+    rng = np.random.default_rng(seed)
+    k, real = 5, rng.random((1000, 2))
+    others = rng.random((1000, 2))
+    others[rng.random(1000) > density] += 10  # only a share of them is where the real ones are
+    assert 1 - likeness(real, others, k).like.mean() == pytest.approx((1 + density) ** -k, abs=0.07)
+
+
+def test_a_gap_is_found_and_nothing_else():
+    rng = np.random.default_rng(0)
+    real, generated = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
+    real[:100] += [12, 0, 0]
+    found = likeness(real, generated)
+    assert not found.like[:100].any() and found.like[100:].mean() > 0.97
+    assert set(np.argsort(-found.nearest)[:50]) <= set(range(100))
+    assert unlike_floor(real) < 0.05
+
+
+def test_images_closer_than_the_resolution_are_alike():
+    cells = np.random.default_rng(0).integers(0, 3, (300, 2)).astype(float)
+    shifted = cells + 0.1
+    assert not likeness(cells, shifted).like.any()  # duplicates: balls of no size
+    assert likeness(cells, shifted, resolution=0.5).like.all()
+    assert likeness(cells, cells).like.all() and likeness(cells, cells).nearest.max() == 0
+
+
+def test_images_of_another_domain_are_farther_than_scenes_are_apart():
+    rng = np.random.default_rng(0)
+    scenes, real = rng.normal(size=(100, 8)), rng.normal(size=(80, 8))
+    assert not foreign(real + 0.5, scenes).any()
+    assert foreign(real + 10, scenes).all()
+    assert np.array_equal(foreign(7 * real, 7 * scenes), foreign(real, scenes))
