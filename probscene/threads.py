@@ -1,0 +1,29 @@
+"""How many threads torch computes with: the one place where that, a setting of the whole process, is changed."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+
+def cores() -> int:
+    """The cores that this process may use: fewer than the machine has, where the system tells."""
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def threads(number: int) -> Iterator[None]:
+    """So many of torch's threads inside; as many as before afterwards.
+
+    Small tensors, such as a guide's, are faster with one. Sums of floats depend on how many threads share them, so that
+    what is to be the same bytes everywhere has a number of its own.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
