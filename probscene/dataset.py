@@ -19,6 +19,7 @@ from torch import Tensor
 from .ahead import ahead
 from .decoding import Fault, Part, Window, decoded, read, window
 from .errors import DataError
+from .threads import cores
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 LEAST_PART = 0.75  # of either side of an image, in its further views
@@ -73,7 +74,7 @@ class ImageFolder:
         self.windows: list[Window | None] = []
         self.bad: dict[Path, str] = {}
         pictures = set()
-        with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
+        with _quiet(), closing(ahead(self._checked, files, cores())) as checked:
             for i, (file, found) in enumerate(zip(files, checked, strict=True)):
                 if isinstance(found, Fault):
                     self.bad[file] = str(found)
@@ -214,9 +215,10 @@ def _listed(folder: Path) -> tuple[list[Path], list[str]]:
     if not folder.is_dir():
         raise DataError(f"Expected a folder of PNG or JPEG images, actual {folder}, which is a file; name its folder.")
     try:
-        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise DataError(f"Expected a folder that can be read, actual {folder}: {error.strerror}.") from error
+    entries.sort(key=lambda entry: entry.name)  # paths of Windows would be sorted without regard to case
     folders = [entry.name + "/" for entry in entries if entry.is_dir()]
     files = [entry for entry in entries if not entry.is_dir()]
     images = [entry for entry in files if entry.suffix.lower() in SUFFIXES]

@@ -14,6 +14,7 @@ from probscene.dataset import grey
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import Scenes, sample, seed_everything
+from probscene.threads import threads
 
 CHUNK = 64
 
@@ -37,13 +38,8 @@ def draw_chunk(model: SceneModel, policy: Policy, seed: int, chunk: int) -> Scen
     Raises:
         SamplingError, ModelError: see ``sample``.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums of floats depend on how many threads share them
-    try:
-        with chunk_randomness(seed, chunk):
-            return sample(model, policy, CHUNK)
-    finally:
-        torch.set_num_threads(threads)
+    with threads(1), chunk_randomness(seed, chunk):
+        return sample(model, policy, CHUNK)
 
 
 def as_written(model: SceneModel, image: Tensor) -> Tensor:

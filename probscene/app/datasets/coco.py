@@ -69,7 +69,7 @@ def write(path: Path, model: SceneModel, num: int, info: dict[str, Any], found: 
         for i in range(num)
     )
     numbered = ({"id": number, **annotation} for number, annotation in enumerate(found, 1))
-    with open(path, "w", encoding="utf-8") as file:
+    with open(path, "w", encoding="utf-8", newline="\n") as file:
         file.write(f'{{"info": {json.dumps(info)},\n"licenses": [],\n"categories": {json.dumps(categories(model))}')
         for key, entries in (("images", images), ("annotations", numbered)):
             file.write(f',\n"{key}": [')

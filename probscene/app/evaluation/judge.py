@@ -18,13 +18,14 @@ from probscene.inference.judging.trust import Trust, trust
 from probscene.inference.judging.two_sample import NEEDED
 from probscene.policy import Policy
 from probscene.sampling import sample
+from probscene.threads import threads
 
 from ..chunks import CHUNK, chunk_randomness
 from ..fitting.fit import Progress
 from ..fitting.observer import Observer
 from ..fitting.presets import Preset
 from ..fitting.run import Run
-from ..fitting.scene_features import features_in, kept_features, own_net, threads
+from ..fitting.scene_features import features_in, kept_features, own_net
 from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement

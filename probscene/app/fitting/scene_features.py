@@ -5,7 +5,6 @@ Axis letters: N scenes, L images, D features, C H W.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.threads import threads
 
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..loading import renderer_for
@@ -102,14 +102,3 @@ def network(choice: str, run: Run) -> tuple[str, FeatureNet]:
     from probscene.inference.features.pretrained import pretrained  # torchvision takes seconds to import
 
     return name, pretrained(choice)
-
-
-@contextmanager
-def threads(number: int) -> Iterator[None]:
-    """So many of torch's threads inside."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
