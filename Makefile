@@ -29,6 +29,10 @@ demo: install
 
 lint: install
 	@$(BIN)/ruff check --quiet
+	@rm -rf build/types
+	@$(BIN)/python -c 'import setuptools; setuptools.setup()' --quiet build_py --build-lib build/types
+	@cp -R examples build/types
+	@$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 # One thread a process: two processes with one thread each are faster than one with two.
 test: export OMP_NUM_THREADS := 1

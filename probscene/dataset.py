@@ -66,7 +66,7 @@ class ImageFolder:
         skip_bad: bool = False,
         progress: Callable[[int, int], None] | None = None,
     ):
-        self.path, self.canvas, self.channels = Path(path), tuple(canvas), channels
+        self.path, self.canvas, self.channels = Path(path), (canvas[0], canvas[1]), channels
         files, others = _listed(self.path)
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths: list[Path] = []
@@ -81,7 +81,7 @@ class ImageFolder:
                 else:
                     self.paths.append(file)
                     digest.update(hashlib.sha256(os.fsencode(file.name)).digest() + found.data)
-                    self.sizes.append(tuple(found.size))
+                    self.sizes.append(found.size)
                     pictures.add(found.picture)
                     seen = window(found.size, self.canvas)
                     self.windows.append(seen)
@@ -93,7 +93,7 @@ class ImageFolder:
         self.fingerprint = digest.hexdigest()
         self.distinct = len(pictures)
         sizes = Counter(self.sizes)
-        cut = Counter(size for size, seen in zip(self.sizes, self.windows, strict=True) if seen is not None)
+        cut = Counter((size, seen) for size, seen in zip(self.sizes, self.windows, strict=True) if seen is not None)
         sizes.pop(self.canvas, None)
         self.resized, self.cropped = sizes.total(), cut.total()
         self.notes = self._notes(sizes, cut, others)
@@ -145,7 +145,7 @@ class ImageFolder:
             picture, size = decoded(data, self.canvas, self.channels)
         except Fault as fault:
             return fault
-        return _Checked(size, hashlib.sha256(data).digest(), hashlib.blake2b(picture, digest_size=16).digest())
+        return _Checked(size, hashlib.sha256(data).digest(), hashlib.blake2b(picture.data, digest_size=16).digest())
 
     def _judge(self, skip_bad: bool) -> None:
         if self.bad and not (skip_bad and self.paths):
@@ -166,8 +166,7 @@ class ImageFolder:
                 f"they are resized to {self.canvas[1]}x{self.canvas[0]}."
             )
         if self.cropped:
-            height, width = size = cut.most_common(1)[0][0]
-            _, _, rows, columns = window(size, self.canvas)
+            (height, width), (_, _, rows, columns) = cut.most_common(1)[0][0]
             notes.append(
                 f"{self.cropped} of {len(self)} images in {self.path} have another shape, of which only the middle is "
                 f"seen, mostly {columns}x{rows} of {width}x{height}; cut them before where it should be another part."

@@ -5,6 +5,7 @@ Axis letters: N scenes, M nodes.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, cast
 
 import pyro
 import torch
@@ -73,7 +74,7 @@ def run_program(
     with torch.no_grad(), poutine.block():
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
-    drawing = trace.nodes["_RETURN"]["value"]
+    drawing = trace.nodes["_RETURN"].get("value")
     if not isinstance(drawing, Drawing | World) or len(drawing) != N:
         raise ModelError(
             f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
@@ -81,7 +82,7 @@ def run_program(
         )
     values, site_mask = {}, {}
     log_prob = torch.zeros(N)
-    for key, site in trace.nodes.items():
+    for key, site in cast(dict[str, Any], trace.nodes).items():
         if site["type"] != "sample" or key in sites or site_is_subsample(site):
             continue
         value, mask = site["value"], site["mask"]

@@ -111,6 +111,8 @@ class Mixture(Policy):
         weights: of the scenarios; equal if None.
     """
 
+    grammar: JointGrammar
+
     def __init__(self, grammar: JointGrammar, policies: list[Policy], weights: list[float] | None = None):
         self.grammar, self.policies = grammar, policies
         share = torch.tensor([1.0] * len(policies) if weights is None else weights)
@@ -179,11 +181,15 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
 
     def target(seed: int) -> SceneModel:
         """The scenarios' own targets, joined."""
-        return join(f"{name}_target", {key: model.target(seed) for key, model in models.items()}, weights)
+        return join(
+            f"{name}_target", {key: model.target(seed) for key, model in models.items() if model.target}, weights
+        )
 
     def with_assets(folder: str) -> SceneModel:
         """All scenarios drawn with one folder."""
-        return join(name, {key: model.with_assets(folder) for key, model in models.items()}, weights)
+        return join(
+            name, {key: model.with_assets(folder) for key, model in models.items() if model.with_assets}, weights
+        )
 
     return SceneModel(
         name,
@@ -206,8 +212,9 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
 
 def mixture(grammar: JointGrammar, policies: list[Policy], weights: list[float] | None = None) -> Policy:
     """``Mixture``; of tables it is one table, about which more can be proved."""
-    if all(type(policy) is StructurePrior for policy in policies):
-        return StructurePrior.joined(grammar, policies, [1.0] * len(policies) if weights is None else weights)
+    tables = [policy for policy in policies if type(policy) is StructurePrior]
+    if len(tables) == len(policies):
+        return StructurePrior.joined(grammar, tables, [1.0] * len(policies) if weights is None else weights)
     return Mixture(grammar, policies, weights)
 
 

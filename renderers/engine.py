@@ -10,6 +10,7 @@ import io
 import os
 import tempfile
 import warnings
+from typing import Any
 
 from probscene.cache import cache_folder
 from probscene.errors import ModelError, ProbsceneError
@@ -21,6 +22,7 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # otherwise the import ask
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # deprecations inside Taichi must not fail a run under -W error
     import taichi as ti
+    from taichi.lang.impl import get_runtime
 
 __all__ = ["check_canvas", "started", "start", "ti"]
 
@@ -43,7 +45,7 @@ def check_canvas(canvas: tuple[int, int], threads: int | None, most: int) -> tup
 
 def started() -> bool:
     """Whether Taichi runs in this process, by ``start`` or by the user's own ``ti.init``."""
-    return ti.lang.impl.get_runtime().prog is not None
+    return get_runtime().prog is not None
 
 
 def start() -> None:
@@ -72,7 +74,7 @@ def start() -> None:
         )
 
 
-def _cache() -> dict[str, object]:
+def _cache() -> dict[str, Any]:
     """Where compiled kernels are kept between runs, safe with several processes; nowhere if nothing can be written."""
     folder = cache_folder() / "taichi"
     with contextlib.suppress(OSError):

@@ -20,6 +20,8 @@ class ScenarioGuide(Guide):
         kind, settings: of each scenario's guide, see ``make_guide``.
     """
 
+    grammar: JointGrammar
+
     def __init__(
         self,
         grammar: JointGrammar,

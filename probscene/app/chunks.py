@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import pyro
 import torch
+from pyro.util import get_rng_state, set_rng_state
 from torch import Tensor
 
 from probscene.dataset import grey
@@ -22,14 +22,14 @@ CHUNK = 64
 @contextmanager
 def chunk_randomness(seed: int, chunk: int) -> Iterator[None]:
     """The random numbers of one chunk; the generators' state from before is put back afterwards."""
-    before = pyro.util.get_rng_state()
+    before = get_rng_state()
     words = [int(word) for word in np.random.SeedSequence(seed, spawn_key=(chunk,)).generate_state(3)]
     seed_everything(words[0])
     torch.manual_seed(words[1] << 32 | words[2])  # numpy's seed has 32 bits, in which many chunks would collide
     try:
         yield
     finally:
-        pyro.util.set_rng_state(before)
+        set_rng_state(before)
 
 
 def draw_chunk(model: SceneModel, policy: Policy, seed: int, chunk: int) -> Scenes:

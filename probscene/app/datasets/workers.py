@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
+from typing import cast
 
 from probscene.errors import MachineError, ProbsceneError
 from probscene.threads import use_threads
@@ -47,7 +48,7 @@ def spread(
             there.close()
             here.send(next(todo))
         while crew:
-            for here in wait(list(crew)):
+            for here in cast(list[Connection], wait(list(crew))):
                 done(_answer(here))
                 task = next(todo, None)
                 if task is None:

@@ -61,7 +61,7 @@ class Judged:
         """For JSON."""
         if self.trust is None:
             return {"verdict": None, "because": self.absent}
-        more = {"unlike_images": list(self.names)}
+        more: dict[str, Any] = {"unlike_images": list(self.names)}
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
         return self.trust.record() | more
@@ -126,7 +126,7 @@ def judge(
     names = tuple(target.paths[i].name for i in real_unmatched)
     by_labels = None
     if evaluation is not None and "truth" in evaluation.sources:
-        by_labels = agreement(*(evaluation.sources[name] for name in ("learnt", "truth")), evaluation.classes)
+        by_labels = agreement(evaluation.sources["learnt"], evaluation.sources["truth"], evaluation.classes)
     return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels)
 
 
