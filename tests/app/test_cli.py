@@ -388,17 +388,18 @@ def test_a_bug_is_one_line_and_a_traceback_on_demand(call, discs, tmp_path, monk
 
 CHILD = """
 import os, signal, sys
-from probscene.app import cli, files, keeper
+from probscene.app import cli, files
+from probscene.app.fitting import checkpoints
 
 kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
-keeper.SAVE_EVERY = 0.0
+checkpoints.SAVE_EVERY = 0.0
 line, replace = [{}], os.replace
 
 def at_once():
     if line[0].get("stage") == stage and line[0].get("step", line[0].get("batch")) >= number:
         os.kill(os.getpid(), kind)
 
-keep = keeper.Keeper.__call__
+keep = checkpoints.Keeper.__call__
 def keeping(self, said):
     line[0] = said
     keep(self, said)
@@ -410,7 +411,7 @@ def replacing(source, path):  # the worst moment: the log is ahead, the checkpoi
         at_once()
     replace(source, path)
 
-keeper.Keeper.__call__, os.replace = keeping, replacing
+checkpoints.Keeper.__call__, os.replace = keeping, replacing
 del sys.argv[1:4]
 cli.main()
 """

@@ -85,7 +85,7 @@ def write(
     make_folder(out.parent)
     record, model = run.record, run.model
     target = f"{len(images)} target images in {images.path}" if images else f"target {record['target']}"
-    page = Template(resources.files("probscene.app").joinpath("report.html").read_text(encoding="utf-8"))
+    page = Template(resources.files("probscene.app.views").joinpath("report.html").read_text(encoding="utf-8"))
     write_text(
         out,
         page.substitute(
