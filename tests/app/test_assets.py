@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.errors import DataError, ModelError, RunError
 from probscene.models.assets.catalogue import street
@@ -64,24 +64,24 @@ def test_a_model_without_assets_says_so(tmp_path, discs):
 def test_a_run_remembers_its_folder(tmp_path, monkeypatch, fresh_folders):
     folder = meshes(tmp_path / "mine")
     monkeypatch.chdir(tmp_path)
-    made = Run.create(tmp_path / "run", "driving:city", {}, Path("mine"))
+    made = RunFolder.create(tmp_path / "run", "driving:city", {}, Path("mine"))
     monkeypatch.chdir("/")
-    run = Run.open(tmp_path / "run")
+    run = RunFolder.at(tmp_path / "run")
     assert run.model.assets == made.record["assets"] and str(folder) in run.model.assets
     assert json.loads((tmp_path / "run" / "run.json").read_text())["assets_folder"] == str(folder)
     shutil.move(folder, tmp_path / "moved")
     fresh_folders()
     with pytest.raises(DataError, match="Expected a folder of meshes, actual .*mine"):
-        Run.open(tmp_path / "run").model.program  # noqa: B018
+        RunFolder.at(tmp_path / "run").model.program  # noqa: B018
 
 
 def test_a_run_is_bound_to_what_is_in_the_folder(tmp_path, fresh_folders):
     folder = meshes(tmp_path / "mine")
-    Run.create(tmp_path / "run", "driving:city", {}, folder)
+    RunFolder.create(tmp_path / "run", "driving:city", {}, folder)
     meshes(folder, SLAB.replace("2.2", "2.3"))
     fresh_folders()
     with pytest.raises(RunError, match="to draw with meshes in .*, as when the run .* was begun, actual meshes in"):
-        Run.open(tmp_path / "run").model.program  # noqa: B018
+        RunFolder.at(tmp_path / "run").model.program  # noqa: B018
 
 
 @pytest.fixture
