@@ -174,17 +174,18 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         models: by scenario.
 
     Raises:
-        ModelError: no models, or models that differ in canvas or channels.
+        ModelError: no models, or models that differ in canvas, channels or renderer.
     """
     if not models:
         raise ModelError("Expected at least one scenario, actual none.")
     each = list(models.values())
-    for what in ("canvas", "channels"):
+    for what in ("canvas", "channels", "renderer"):
         found = {key: getattr(model, what) for key, model in models.items()}
         if len(set(found.values())) > 1:
             raise ModelError(f"Expected scenarios of one {what}, actual {found}.")
     grammar = JointGrammar({key: model.grammar for key, model in models.items()})
     groups = {model.groups for model in each}
+    variables = {model.assets_variable for model in each}
     targets = [model.target for model in each]
     pretraining = None
     if any(model.pretraining is not None for model in each):
@@ -214,6 +215,8 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         pretraining=pretraining,
         target=target if all(targets) else None,
         scenarios=tuple(models.items()),
+        renderer=each[0].renderer,
+        assets_variable=variables.pop() if len(variables) == 1 else "",
     )
 
 

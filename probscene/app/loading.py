@@ -8,15 +8,20 @@ import hashlib
 import importlib
 import importlib.util
 import os
+import re
 import sys
 import traceback
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+
+import torch
 
 from probscene.batch import RenderBatch, Renderer
 from probscene.drawing import Drawing
 from probscene.errors import ModelError, ProbsceneError
 from probscene.model import SceneModel
+from probscene.render_check import check_renderer
 from probscene.renderers.meshes import MeshRenderer
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.scenarios import join
@@ -28,13 +33,14 @@ BUILT_IN = {
     "driving": "probscene.models.driving",
     "driving_simple": "probscene.models.driving_simple",
 }
+_VARIABLE = re.compile(r" (\(PROBSCENE_\w+\)|of PROBSCENE_\w+)$")  # at the end of the words; "of" is of older runs
 
 
 def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
     """The scene model that a name or a file gives.
 
     Args:
-        assets: a folder of what it is to be drawn with.
+        assets: a folder of what it is to be drawn with; if None, that which the model's ``assets_variable`` names.
 
     Raises:
         ModelError: no such name or file, a file that does not import, one that exports none or several models, a
@@ -43,13 +49,31 @@ def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
     """
     model = _loaded(reference)
     if assets is None:
-        return model
+        return _with_environment(model)
     if model.with_assets is None:
         raise ModelError(
             f"Expected a model that can be drawn with a folder of assets, actual {reference!r}, which has no "
             "with_assets; leave --assets out."
         )
     return model.with_assets(os.path.abspath(assets))
+
+
+def _with_environment(model: SceneModel) -> SceneModel:
+    """The model with the assets that an environment variable names, if it has one that is set."""
+    folder = os.environ.get(model.assets_variable, "") if model.assets_variable else ""
+    if not folder:
+        return model
+    try:
+        drawn = model.with_assets(os.path.abspath(folder))
+    except ProbsceneError as error:
+        raise type(error)(f"{error} The variable {model.assets_variable} names {folder}.") from error
+    return replace(drawn, assets=f"{drawn.assets} ({model.assets_variable})")
+
+
+def same_assets(one: str, other: str) -> bool:
+    """Whether two models draw with the same assets, by their words; ``--assets`` and an environment variable that name
+    one folder give the same."""
+    return _VARIABLE.sub("", one) == _VARIABLE.sub("", other)
 
 
 def _loaded(reference: str) -> SceneModel:
@@ -114,9 +138,36 @@ class _AnyRenderer:
         return MeshRenderer(*self._options)
 
 
+class _OwnRenderer:
+    """A model's own renderer; the first batch that it gives is checked."""
+
+    def __init__(self, renderer: Renderer, canvas: tuple[int, int]):
+        self._renderer, self._canvas, self._checked = renderer, canvas, False
+
+    def __call__(self, drawing: Drawing | World) -> RenderBatch:
+        batch = self._renderer(drawing)
+        if not self._checked and len(drawing):
+            check_renderer(self._renderer, drawing, self._canvas, batch)
+            self._checked = True
+        return batch._replace(image=batch.image.contiguous(memory_format=torch.channels_last))
+
+
 def renderer_for(model: SceneModel, threads: int | None = None) -> Renderer:
-    """The renderer that reads what the model returns; one thread for every core where no number is given."""
-    return _AnyRenderer(model.canvas, threads)
+    """The model's own renderer, or the built-in one that reads what the model returns; one thread for every core where
+    no number is given.
+
+    Raises:
+        ModelError: the model's own is none; when it is called, see ``check_renderer``.
+    """
+    if model.renderer is None:
+        return _AnyRenderer(model.canvas, threads)
+    renderer = model.renderer(model.canvas, threads)
+    if not callable(renderer):
+        raise ModelError(
+            f"Expected the renderer of model {model.name!r}, called with the canvas and a number of threads, to give "
+            f"what can be called with a drawing, actual {type(renderer).__name__}; see Renderer in probscene.batch."
+        )
+    return _OwnRenderer(renderer, model.canvas)
 
 
 def _exported(names: dict, reference: str, wanted: tuple[str, ...] = ()) -> SceneModel:
