@@ -69,13 +69,14 @@ def draw(scene: SceneGraph, digits: Digits, exemplar, x, y, angle=0.0) -> Drawin
     return scene.draw(Sprites(CLASSES, digits.atlas, digits.sprite(digit, exemplar), x, y, angle))
 
 
-def target(seed: int, digits: Source = shipped) -> SceneModel:
+def target(seed: int, digits: Source = shipped, assets: str = "") -> SceneModel:
     """The experiment's truth: counts in 0..10 and digits from distributions that are Dirichlet(1) draws of ``seed``."""
     rng = np.random.default_rng(seed)
     number, share = rng.dirichlet(np.ones(MOST + 1)), rng.dirichlet(np.ones(len(CLASSES)))
     prior = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
     program = partial(row, digits=digits)
-    return SceneModel("multi_mnist_target", GRAMMAR, prior, program, (CANVAS, CANVAS), MAX_STEPS, CLASSES, channels=1)
+    more = {"channels": 1, "assets": assets}
+    return SceneModel("multi_mnist_target", GRAMMAR, prior, program, (CANVAS, CANVAS), MAX_STEPS, CLASSES, **more)
 
 
 def with_assets(folder: str) -> SceneModel:
@@ -98,7 +99,7 @@ def multi_mnist(digits: Source = shipped, assets: str = "") -> SceneModel:
         channels=1,
         assets=assets,
         with_assets=with_assets,
-        target=partial(target, digits=digits),
+        target=partial(target, digits=digits, assets=assets),
         assets_variable="PROBSCENE_MNIST",
     )
 

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare, kstest, poisson
 
+from probscene.app.loading import load_model
 from probscene.checks import check
 from probscene.errors import DataError
-from probscene.models.aerial2d import APART, CANVAS, GRAMMAR, LANE, MODEL, PRETRAINING, ROAD, TARGET, aerial2d
+from probscene.models.aerial2d import APART, CANVAS, GRAMMAR, LANE, MODEL, PRETRAINING, ROAD, TARGET
 from probscene.models.aerial_sprites import folder
 from probscene.relations import per_parent
 from probscene.renderers.sprites import SpriteRenderer

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from probscene.app.loading import load_model, renderer_for
-from probscene.models.driving import SCENARIOS, SIMPLE, assets, driving
+from probscene.models.driving import SCENARIOS, SIMPLE, driving
 from probscene.models.streets.grammars import grammar
 from probscene.models.streets.layout import STRIPS, in_line
 from probscene.models.streets.parameters import PARAMETERS
