@@ -4,6 +4,8 @@ Each step samples the rule of the next nonterminal at the site ``rule_t`` from a
 masked. ``Given`` is an effect handler that hands ``derive`` what is derived already. Axis letters: N scenes, T steps.
 """
 
+from collections.abc import Callable
+
 import pyro
 import pyro.distributions as dist
 import torch
@@ -16,7 +18,11 @@ from .errors import ModelError, SamplingError
 from .grammar import Grammar
 from .policy import Policy, masked
 
-_expand = effectful(expand, type="derive")
+
+@effectful(type="derive")
+def _derived(grammar: Grammar, choose: Callable[..., Tensor], num_scenes: int, max_steps: int) -> Derivation:
+    """``expand``, unless a handler has the derivations."""
+    return expand(grammar, choose, num_scenes, max_steps)
 
 
 class Given(Messenger):
@@ -66,7 +72,7 @@ def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) ->
         value = pyro.sample(f"rule_{t}", rule.mask(active.unsqueeze(-1))).squeeze(-1)
         return value.where(active, -1)
 
-    return _expand(grammar, choose, num_scenes, max_steps)
+    return _derived(grammar, choose, num_scenes, max_steps)
 
 
 def derive_complete(
