@@ -50,11 +50,10 @@ _MODULES = {
     "probscene.inference.objective": ("ScoreFunction",),
     "probscene.inference.pretrain": ("pretrain",),
     "probscene.mesh": ("Mesh",),
-    "probscene.model": ("Groups", "SceneModel"),
+    "probscene.model": ("Groups", "SceneModel", "scene_model"),
     "probscene.policy": ("Policy",),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
     "probscene.scene": ("SceneGraph",),
-    "probscene.scene_model": ("scene_model",),
     "probscene.structure": ("StructurePrior", "counts", "ranked", "weights"),
     "probscene.world": ("Camera", "Ground", "Light", "Meshes", "Photo", "World"),
 }  # fmt: skip
@@ -85,11 +84,10 @@ if TYPE_CHECKING:
     from .grammar import Grammar
     from .image_array import ImageArray
     from .mesh import Mesh
-    from .model import Groups, SceneModel
+    from .model import Groups, SceneModel, scene_model
     from .policy import Policy
     from .sampling import Scenes, sample, seed_everything
     from .scene import SceneGraph
-    from .scene_model import scene_model
     from .structure import StructurePrior, counts, ranked, weights
     from .world import Camera, Ground, Light, Meshes, Photo, World
 

@@ -17,7 +17,7 @@ from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.model import SceneModel
 
 from ..files import make_folder, write_json, write_whole
-from ..loading import BUILT_IN, lasting_reference, load_model, split_reference
+from ..loading import BUILT_IN, lasting_reference, load_model, same_assets, split_reference
 from ..modules import file_digest
 from .parts import (
     IN_MEMORY,
@@ -121,7 +121,7 @@ class RunFolder(Storage):
                 raise self._only_in_memory("model", reference)
             self._unchanged(Path(split_reference(reference)[0]), self.record["model_sha256"], "model")
             model = load_model(reference, self.record.get("assets_folder"))
-            if model.assets != self.record["assets"]:
+            if not same_assets(model.assets, self.record["assets"]):
                 raise RunError(
                     f"Expected model {model.name} to draw with {self.record['assets'] or 'no assets'}, as when the run "
                     f"{self.path} was begun, actual {model.assets or 'no assets'}; put them back, or fit again."

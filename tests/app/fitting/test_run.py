@@ -1,6 +1,5 @@
 """The run folder keeps what it has, whatever happens while it is written."""
 
-import importlib
 import resource
 import shutil
 from pathlib import Path
@@ -13,7 +12,6 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.storage import check_free
 from probscene.errors import DataError, MachineError, RunError
 from probscene.inference.guides.lstm import GUIDES, make_guide
-from probscene.models import multi_mnist
 
 DISCS = Path(__file__).parents[1] / "discs.py"
 
@@ -56,17 +54,13 @@ def test_a_run_whose_making_was_interrupted_can_be_resumed(tmp_path, monkeypatch
     assert [file.name for file in run.path.iterdir()] == ["run.json"]
 
 
-def test_a_run_is_bound_to_the_digits_it_was_begun_with(tmp_path, monkeypatch):
+def test_a_run_is_bound_to_the_digits_it_was_begun_with(tmp_path, monkeypatch, idx_folder):
     monkeypatch.delenv("PROBSCENE_MNIST", raising=False)
-    importlib.reload(multi_mnist)
     run = RunFolder.create(tmp_path / "run", "multi_mnist", {})
     assert RunFolder.at(run.path).model.name == "multi_mnist"
-    monkeypatch.setenv("PROBSCENE_MNIST", str(tmp_path))
-    importlib.reload(multi_mnist)
+    monkeypatch.setenv("PROBSCENE_MNIST", str(idx_folder))
     with pytest.raises(RunError, match="PROBSCENE_MNIST"):
         _ = RunFolder.at(run.path).model
-    monkeypatch.delenv("PROBSCENE_MNIST")
-    importlib.reload(multi_mnist)
 
 
 @pytest.mark.parametrize("kind", [*GUIDES, None])
