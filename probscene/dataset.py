@@ -36,6 +36,7 @@ class Images:
         sizes: of each of them, the height and width that it had.
         windows: of each of them, what is seen of it, see ``window``; None where that is all.
         distinct: how many of them are left without those that equal another one in every pixel.
+        bad: the files left out, each with the fault.
         notes: what a person should know, one sentence each.
         fingerprint: SHA-256, hexadecimal: equal fingerprints mean equal tensors.
     """
@@ -47,6 +48,7 @@ class Images:
     sizes: list[tuple[int, int]]
     windows: list[Window | None]
     distinct: int
+    bad: dict[Path, str]
     notes: tuple[str, ...]
     fingerprint: str
 
@@ -141,7 +143,7 @@ class ImageFolder(Images):
         self.listed = bool(isinstance(path, list | tuple))
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths, self.sizes, self.windows = [], [], []
-        self.bad: dict[Path, str] = {}
+        self.bad = {}
         pictures = set()
         with _quiet(), closing(ahead(self._checked, files, cores())) as checked:
             for i, (file, found) in enumerate(zip(files, checked, strict=True)):

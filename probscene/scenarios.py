@@ -7,14 +7,15 @@ draw; a scene of another scenario counts nowhere in it. Whatever works on a mode
 features, datasets, provenance, reports. Axis letters: N scenes, T steps, K rules, S scenarios.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
+from typing import cast
 
 import pyro
 import torch
 from pyro import poutine
 from pyro.poutine.messenger import Messenger
-from torch import Tensor
+from torch import BoolTensor, Tensor
 
 from .derivation import Derivation, Frontier, expand
 from .derive import Given, derive
@@ -126,7 +127,7 @@ class Mixture(Policy):
 
     grammar: JointGrammar
 
-    def __init__(self, grammar: JointGrammar, policies: list[Policy], weights: list[float] | None = None):
+    def __init__(self, grammar: JointGrammar, policies: Sequence[Policy], weights: list[float] | None = None):
         self.grammar, self.policies = grammar, policies
         share = torch.tensor([1.0] * len(policies) if weights is None else weights)
         self.log_weights = (share / share.sum()).log()
@@ -246,7 +247,8 @@ def _program(
         own = scenario == number
         sites = grammar.sites(derivation, number)
         known = Given(model.grammar, grammar.part(derivation, number), any_length=True)
-        with Within(name), poutine.mask(mask=own.unsqueeze(1)), poutine.block(hide=list(sites)), known:
+        counted = cast(BoolTensor, own.unsqueeze(1))
+        with Within(name), poutine.mask(mask=counted), poutine.block(hide=list(sites)), known:
             drawn.append((own, poutine.condition(model, data=sites)(num_scenes)))
     return join_drawings(derivation.kind, grammar.kinds, drawn)
 

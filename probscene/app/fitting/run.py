@@ -15,6 +15,7 @@ from probscene.inference.guides.base import Guide
 from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.model import SceneModel
+from probscene.scenarios import JointGrammar
 
 from ..files import make_folder, write_json, write_whole
 from ..loading import BUILT_IN, lasting_reference, load_model, same_assets, split_reference
@@ -225,7 +226,7 @@ class RunFolder(Storage):
         if make is None and is_file_part(kind):
             self._unchanged_part(kind)
             make = as_guide_maker(load_part(kind))
-        if model.scenarios:
+        if isinstance(model.grammar, JointGrammar):
             made = ScenarioGuide(model.grammar, model.max_steps, make=make, **settings)
         elif make is not None:
             made = make(model.grammar, model.max_steps)
