@@ -58,9 +58,7 @@ class Labels(NamedTuple):
         return [model.classes.index(name) for name in self.classes or model.classes]
 
 
-def read_labels(
-    path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0
-) -> Labels:
+def read_labels(path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Labels:
     """The labels of a target's images, from a ``.jsonl`` of provenance, a CSV of counts or a folder of KITTI's labels.
 
     Rows of files that the target left out as bad are passed over.
