@@ -205,7 +205,7 @@ def test_a_seed_gives_the_same_scenes_and_parameters_keep_to_their_ranges(model)
     expected = torch.zeros(20)
     for key, value in a.parameters.items():
         low, high = named[key]
-        counted = a.counted[key]
+        counted = a.site_mask[key]
         assert (value[counted] >= low).all() and (value[counted] <= high).all()
         expected -= counted.sum(1) * math.log(high - low)
     assert torch.allclose(a.log_prob, expected, atol=1e-2, rtol=1e-4)
