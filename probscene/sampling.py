@@ -92,7 +92,7 @@ def run_program(
             f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
             f"or scene.build(...)), actual {type(drawing).__name__}."
         )
-    _check_nodes(name, drawing, derivation.trimmed())
+    check_nodes(name, drawing, derivation.trimmed())
     values, site_mask = {}, {}
     log_prob = torch.zeros(N)
     for key, site in cast(dict[str, Any], trace.nodes).items():
@@ -118,8 +118,12 @@ def run_program(
     )
 
 
-def _check_nodes(name: str, drawing: Drawing | World, derivation: Derivation) -> None:
-    """See that a program drew the nodes that were derived."""
+def check_nodes(name: str, drawing: Drawing | World, derivation: Derivation) -> None:
+    """See that the program of model ``name`` drew the nodes that were derived.
+
+    Raises:
+        ModelError: it drew others.
+    """
     M = max(drawing.kind.shape[1], derivation.kind.shape[1])
     drawn, derived = (pad(kind, (0, M - kind.shape[1]), value=-1) for kind in (drawing.kind, derivation.kind))
     other = (drawn != derived).any(1)

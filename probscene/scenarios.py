@@ -26,6 +26,7 @@ from .grammar import Grammar, Node, Rule, is_nonterminal
 from .joining import join_drawings
 from .model import SceneModel
 from .policy import Policy
+from .sampling import check_nodes
 from .structure import StructurePrior
 from .world import World
 
@@ -246,10 +247,14 @@ def _program(
     for number, (name, model) in enumerate(models.items()):
         own = scenario == number
         sites = grammar.sites(derivation, number)
-        known = Given(model.grammar, grammar.part(derivation, number), any_length=True)
+        part = grammar.part(derivation, number)
+        known = Given(model.grammar, part, any_length=True)  # the joint model's T_max may be larger than the part's own
         counted = cast(BoolTensor, own.unsqueeze(1))
         with Within(name), poutine.mask(mask=counted), poutine.block(hide=list(sites)), known:
-            drawn.append((own, poutine.condition(model, data=sites)(num_scenes)))
+            drawing = poutine.condition(model, data=sites)(num_scenes)
+        if isinstance(drawing, Drawing | World):
+            check_nodes(model.name, drawing, part)
+        drawn.append((own, drawing))
     return join_drawings(derivation.kind, grammar.kinds, drawn)
 
 

@@ -44,6 +44,8 @@ def demo(
     images: int = 3000,
     num: int = 500,
     threads: int | None = None,
+    cache: Path | None = None,
+    use_cache: bool = True,
 ) -> None:
     """Draw a target, fit, generate, evaluate, report; prints how near it came and where to look.
 
@@ -52,6 +54,7 @@ def demo(
         images: of the target.
         num: of the dataset.
         threads: of the fit; all cores where None.
+        cache, use_cache: see ``fit.fit``.
 
     Raises:
         ProbsceneError: a model without a target, or a folder that holds something else.
@@ -62,7 +65,9 @@ def demo(
     out = make_folder(out)
     with Display() as show:
         target = _draw(loaded.target(seed), images, out, seed, show)
-        run, opened = _fit(model, target, out / "run", preset, seed, threads, show)
+        run, opened = _begun(model, target, out / "run", preset, seed, threads, show)
+        if not run.is_finished:
+            session.carry_out(run, opened, show, cache, use_cache)
         generate(run, num, out / "dataset", seed, progress=show.stage("generating"))
         if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
             _judge(run, opened or session.open_images(target, loaded, False, show), out, show)
@@ -91,16 +96,12 @@ def _draw(truth: SceneModel, images: int, out: Path, seed: int, show: Display) -
     return folder / "images"
 
 
-def _fit(
+def _begun(
     model: str, target: Path, out: Path, preset: Preset, seed: int, threads: int | None, show: Display
 ) -> tuple[RunFolder, Images | None]:
     if (out / "run.json").exists():
-        run, opened = session.resume(out, show, model, target, preset, seed=seed, threads=threads)
-    else:
-        run, opened = session.begin(model, target, out, preset, seed, False, threads, show)
-    if not run.is_finished:
-        session.carry_out(run, opened, show)
-    return run, opened
+        return session.resume(out, show, model, target, preset, seed=seed, threads=threads)
+    return session.begin(model, target, out, preset, seed, False, threads, show)
 
 
 def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 import probscene
-from probscene.app import cli
+from probscene.app.cli.options import PresetName
 from probscene.app.fitting import fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import OBJECTIVES, PRESETS, QUICK
@@ -64,11 +64,9 @@ def test_version_and_help(call):
 
 
 def test_presets_are_those_of_the_library():
-    assert [str(name) for name in cli.PresetName] == list(PRESETS)
-    assert [str(name) for name in cli.Objective] == list(OBJECTIVES)
-    assert [str(name) for name in cli.GuideName] == list(GUIDES)
-    assert {override(QUICK, [f"objective={name}"]).objective for name in cli.Objective} == set(cli.Objective)
-    assert {override(QUICK, [f"guide={name}"]).guide for name in cli.GuideName} == set(cli.GuideName)
+    assert [str(name) for name in PresetName] == list(PRESETS)
+    assert {override(QUICK, [f"objective={name}"]).objective for name in OBJECTIVES} == set(OBJECTIVES)
+    assert {override(QUICK, [f"guide={name}"]).guide for name in GUIDES} == set(GUIDES)
 
 
 def test_check_says_what_a_person_should_know(call, discs):

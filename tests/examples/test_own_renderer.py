@@ -87,7 +87,7 @@ def test_it_is_fitted_and_generated(tmp_path):
     probscene("generate", run, "--num", 4, "--out", tmp_path / "dataset")
     coco = json.loads((tmp_path / "dataset" / "annotations.json").read_text())
     assert len(coco["images"]) == 4 and {c["name"] for c in coco["categories"]} == {"red", "green"}
-    first = np.asarray(Image.open(tmp_path / "dataset" / coco["images"][0]["file_name"]))
+    first = np.asarray(Image.open(tmp_path / "dataset" / "images" / coco["images"][0]["file_name"]))
     assert first.shape == (96, 96, 3) and (first[0, 0, :3] < 60).all()
     probscene("preview", run, "--out", tmp_path / "night.png", "--boxes", "--num", 3)
     assert (tmp_path / "night.png").is_file()

@@ -227,6 +227,27 @@ def test_targets_are_joined():
     assert MODEL.target is None
 
 
+def test_scenes_may_be_longer_than_a_scenarios_own_max_steps():
+    """As the joint guide's may be; none of their objects is lost."""
+    short = replace(MODELS["discs"], max_steps=4)
+    joint = join("both", {"discs": short, "boxes": MODELS["boxes"]})
+    rows = torch.tensor([[0, *[2 + k for k in (0, 1, 1, 1, 1, 1, 1, 1, 1, 1, 2)]]])
+    derivation = type(enumerate_derivations(JOINT, 4)).of(joint.grammar, rows)
+    scenes = run_program(joint, derivation)
+    assert derivation.complete.all() and int(scenes.drawing.layers[1].present.sum()) == 9
+
+
+def test_a_scenario_that_draws_other_nodes_is_refused():
+    def empty(num_scenes, structure):
+        derivation, _ = derive_complete(DISCS, StructurePrior(DISCS, Discs=counts(1)), num_scenes, 12)
+        return SceneGraph(DISCS, derivation).draw()
+
+    full = replace(MODELS["discs"], program=empty, prior=StructurePrior(DISCS, Discs=counts(0, 0, 1)))
+    joint = join("both", {"discs": full, "boxes": MODELS["boxes"]})
+    with pytest.raises(ModelError, match="program of model 'discs' to draw .* derived disc, disc; drawn none"):
+        sample(joint, joint.prior, 20)
+
+
 def test_scenarios_that_do_not_go_together():
     with pytest.raises(ModelError, match="at least one scenario"):
         join("none", {})

@@ -30,8 +30,8 @@ from ..progress import Progress
 from .cache import NetworkCache
 from .checkpoints import Keeper
 from .observer import RENDERED_AT_ONCE, Observer
-from .parts import inner
-from .run import RunFolder, load_state, state_of
+from .parts import inner, load_state, state_of
+from .run import RunFolder
 from .scene_features import fingerprint
 
 Say = Callable[[str], None]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.errors import ModelError, ProbsceneError
+from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.grammar import Grammar
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features, Fixed
@@ -145,6 +145,31 @@ class CheckedNet:
 def inner(net: FeatureNet) -> FeatureNet:
     """The network itself, without the checks around a user's."""
     return net.net if isinstance(net, CheckedNet) else net
+
+
+def state_of(net: FeatureNet) -> dict[str, Tensor]:
+    """What a run keeps of a feature network: a module's state, of anything else nothing."""
+    module = inner(net)
+    return module.state_dict() if isinstance(module, nn.Module) else {}
+
+
+def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
+    """The reverse of ``state_of``; the network is then ready for use.
+
+    Raises:
+        RunError: the state is another network's.
+    """
+    module = inner(net)
+    if not isinstance(module, nn.Module):
+        return
+    try:
+        module.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise RunError(
+            f"Expected the state of a {type(module).__name__}, actual another network's; put the features back as they "
+            "were when the run was begun, or fit again."
+        ) from error
+    module.eval()
 
 
 class CheckedDivergence:

@@ -4,9 +4,7 @@ import os
 import shutil
 from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-from torch import Tensor, nn
+from typing import Any, Self
 
 from probscene.errors import RunError
 from probscene.inference.divergence import Divergence
@@ -27,9 +25,9 @@ from .parts import (
     Parts,
     as_guide_maker,
     check_guide,
-    inner,
     is_file_part,
     load_part,
+    load_state,
     part_file,
 )
 from .presets import Preset
@@ -64,7 +62,7 @@ class RunFolder(Storage):
         assets: Path | None = None,
         loaded: SceneModel | None = None,
         parts: Parts | None = None,
-    ) -> "RunFolder":
+    ) -> Self:
         """A new run folder; ``record`` is kept in ``run.json``.
 
         Args:
@@ -97,7 +95,7 @@ class RunFolder(Storage):
         return run
 
     @classmethod
-    def at(cls, path: Path, model: SceneModel | None = None, parts: Parts | None = None) -> "RunFolder":
+    def at(cls, path: Path, model: SceneModel | None = None, parts: Parts | None = None) -> Self:
         """An existing run folder.
 
         Args:
@@ -277,31 +275,6 @@ class RunFolder(Storage):
                 f"Expected the {what} file {file} as it was when {self.path} was fitted, actual a missing or changed "
                 f"file. {kept or 'Put it back, or fit again.'}"
             )
-
-
-def state_of(net: FeatureNet) -> dict[str, Tensor]:
-    """What a run keeps of a feature network: a module's state, of anything else nothing."""
-    module = inner(net)
-    return module.state_dict() if isinstance(module, nn.Module) else {}
-
-
-def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
-    """The reverse of ``state_of``; the network is then ready for use.
-
-    Raises:
-        RunError: the state is another network's.
-    """
-    module = inner(net)
-    if not isinstance(module, nn.Module):
-        return
-    try:
-        module.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise RunError(
-            f"Expected the state of a {type(module).__name__}, actual another network's; put the features back as they "
-            "were when the run was begun, or fit again."
-        ) from error
-    module.eval()
 
 
 def is_run(path: str) -> bool:

@@ -1,0 +1,5 @@
+"""``python -m probscene.app.cli``."""
+
+from . import main
+
+main()

@@ -1,0 +1,82 @@
+"""The application that commands are added to, and how an error of any of them is told."""
+
+import os
+import shlex
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer.core import TyperGroup
+
+from probscene.errors import ProbsceneError
+
+
+@dataclass
+class Call:
+    """What was asked for, for the message when it ends early."""
+
+    words: list[str]
+    debug: bool = field(default_factory=lambda: bool(os.environ.get("PROBSCENE_DEBUG")))
+
+
+ORDER = ("check", "preview", "view", "fit", "generate", "evaluate", "report", "compare", "demo", "version")
+
+
+class Commands(TyperGroup):
+    """Lists commands in the order of the work, and turns an error of any into one line on stderr and an exit code."""
+
+    def list_commands(self, ctx):
+        return [name for name in ORDER if name in self.commands]
+
+    def parse_args(self, ctx, args):
+        ctx.obj = Call(list(args))
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx):
+        try:
+            return super().invoke(ctx)
+        except (Exception, KeyboardInterrupt) as error:
+            its_own = type(error).__module__.startswith(("typer.", "click."))  # wrong usage, --help, an exit code
+            if its_own or isinstance(error, BrokenPipeError) or ctx.obj.debug:
+                raise
+            code, text = explained(error, ctx.obj.words)
+            print(text, file=sys.stderr)
+        raise typer.Exit(code)
+
+
+def explained(error: BaseException, words: list[str]) -> tuple[int, str]:
+    """The exit code and the one line that an error comes to; ``words`` are what was typed after ``probscene``."""
+    again = shlex.join(["probscene", *words])
+    if isinstance(error, KeyboardInterrupt):
+        return 1, f"Interrupted; go on with: {again}"
+    if isinstance(error, OSError):
+        from ..files import machine_error
+
+        error = machine_error(error, Path(error.filename or "the output"))
+    if isinstance(error, ProbsceneError):
+        return error.exit_code, f"probscene: {' '.join(str(error).split())}"
+    if isinstance(error, MemoryError):
+        return 1, "probscene: The machine is out of memory; close other programs and run the command again."
+    last = (str(error).strip().splitlines() or ["no message"])[-1]
+    debug = shlex.join(["probscene", "--debug", *words])
+    return 1, f"probscene: A bug in probscene: {type(error).__name__}: {last}. Please report what this prints: {debug}"
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback()
+def _everywhere(
+    ctx: typer.Context, debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False
+) -> None:
+    """Learn which scene structures occur in unlabelled images, then generate a labelled dataset that has them."""
+    ctx.obj.debug |= debug

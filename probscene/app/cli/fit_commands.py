@@ -1,0 +1,102 @@
+"""``probscene fit``, ``demo`` and ``version``."""
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import probscene
+from probscene.errors import ProbsceneError
+
+from .application import app
+from .options import Assets, Cache, NoCache, PresetName, Seed, checked_seed
+
+
+@app.command()
+def fit(
+    ctx: typer.Context,
+    out: Annotated[Path, typer.Option(metavar="RUN", help="The run folder to write.")],
+    model: Annotated[str | None, typer.Argument(metavar="MODEL", help="A built-in model or a .py file.")] = None,
+    target: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of PNG or JPEG images.")] = None,
+    preset: Annotated[PresetName | None, typer.Option(help="How long to learn; 'default' if not given.")] = None,
+    objective: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The divergence: kde, js, witness, mmd, or FILE.py:NAME.")
+    ] = None,
+    guide: Annotated[
+        str | None, typer.Option(metavar="NAME", help="What learns: lstm, pcfg, grammar-vae, or FILE.py:NAME.")
+    ] = None,
+    features: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NET",
+            help="count, count=efficientnet, presence, efficientnet, inception[=FILE], resnet50[=FILE], FILE.py:NAME.",
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="The same seed gives the same result; 0 if not given.")] = None,
+    skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = None,
+    threads: Annotated[int | None, typer.Option(help="All cores if not given.")] = None,
+    scenarios: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="Of a model that has several; a guide learns each. All if not given."),
+    ] = None,
+    assets: Assets = None,
+    cache: Cache = None,
+    no_cache: NoCache = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
+) -> None:
+    """Learn which structures occur in a folder of unlabelled images."""
+    from ..api.fit import chosen_preset
+    from ..fitting import session
+    from ..loading import split_reference
+    from ..progress import Display
+
+    if seed is not None:
+        checked_seed(seed)
+    if threads is not None and threads < 1:
+        raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
+    name = str(preset or PresetName.default)
+    chosen, _ = chosen_preset(name, features, objective, guide, settings or [])
+    if scenarios is not None:
+        if model is None:
+            raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")
+        if split_reference(model)[1]:
+            raise ProbsceneError(f"Expected scenarios once, actual {model} and {scenarios}; leave out --scenarios.")
+        model = f"{model}:{scenarios}"
+    with Display() as show:
+        if resume:
+            given = chosen if preset or objective or guide or features or settings else None
+            begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads}
+            run, images = session.resume(out, show, model, target, given, assets, **begun)
+        elif model is None or target is None:
+            raise ProbsceneError(
+                "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
+            )
+        else:
+            run, images = session.begin(model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets)
+            ctx.obj.words.append("--resume")
+        if not run.is_finished:
+            session.carry_out(run, images, show, cache, not no_cache)
+    print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")] = Path("demo"),
+    seed: Seed = 0,
+    cache: Cache = None,
+    no_cache: NoCache = False,
+) -> None:
+    """The whole path on handwritten digits that come with the install; about five minutes on two cores."""
+    from ..demo import demo
+
+    demo(out, checked_seed(seed), cache=cache, use_cache=not no_cache)
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    print(f"probscene {probscene.__version__}")

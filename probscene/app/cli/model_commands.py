@@ -1,0 +1,55 @@
+"""``probscene check``, ``preview`` and ``view``: looks at a model, or at what a run has learnt."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from probscene.errors import ModelError
+
+from .application import app
+from .options import Assets, Model, Seed, checked_seed
+
+
+@app.command()
+def check(model: Model, assets: Assets = None) -> None:
+    """Say whether a model's grammar is sound, how long its derivations are, and what to mend."""
+    from probscene.checks import check
+
+    from ..loading import load_model
+
+    report = check(load_model(model, assets))
+    print(report)
+    if report.faults:
+        raise ModelError(f"Expected a model without faults, actual {model} with {len(report.faults)}; mend them first.")
+
+
+@app.command()
+def preview(
+    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a finished run.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write, a PNG.")],
+    num: Annotated[int, typer.Option(help="How many scenes.")] = 16,
+    seed: Seed = 0,
+    boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes and class names.")] = False,
+    assets: Assets = None,
+) -> None:
+    """Draw a grid of scenes: of a model's prior, or of what a run has learnt."""
+    from ..views.preview import preview
+
+    preview(model_or_run, out, num, checked_seed(seed), boxes, assets)
+    print(f"{num} scenes in {out}")
+
+
+@app.command()
+def view(
+    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a finished run.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="scene.rrd for Rerun's viewer, or scene.glb (glTF, 3D).")],
+    num: Annotated[int, typer.Option(help="How many scenes, one after the other; a .glb holds one.")] = 1,
+    seed: Seed = 0,
+    assets: Assets = None,
+) -> None:
+    """Write scenes that one can turn: of a model's prior, or of what a run has learnt."""
+    from ..views.export import view
+
+    view(model_or_run, out, num, checked_seed(seed), assets)
+    print(f"{num} {'scene' if num == 1 else 'scenes'} in {out}")

@@ -1,0 +1,153 @@
+"""``probscene generate``, ``evaluate``, ``report`` and ``compare``: what is done with a run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .application import app
+from .options import MinHeight, RunPath, Seed
+
+
+@app.command()
+def generate(
+    run: RunPath,
+    num: Annotated[int, typer.Option(metavar="N", help="How many images.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    format: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FORMAT",
+            help="coco (if not given), yolo, kitti, webdataset, or images for no labels; again for more.",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,
+) -> None:
+    """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
+    from ..datasets.generate import generate
+    from ..fitting.run import RunFolder
+    from ..progress import Display
+
+    with Display() as show:
+        dataset = generate(RunFolder.at(run), num, out, seed, workers, format or "coco", show.stage("generating"))
+    print(f"{num} images in {dataset.path}, {dataset.made} of them made now")
+
+
+@app.command()
+def evaluate(
+    run: RunPath,
+    target: Annotated[Path, typer.Option(metavar="DIR", help="The images to judge by.")],
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH", help="A counts.csv (image,CLASS,...), a provenance.jsonl, or KITTI's folder label_2."
+        ),
+    ] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
+    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+    features: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NET", help="FID and KID by run, efficientnet, inception[=FILE], resnet50[=FILE]; many."),
+    ] = None,
+    num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
+    scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
+    some_labels: Annotated[bool, typer.Option("--some-labels", help="Labels need not cover all images.")] = False,
+    min_height: MinHeight = 0.0,
+) -> None:
+    """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
+    from rich.console import Console
+
+    from ..evaluation import judge as verdict
+    from ..evaluation.evaluate import evaluate
+    from ..evaluation.labels import read_labels
+    from ..files import make_folder, write_json
+    from ..fitting import session
+    from ..fitting.run import RunFolder
+    from ..progress import Display
+    from ..views import tables, verdict_text
+
+    opened = RunFolder.at(run)
+    opened.check_finished()
+    if json is not None:
+        make_folder(json.parent)
+    with Display() as show:
+        images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
+        truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
+        found = evaluate(opened, images, truth, show, num, features=features or (), images=num_images)
+        judged = verdict.judge(opened, images, show, scenes, found) if scenes else None
+    console = Console(highlight=False)
+    if judged is not None:
+        verdict_text.show(judged, console)
+    tables.show(found, console)
+    if json is not None:
+        write_json(json, found.record() | ({} if judged is None else {"trust": judged.record()}))
+
+
+@app.command()
+def report(
+    run: RunPath,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="report.html in the run folder if not given.")
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="counts.csv, provenance.jsonl or label_2 of the run's target.")
+    ] = None,
+    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+    scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
+) -> None:
+    """Write one self-contained HTML page about a run."""
+    from ..fitting.run import RunFolder
+    from ..progress import Display
+    from ..views.report import report
+
+    with Display() as show:
+        path = report(RunFolder.at(run), show, out, labels, num, scenes)
+    print(f"The report is {path}")
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Finished runs of one model.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write, a PNG.")],
+    target: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="The images to judge by; the runs' own if not given.")
+    ] = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="counts.csv, provenance.jsonl or label_2 of the target, for the truth."),
+    ] = None,
+    min_height: MinHeight = 0.0,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
+    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+) -> None:
+    """Draw the prior, several runs and the truth side by side, and print how far each is from the truth."""
+    from rich.console import Console
+
+    from ..evaluation import compare
+    from ..evaluation.labels import read_labels
+    from ..files import make_folder, write_json
+    from ..fitting import fit, session
+    from ..progress import Display
+    from ..views import comparison, tables
+
+    opened = compare.open_runs(runs)
+    comparison.make_place(out)
+    first = next(iter(opened.values()))
+    if json is not None:
+        make_folder(json.parent)
+    with Display() as show:
+        images = None
+        if target is not None:
+            images = session.open_images(target, first.model, first.record["skip_bad"], show)
+        elif labels is not None:
+            images = fit.open_target(first, show)
+        truth = None
+        if labels is not None and images is not None:
+            truth = read_labels(labels, first.model, images, min_height=min_height)
+        found = compare.compare(opened, images, truth, show, num)
+        comparison.draw(found, out)
+    tables.show_comparison(found, Console(highlight=False))
+    print(f"The picture is {out}")
+    if json is not None:
+        write_json(json, found.record())
