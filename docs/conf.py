@@ -13,6 +13,7 @@ html_title = f"probscene {version}"
 html_static_path: list[str] = []
 exclude_patterns = ["_build"]
 
+myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True}
@@ -37,7 +38,7 @@ def literal_blocks(app, what, name, obj, options, lines):
 
 
 def _listed(lines):
-    """Whether the paragraph before belongs to a field or is marked already, so that indentation means something else."""
+    """Whether the paragraph before is a field or marked already, so that indentation means something else."""
     before = next((line for line in reversed(lines) if line.strip()), "")
     return before.startswith((":", ".. ", "   ")) or before.endswith("::")
 

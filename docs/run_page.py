@@ -19,7 +19,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-FENCE = re.compile(r"^```python(?: (?P<file>\S+))?\n(?P<code>.*?)^```\n(?:\n```text\n(?P<shown>.*?)^```\n)?", re.M | re.S)
+FENCE = re.compile(
+    r"^```python(?: (?P<file>\S+))?\n(?P<code>.*?)^```\n(?:\n```text\n(?P<shown>.*?)^```\n)?", re.M | re.S
+)
 
 
 def run(page: str) -> str:
