@@ -23,7 +23,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
 from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.presets import DEFAULT, QUICK, Preset
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.derive import derive_complete
 from probscene.inference.judging.metrics import total_variation
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
@@ -78,7 +78,7 @@ def fit_images(preset: str, name: str, seed: int, out: Path) -> tuple[Policy, di
     """A fit from images, resumed if it was begun."""
     path, shared = out / f"{preset}-{name}-{seed}", out / f"features-{preset}-{seed}"
     if (path / "run.json").exists():
-        run = Run.open(path)
+        run = RunFolder.at(path)
     else:
         run = create("aerial2d", out / f"target-{seed}" / "images", path, chosen(preset, name), seed)
     took, last = {}, [None, time.monotonic()]

@@ -19,7 +19,7 @@ from probscene.app.files import write_json
 from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.derive import derive_complete
@@ -54,7 +54,7 @@ def main():
         chosen = override(preset(args.preset), args.settings)
         path = args.out / f"run-{seed}"
         began = path.exists()
-        run = Run.open(path) if began else create(args.model, folder / "images", path, chosen, seed)
+        run = RunFolder.at(path) if began else create(args.model, folder / "images", path, chosen, seed)
         start, took, last = time.monotonic(), {}, [None, 0.0]
 
         def progress(stage, done, total, note, took=took, last=last):

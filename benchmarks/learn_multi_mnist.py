@@ -22,7 +22,7 @@ import torch
 from probscene.app.files import write_json
 from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
@@ -89,7 +89,7 @@ def fit_images(name: str, target: int, seed: int, args) -> tuple[LSTMGuide, dict
     out = args.out / f"{name}-{target}"
     shared = args.out / f"features-{'paper' if name == 'paper' else name.split('-')[0]}.safetensors"
     if (out / "run.json").exists():
-        run = Run.open(out)
+        run = RunFolder.at(out)
     else:
         run = create("multi_mnist", args.out / f"target-{target}", out, PRESETS[name], seed)
     took, last = {}, [None, time.monotonic()]

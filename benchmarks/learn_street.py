@@ -22,7 +22,7 @@ from probscene.app.files import write_json
 from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
@@ -83,7 +83,7 @@ def main():
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
         chosen = override(preset("street").with_features(args.features), args.settings)
-        run = Run.open(path) if path.exists() else create(args.model, args.images, path, chosen, seed)
+        run = RunFolder.at(path) if path.exists() else create(args.model, args.images, path, chosen, seed)
         start = time.monotonic()
         fit(run, lambda *_: None)
         seconds = round(time.monotonic() - start, 1)

@@ -12,7 +12,7 @@ import time
 
 import torch
 
-from probscene.app.fitting.observer import Observer, feature_net
+from probscene.app.fitting.observer import Observer
 from probscene.app.fitting.presets import QUICK
 from probscene.app.loading import load_model, renderer_for
 from probscene.derive import derive_complete
@@ -69,7 +69,7 @@ def main():
     for features in args.features:
         seed_everything(0)
         view = Observer(model, 1)
-        net = feature_net(QUICK.with_features(features), model).eval()
+        net = QUICK.with_features(features).make_features().build(model).eval()
         if features == "count":
             net.fit_to(view.object_size())
         made = ScenarioGuide if model.scenarios else lambda g, steps: make_guide("lstm", g, steps)

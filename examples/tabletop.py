@@ -9,6 +9,7 @@ other; in ``target(seed)`` the first plate is set for company. No list of rule w
 
 import argparse
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,10 +17,9 @@ import pyro
 import pyro.distributions as dist
 import torch
 
-from probscene.derive import derive
 from probscene.drawing import Atlas, Drawing, Sprites, disc
 from probscene.grammar import Grammar
-from probscene.model import SceneModel
+from probscene.model import SceneModel, scene_model
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.scene import SceneGraph
@@ -74,20 +74,26 @@ DISH = rings(128, (1, 225), (0.94, 255), (0.68, 210), (0.64, 242))
 WOOD, DISHES, MUGS = Atlas((wood(),)), Atlas((DISH,)), Atlas((mug(),))
 
 
-def tabletop(num_scenes: int, structure=PRIOR) -> Drawing:
-    """The Pyro program: angles in radians, lengths in pixels; every site is ``(N, M)``."""
-    with pyro.plate("scenes", num_scenes, dim=-2):
-        scene = SceneGraph(GRAMMAR, derive(GRAMMAR, structure, num_scenes, max_steps=40))
-        with scene.nodes("table"):
-            table_turn = pyro.sample("table.turn", dist.Uniform(0.0, TURN))
-        with scene.nodes("plate"):
-            place = pyro.sample("plate.place", dist.Uniform(-0.2, 0.2))
-            away = pyro.sample("plate.away", dist.Uniform(58.0, 80.0))
-            glaze = pyro.sample("plate.glaze", dist.Categorical(torch.ones(len(GLAZES))))
-        with scene.nodes("mug"):
-            spot = pyro.sample("mug.spot", dist.Uniform(-0.2, 0.2))
-            handle = pyro.sample("mug.handle", dist.Uniform(0.0, TURN))
-            enamel = pyro.sample("mug.enamel", dist.Categorical(torch.ones(len(ENAMELS))))
+def target(seed: int) -> SceneModel:
+    """The experiment's truth: two or three mugs on the first plate, hardly any on the others; how few is the seed's."""
+    few = 0.05 + 0.25 * np.random.default_rng(seed).random()
+    prior = StructurePrior(GRAMMAR, Plates=counts(0, 2, 5, 3), Mugs=ranked(counts(0, 1, 4, 5), counts(1 - few, few)))
+    return replace(tabletop, name="tabletop_target", prior=prior, target=None)
+
+
+@scene_model(GRAMMAR, PRIOR, canvas=(CANVAS, CANVAS), max_steps=40, classes=("plate", "mug"), target=target)
+def tabletop(scene: SceneGraph) -> Drawing:
+    """Angles in radians, lengths in pixels; every site is ``(N, M)``."""
+    with scene.nodes("table"):
+        table_turn = pyro.sample("table.turn", dist.Uniform(0.0, TURN))
+    with scene.nodes("plate"):
+        place = pyro.sample("plate.place", dist.Uniform(-0.2, 0.2))
+        away = pyro.sample("plate.away", dist.Uniform(58.0, 80.0))
+        glaze = pyro.sample("plate.glaze", dist.Categorical(torch.ones(len(GLAZES))))
+    with scene.nodes("mug"):
+        spot = pyro.sample("mug.spot", dist.Uniform(-0.2, 0.2))
+        handle = pyro.sample("mug.handle", dist.Uniform(0.0, TURN))
+        enamel = pyro.sample("mug.enamel", dist.Categorical(torch.ones(len(ENAMELS))))
     # Siblings share out the circle around their parent's middle, so that none stands on another.
     plate_angle = scene.of_parent(table_turn) + TURN * scene.rank("plate") / scene.count("plate").clamp(min=1) + place
     plate_x, plate_y = MIDDLE + away * plate_angle.cos(), MIDDLE - away * plate_angle.sin()
@@ -103,16 +109,6 @@ def tabletop(num_scenes: int, structure=PRIOR) -> Drawing:
     )
 
 
-def target(seed: int) -> SceneModel:
-    """The experiment's truth: two or three mugs on the first plate, hardly any on the others; how few is the seed's."""
-    few = 0.05 + 0.25 * np.random.default_rng(seed).random()
-    prior = StructurePrior(GRAMMAR, Plates=counts(0, 2, 5, 3), Mugs=ranked(counts(0, 1, 4, 5), counts(1 - few, few)))
-    return SceneModel("tabletop_target", GRAMMAR, prior, tabletop, (CANVAS, CANVAS), 40, ("plate", "mug"))
-
-
-MODEL = SceneModel("tabletop", GRAMMAR, PRIOR, tabletop, (CANVAS, CANVAS), 40, ("plate", "mug"), target=target)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description="Draw labelled scenes of the prior.")
     parser.add_argument("--num", type=int, default=8, help="how many scenes")
@@ -122,7 +118,7 @@ def main() -> None:
     if options.num < 1:
         parser.error(f"expected --num of at least 1, actual {options.num}")
     seed_everything(options.seed)
-    batch = SpriteRenderer(MODEL.canvas)(sample(MODEL, PRIOR, options.num).drawing)
+    batch = SpriteRenderer(tabletop.canvas)(sample(tabletop, PRIOR, options.num).drawing)
     pictures = batch.image.permute(0, 2, 3, 1).numpy().copy()
     for picture, kinds, boxes in zip(pictures, batch.kind.tolist(), batch.box.int().tolist(), strict=True):
         for kind, (x0, y0, x1, y1) in zip(kinds, boxes, strict=True):

@@ -1,22 +1,24 @@
-"""The learning loop of a guide: Adam on the objective, each batch seeded by its number, so that a loop that was
-interrupted goes on to the same result."""
+"""The learning loop of a guide: Pyro's ``SVI`` with Adam on the objective, each batch seeded by its number, so that a
+loop that was interrupted goes on to the same result."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
+import pyro
 import torch
-from torch import Tensor, nn
+from pyro.infer import SVI
+from torch import Tensor
 
 from probscene.errors import ProbsceneError
 from probscene.sampling import seed_everything
 
+from .guides.base import Guide
 from .objective import ScoreFunction
-from .training import batch_seed, restore_training, training_state
+from .training import Report, batch_seed, check_finite, restore_training, training_state
 
 
 class Trainer:
-    """Adam on a ``ScoreFunction``, resumable after every rendered batch.
+    """A ``Training`` of a guide's structure: ``SVI`` on a ``ScoreFunction``, resumable after every rendered batch.
 
     Args:
         model: a scene model.
@@ -30,13 +32,15 @@ class Trainer:
         seed: batch k is drawn from (seed, k).
 
     Attributes:
-        done: batches taken.
+        unit, total, done: see ``Training``; batches.
     """
+
+    unit = "batches"
 
     def __init__(
         self,
         model: Any,
-        guide: nn.Module,
+        guide: Guide,
         objective: ScoreFunction,
         real: Tensor,
         batches: int,
@@ -47,67 +51,107 @@ class Trainer:
         seed: int = 0,
     ):
         self.model, self.guide, self.objective, self.real = model, guide, objective, real
-        self.batches, self.num_scenes, self.num_real, self.seed = batches, num_scenes, num_real, seed
+        self.total, self.num_scenes, self.num_real, self.seed = batches, num_scenes, num_real, seed
         self.learning_rate, self.cosine = learning_rate, cosine
-        self.optimiser = torch.optim.Adam(guide.parameters(), lr=learning_rate)
+        self.adam = _Adam(learning_rate)
+        self.svi = SVI(model, guide, self.adam, loss=objective)
         self.done = 0
 
-    def run(self, each: Callable[["Trainer", dict[str, float]], None] | None = None) -> None:
-        """Take the batches that are left; ``each`` sees the learner and its diagnostics after every one.
+    def run(self, each: Report | None = None) -> None:
+        """Take the batches that are left; ``each`` hears of the last one's ``diagnostics``.
 
         Raises:
             ProbsceneError: a cost or a parameter is no longer finite; the guide is then as it was before that batch.
         """
-        while self.done < self.batches:
-            before = {key: value.clone() for key, value in self.guide.state_dict().items()}
-            seed_everything(batch_seed(self.seed, self.done))
-            real = self.real
-            if self.num_real is not None and self.num_real < len(real):
-                real = real[torch.randperm(len(real))[: self.num_real]]
-            for update in range(self.objective.updates):
-                progress = (self.done * self.objective.updates + update) / (self.batches * self.objective.updates)
-                for group in self.optimiser.param_groups:
-                    factor = 0.5 * (1 + math.cos(math.pi * progress)) if self.cosine else 1.0
-                    group["lr"] = self.learning_rate * factor
-                self.optimiser.zero_grad()
+        with pyro.get_param_store().scope():  # another guide's parameters have the same names
+            while self.done < self.total:
+                before = {key: value.clone() for key, value in self.guide.state_dict().items()}
                 try:
-                    loss = self.objective(self.model, self.guide, self.num_scenes, real=real)
+                    self._batch()
                 except ProbsceneError as error:
                     self.guide.load_state_dict(before)
-                    raise type(error)(f"At batch {self.done + 1} of {self.batches}: {error}") from error
-                loss.backward()
-                self.optimiser.step()
-            if not all(torch.isfinite(p).all() for p in self.guide.parameters()):
-                self.guide.load_state_dict(before)
-                raise ProbsceneError(
-                    f"At batch {self.done + 1} of {self.batches}: Expected finite parameters, actual NaN or infinity; "
-                    "the guide is as it was before it. Begin again with a lower rate, such as "
-                    f"learning_rate={self.learning_rate / 4:g}, or a larger variance."
-                )
-            self.done += 1
-            if each is not None:
-                each(self, self.diagnostics())
+                    raise type(error)(f"At batch {self.done + 1} of {self.total}: {error}") from error
+                self.done += 1
+                if each is not None:
+                    each(self, self.diagnostics())
 
     def diagnostics(self) -> dict[str, float]:
         """Of the last batch: its mean cost, that cost's spread, rejections and length."""
         batch = self.objective.batch
+        assert batch is not None
         return {
             "batch": self.done,
             "cost": batch.cost.mean().item(),
             "cost_sd": batch.cost.std().item(),
             "rejections": batch.rejections,
             "length": batch.derivation.lengths.float().mean().item(),
-            "learning_rate": self.optimiser.param_groups[0]["lr"],
+            "learning_rate": self.adam.rate,
         }
+
+    def summary(self) -> dict[str, Any]:
+        """Nothing more for the log."""
+        return {}
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
         averages = {f"average-{stratum}": value for stratum, value in self.objective.averages.items()}
-        return training_state(self.guide, {"adam": self.optimiser}, done=self.done, **averages)
+        whole = self.adam.whole(list(self.guide.parameters()))
+        return training_state(self.guide, {"adam": whole}, done=self.done, **averages)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
-        numbers = restore_training(self.guide, {"adam": self.optimiser}, tensors)
+        whole = torch.optim.Adam(self.guide.parameters())
+        numbers = restore_training(self.guide, {"adam": whole}, tensors)
+        self.adam.take(whole)
         self.done = int(numbers["done"])
         averages = {key: value for key, value in numbers.items() if key.startswith("average-")}
         self.objective.averages = {int(key.removeprefix("average-")): value for key, value in averages.items()}
+
+    def _batch(self) -> None:
+        seed_everything(batch_seed(self.seed, self.done))
+        real = self.real
+        if self.num_real is not None and self.num_real < len(real):
+            real = real[torch.randperm(len(real))[: self.num_real]]
+        updates, loss = self.objective.updates, 0.0
+        for update in range(updates):
+            progress = (self.done * updates + update) / (self.total * updates)
+            self.adam.rate = self.learning_rate * (0.5 * (1 + math.cos(math.pi * progress)) if self.cosine else 1.0)
+            loss = self.svi.step(self.num_scenes, real=real)
+        remedy = (
+            f"begin again with a lower rate, such as learning_rate={self.learning_rate / 4:g}, or a larger variance; "
+            "the guide is as it was before the batch"
+        )
+        check_finite(loss, self.guide.parameters(), "the guide", "in this batch", remedy)
+
+
+class _Adam(pyro.optim.PyroOptim):
+    """Adam whose rate is the same for all parameters and can be set between two steps."""
+
+    def __init__(self, rate: float):
+        super().__init__(torch.optim.Adam, {"lr": rate})
+
+    @property
+    def rate(self) -> float:
+        return self.pt_optim_args["lr"]
+
+    @rate.setter
+    def rate(self, rate: float) -> None:
+        self.pt_optim_args["lr"] = rate  # of parameters that it has not seen yet
+        for optimiser in self.optim_objs.values():
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+
+    def whole(self, parameters: list[Tensor]) -> torch.optim.Optimizer:
+        """One optimiser of all parameters with the state of each."""
+        whole = torch.optim.Adam(parameters)
+        for parameter in parameters:
+            if parameter in self.optim_objs:
+                whole.state[parameter] = self.optim_objs[parameter].state[parameter]
+        return whole
+
+    def take(self, whole: torch.optim.Optimizer) -> None:
+        """The reverse of ``whole``."""
+        for parameter, slots in whole.state.items():
+            self.optim_objs[parameter] = torch.optim.Adam([parameter], lr=self.rate)
+            self.optim_objs[parameter].state[parameter] = slots
+            self.grad_clip[parameter] = None

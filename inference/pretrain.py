@@ -1,6 +1,5 @@
 """Maximum-likelihood pretraining of a guide on derivations of the prior (Meta-Sim2, section 3.3: "essential")."""
 
-import math
 from collections.abc import Callable
 
 import torch
@@ -8,8 +7,9 @@ from torch import nn
 
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.errors import ProbsceneError
 from probscene.policy import Policy
+
+from .training import check_finite
 
 
 def pretrain(
@@ -47,11 +47,8 @@ def pretrain(
             optimiser.step()
             total += nll.item() * len(rows)
         loss = total / num_derivations
-        if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in guide.parameters()):
-            raise ProbsceneError(
-                f"Expected a finite likelihood in pretraining, actual {loss} in epoch {epoch + 1}; begin again with a "
-                f"lower rate, such as pretrain_rate={learning_rate / 10:g}."
-            )
+        remedy = f"begin again with a lower rate, such as pretrain_rate={learning_rate / 10:g}"
+        check_finite(loss, guide.parameters(), "the guide in pretraining", f"in epoch {epoch + 1}", remedy)
         if progress is not None:
             progress(epoch, loss)
     return loss

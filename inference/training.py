@@ -1,8 +1,70 @@
-"""What a training that can be interrupted keeps: a module, its optimisers and a few numbers, as named tensors."""
+"""Trainings: work in steps that can be interrupted and goes on bit for bit, and what it keeps to do so."""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from probscene.errors import ProbsceneError
+
+Report = Callable[["Training", dict[str, float]], None]
+"""Called after each step or few steps with the training and what it says of them, such as ``{"loss": 0.3}``."""
+
+
+class Training(Protocol):
+    """What ``fit`` runs, shows, saves and resumes: a feature network's training, a projection, a guide's learning.
+
+    Laws: ``done`` only grows, up to ``total`` at most; ``run`` takes the steps that are left; a training of the same
+    arguments that is given ``state()`` by ``restore`` goes on to the same result, bit for bit.
+
+    Attributes:
+        unit: what a step is called, in the plural: ``"steps"``, ``"epochs"``, ``"batches"``, ``"structures"``.
+        total: steps at most.
+        done: steps taken.
+    """
+
+    unit: str
+    total: int
+    done: int
+
+    def run(self, each: Report | None = None) -> None:
+        """Take the steps that are left; ``each`` hears of them.
+
+        Raises:
+            ProbsceneError: a loss or a parameter is no longer finite, see ``check_finite``.
+        """
+        ...
+
+    def summary(self) -> dict[str, Any]:
+        """A line for the log once it is finished, such as how well it went; empty for none."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        ...
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        ...
+
+
+def check_finite(loss: float, parameters: Iterable[Tensor], what: str, where: str, remedy: str) -> None:
+    """The guard of every training.
+
+    Args:
+        what: whose loss it is, where: at which step, remedy: what to do; words of the message.
+
+    Raises:
+        ProbsceneError: the loss or a parameter is NaN or infinite.
+    """
+    if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in parameters):
+        raise ProbsceneError(
+            f"Expected a finite loss and finite parameters of {what}, actual a loss of {loss} {where} or parameters "
+            f"that are NaN or infinite; {remedy}."
+        )
 
 
 def batch_seed(seed: int, *path: int) -> int:

@@ -6,12 +6,12 @@ trees and houses are decoration. Departures from the paper: cars of one road nev
 network's counts are biased; roads are put so that all fit on the canvas; a guide's pretraining has longer lists of
 cars than the prior, because half of the target's first roads have.
 
-Set the environment variable ``PROBSCENE_SPRITES`` to a folder of RGBA pictures in the subfolders ``car``, ``tree`` and
-``house`` to draw with these.
+``--assets DIR``, or the environment variable ``PROBSCENE_SPRITES``, draws with a folder of RGBA pictures in the
+subfolders ``car``, ``tree`` and ``house``.
 """
 
 import math
-import os
+from collections.abc import Callable
 from functools import partial
 
 import pyro
@@ -153,26 +153,14 @@ def _clear(y: Tensor, reach: Tensor, road_y: Tensor, road: Tensor) -> Tensor:
     return away.amin(-1) > ROAD / 2 + reach + GAP
 
 
-def scenery() -> Scenery:
-    """The pictures in ``PROBSCENE_SPRITES`` if that is set, else the project's own sprites."""
-    path = os.environ.get("PROBSCENE_SPRITES")
-    return folder(os.path.abspath(path)) if path else drawn()
-
-
-def assets() -> str:
-    """Which sprites ``scenery`` gives."""
-    path = os.environ.get("PROBSCENE_SPRITES")
-    return f"pictures in {os.path.abspath(path)} (PROBSCENE_SPRITES)" if path else ""
-
-
 def with_assets(path: str, prior: Policy) -> SceneModel:
     """The model with the pictures in a folder."""
     folder(path)  # which finds what is wrong with it
     return aerial2d(partial(folder, path), f"pictures in {path}", prior)
 
 
-def aerial2d(look=scenery, assets: str = "", prior: Policy = PRIOR) -> SceneModel:
-    """The model with scenery of any source, ``look() -> Scenery``; ``assets`` names it in words."""
+def aerial2d(look: Callable[[], Scenery] = drawn, assets: str = "", prior: Policy = PRIOR) -> SceneModel:
+    """The model with scenery of any source, the project's own if none is named; ``assets`` says which in words."""
 
     def model(name, structure, spaced, **more):
         program = partial(aerial, spaced=spaced, scenery=look)
@@ -183,8 +171,8 @@ def aerial2d(look=scenery, assets: str = "", prior: Policy = PRIOR) -> SceneMode
         """The experiment's truth; the paper has one, whatever the seed."""
         return model("aerial2d_target", TARGET, True)
 
-    other = partial(with_assets, prior=prior)
-    return model("aerial2d", prior, False, pretraining=PRETRAINING, target=target, with_assets=other)
+    drawn_with = {"with_assets": partial(with_assets, prior=prior), "assets_variable": "PROBSCENE_SPRITES"}
+    return model("aerial2d", prior, False, pretraining=PRETRAINING, target=target, **drawn_with)
 
 
-MODEL = aerial2d(assets=assets())
+MODEL = aerial2d()

@@ -12,7 +12,6 @@ kinds of their own, left out unless asked for (``vehicles``), because a van that
 ``--assets DIR``, or the environment variable ``PROBSCENE_ASSETS``, draws with a folder of meshes, one subfolder a kind.
 """
 
-import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
@@ -57,20 +56,13 @@ FITTING = {
 
 
 def assets(scenario: str, path: str | None = None) -> Assets:
-    """The project's own meshes, those of the kinds in a folder, ``PROBSCENE_ASSETS`` if none is named, replaced by what
-    is there."""
-    path, own = path or os.environ.get("PROBSCENE_ASSETS"), street()
-    meshes = dict(folder(os.path.abspath(path)) if path else own)
+    """The project's own meshes, those of the kinds in a folder replaced by what is there."""
+    own = street()
+    meshes = dict(folder(path) if path else own)
     for kind, groups in FITTING[scenario].items():
         if meshes[kind] is own[kind]:
             meshes[kind] = tuple(own[kind][i] for group in groups for i in GROUPS[kind][group])
     return Assets(meshes, surfaces())
-
-
-def default_assets() -> str:
-    """Which meshes ``assets`` gives."""
-    path = os.environ.get("PROBSCENE_ASSETS")
-    return f"{described(os.path.abspath(path))} of PROBSCENE_ASSETS" if path else ""
 
 
 def with_assets(path: str, scenario: str, **more) -> SceneModel:
@@ -134,7 +126,8 @@ def driving(
     pretraining = structures.pretraining(scenario, prior, vehicles)
     other = partial(with_assets, scenario=scenario, prior=prior, canvas=canvas, vehicles=vehicles)
     structure = structures.prior(scenario, prior, vehicles)
-    return model(name, structure, pretraining=pretraining, target=target, with_assets=other)
+    drawn_with = {"with_assets": other, "assets_variable": "PROBSCENE_ASSETS"}
+    return model(name, structure, pretraining=pretraining, target=target, **drawn_with)
 
 
 def scenarios(prior: str = "tuned", **more) -> dict[str, SceneModel]:
@@ -142,5 +135,5 @@ def scenarios(prior: str = "tuned", **more) -> dict[str, SceneModel]:
     return {name: driving(name, prior, **more) for name in structures.ROWS}
 
 
-SCENARIOS = scenarios(assets=default_assets())
-SIMPLE = scenarios("simple", assets=default_assets())
+SCENARIOS = scenarios()
+SIMPLE = scenarios("simple")

@@ -4,11 +4,10 @@ The prior scatters and turns them; the target is one upright row in the middle w
 of digits. Where the paper is silent: rotation within 30 degrees, the row's spacing, exemplars the target shares with
 no prior scene.
 
-Set the environment variable ``PROBSCENE_MNIST`` to the folder of the original IDX files to draw with these digits.
+``--assets DIR``, or the environment variable ``PROBSCENE_MNIST``, draws with the original IDX files in a folder.
 """
 
 import math
-import os
 from functools import partial
 
 import numpy as np
@@ -37,18 +36,6 @@ CANVAS = 256
 MAX_STEPS = 32  # up to 15 digits: the guide may go beyond the prior
 TURN = math.radians(30)
 MARGIN = math.ceil(SIZE / 2 * (math.cos(TURN) + math.sin(TURN)))  # a turned glyph stays on the canvas
-
-
-def default_digits(held_out: bool) -> Digits:
-    """The IDX digits in ``PROBSCENE_MNIST`` if that is set, else those that come with the install."""
-    folder = os.environ.get("PROBSCENE_MNIST")
-    return idx(folder, held_out) if folder else shipped(held_out)
-
-
-def default_assets() -> str:
-    """Which digits ``default_digits`` are."""
-    folder = os.environ.get("PROBSCENE_MNIST")
-    return f"IDX digits in {os.path.abspath(folder)} (PROBSCENE_MNIST)" if folder else "digits of the install"
 
 
 def scattered(num_scenes: int, structure: Policy, digits: Source) -> Drawing:
@@ -82,16 +69,24 @@ def draw(scene: SceneGraph, digits: Digits, exemplar, x, y, angle=0.0) -> Drawin
     return scene.draw(Sprites(CLASSES, digits.atlas, digits.sprite(digit, exemplar), x, y, angle))
 
 
-def target(seed: int, digits: Source = default_digits) -> SceneModel:
+def target(seed: int, digits: Source = shipped, assets: str = "") -> SceneModel:
     """The experiment's truth: counts in 0..10 and digits from distributions that are Dirichlet(1) draws of ``seed``."""
     rng = np.random.default_rng(seed)
     number, share = rng.dirichlet(np.ones(MOST + 1)), rng.dirichlet(np.ones(len(CLASSES)))
     prior = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
     program = partial(row, digits=digits)
-    return SceneModel("multi_mnist_target", GRAMMAR, prior, program, (CANVAS, CANVAS), MAX_STEPS, CLASSES, channels=1)
+    more = {"channels": 1, "assets": assets}
+    return SceneModel("multi_mnist_target", GRAMMAR, prior, program, (CANVAS, CANVAS), MAX_STEPS, CLASSES, **more)
 
 
-def multi_mnist(digits: Source = default_digits, assets: str = "") -> SceneModel:
+def with_assets(folder: str) -> SceneModel:
+    """The model with the digits of the original IDX files in a folder."""
+    for held_out in (False, True):
+        idx(folder, held_out)  # which finds what is wrong with it
+    return multi_mnist(partial(idx, folder), f"IDX digits in {folder}")
+
+
+def multi_mnist(digits: Source = shipped, assets: str = "") -> SceneModel:
     """The model with digits of any source, see ``probscene.models.digits``; ``assets`` names it in words."""
     return SceneModel(
         name="multi_mnist",
@@ -103,8 +98,10 @@ def multi_mnist(digits: Source = default_digits, assets: str = "") -> SceneModel
         classes=CLASSES,
         channels=1,
         assets=assets,
-        target=partial(target, digits=digits),
+        with_assets=with_assets,
+        target=partial(target, digits=digits, assets=assets),
+        assets_variable="PROBSCENE_MNIST",
     )
 
 
-MODEL = multi_mnist(assets=default_assets())
+MODEL = multi_mnist(assets="digits of the install")

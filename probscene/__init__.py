@@ -1,12 +1,126 @@
 """probscene: learn which scene structures occur in unlabelled images, then generate labelled ones.
 
-The hub. Import its leaf modules (``from probscene.grammar import Grammar``); this face exports nothing.
+    import probscene as ps
+
+    fit = ps.fit(model, "photos/", preset="quick")
+    fit.generate(10_000, "dataset/", format="coco")
+
+This face holds what a person writes; a name is imported when it is first used. Each is defined in one module, which is
+what the library itself imports.
 """
 
+import sys as _sys
+from importlib import import_module as _import_module
 from pathlib import Path as _Path
+from types import ModuleType as _ModuleType
+from typing import TYPE_CHECKING
 
 _checkout = _Path(__file__).resolve().parent.parent
 if (_checkout / "pyproject.toml").is_file():  # a plain checkout: probscene.models is models/, and so on
     __path__.append(str(_checkout))
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
+
+_HOME = {
+    "api.calls": ("compare", "evaluate", "generate", "render", "report"),
+    "api.fit": ("fit",),
+    "api.run": ("Run",),
+    "datasets.scene_dataset": ("SceneDataset",),
+    "fitting.presets": ("Preset",),
+    "loading": ("load_model",),
+}
+_MODULES = {
+    **{f"probscene.app.{module}": names for module, names in _HOME.items()},
+    "probscene.batch": ("RenderBatch", "Renderer"),
+    "probscene.dataset": ("ImageFolder",),
+    "probscene.derivation": ("Derivation",),
+    "probscene.derive": ("derive",),
+    "probscene.drawing": ("Drawing", "Sprites"),
+    "probscene.errors": (
+        "DataError", "GrammarError", "MachineError", "ModelError", "ProbsceneError", "RunError", "SamplingError",
+    ),
+    "probscene.grammar": ("Grammar",),
+    "probscene.image_array": ("ImageArray",),
+    "probscene.inference.divergence": ("Divergence", "JensenShannon", "KDELogRatio", "MMD"),
+    "probscene.inference.features.base": ("FeatureNet", "Features"),
+    "probscene.inference.guides.base": ("Guide",),
+    "probscene.inference.guides.grammar_vae": ("GrammarVAE",),
+    "probscene.inference.guides.lstm": ("LSTMGuide",),
+    "probscene.inference.guides.pcfg": ("PCFG",),
+    "probscene.inference.objective": ("ScoreFunction",),
+    "probscene.inference.pretrain": ("pretrain",),
+    "probscene.mesh": ("Mesh",),
+    "probscene.model": ("Groups", "SceneModel", "scene_model"),
+    "probscene.policy": ("Policy",),
+    "probscene.sampling": ("Scenes", "sample", "seed_everything"),
+    "probscene.scene": ("SceneGraph",),
+    "probscene.structure": ("StructurePrior", "counts", "ranked", "weights"),
+    "probscene.world": ("Camera", "Ground", "Light", "Meshes", "Photo", "World"),
+}  # fmt: skip
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+if TYPE_CHECKING:
+    from probscene.app.api.calls import compare, evaluate, generate, render, report
+    from probscene.app.api.fit import fit
+    from probscene.app.api.run import Run
+    from probscene.app.datasets.scene_dataset import SceneDataset
+    from probscene.app.fitting.presets import Preset
+    from probscene.app.loading import load_model
+    from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
+    from probscene.inference.features.base import FeatureNet, Features
+    from probscene.inference.guides.base import Guide
+    from probscene.inference.guides.grammar_vae import GrammarVAE
+    from probscene.inference.guides.lstm import LSTMGuide
+    from probscene.inference.guides.pcfg import PCFG
+    from probscene.inference.objective import ScoreFunction
+    from probscene.inference.pretrain import pretrain
+
+    from .batch import RenderBatch, Renderer
+    from .dataset import ImageFolder
+    from .derivation import Derivation
+    from .derive import derive
+    from .drawing import Drawing, Sprites
+    from .errors import DataError, GrammarError, MachineError, ModelError, ProbsceneError, RunError, SamplingError
+    from .grammar import Grammar
+    from .image_array import ImageArray
+    from .mesh import Mesh
+    from .model import Groups, SceneModel, scene_model
+    from .policy import Policy
+    from .sampling import Scenes, sample, seed_everything
+    from .scene import SceneGraph
+    from .structure import StructurePrior, counts, ranked, weights
+    from .world import Camera, Ground, Light, Meshes, Photo, World
+
+__all__ = [
+    "FeatureNet", "Features", "Camera", "DataError", "Derivation", "Divergence", "Drawing", "Grammar", "GrammarError",
+    "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide",
+    "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "Photo", "Policy", "Preset",
+    "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph",
+    "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive",
+    "evaluate", "fit", "generate", "load_model", "pretrain", "ranked", "render", "report", "sample", "scene_model",
+    "seed_everything", "weights",
+]  # fmt: skip
+
+
+class _Face(_ModuleType):
+    """A package of which ``derive`` is the function, though a module has that name, too: importing a submodule would
+    bind its name here."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _MODULE_OF and isinstance(value, _ModuleType)):
+            super().__setattr__(name, value)
+
+
+_sys.modules[__name__].__class__ = _Face
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(_import_module(_MODULE_OF[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, *(name for name in globals() if name.startswith("__"))])

@@ -60,6 +60,25 @@ class RenderBatch(NamedTuple):
 
 
 class Renderer(Protocol):
-    """Turns a drawing into labelled pixels; a drawing gives the same bytes for any batch size and thread count."""
+    """Turns what a model's program returns into labelled pixels. Axis letters: N scenes, M nodes, H W of the canvas.
+
+    A model names its own renderer in ``SceneModel.renderer``, a class or function that is called with the canvas,
+    ``(H, W)``, and a number of threads, or None for one for every core; ``renderer(drawing)`` is all that is called
+    on what it gives, again and again, with batches of any N. A drawing's ``kind (N, M)`` says what its nodes are,
+    ``len(drawing)`` is N, and ``drawing[a:b]`` are some of its scenes.
+
+    It returns a ``RenderBatch`` on the CPU, with every field but ``space``, in the shapes and types named there:
+
+    - ``image``, what a fit compares with photographs, RGB also where a model has one channel;
+    - ``instance``, ``kind`` and ``pixels``, which go together: ids are node index + 1, only at nodes whose ``kind`` is
+      the drawing's, not -1, and ``pixels`` counts them;
+    - ``box``, ``amodal_box`` and ``visible``, from which detection labels are made and features trained;
+    - ``space`` for worlds, where 3D labels are wanted (KITTI, depth); else None.
+
+    Laws: M is the drawing's, also in columns that only pad. No value is NaN. A scene gives the same bytes whenever it
+    is rendered, alone or among others, for any number of threads and in any process; so draw no random numbers from a
+    global generator and keep nothing from call to call that shows. What the model samples goes in by the drawing.
+    The first batch of a user's own renderer is checked for all of this, and a ``ModelError`` says what is wrong.
+    """
 
     def __call__(self, drawing: Drawing | World) -> RenderBatch: ...

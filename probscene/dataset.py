@@ -7,7 +7,7 @@ import hashlib
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +24,71 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 LEAST_PART = 0.75  # of either side of an image, in its further views
 
 
-class ImageFolder:
+class Images:
+    """L images as a model's renders are, from wherever they come: an ``ImageFolder`` or an ``ImageArray``.
+
+    Attributes:
+        path: their folder; of others what they are called in messages.
+        paths: their files; of others what they are called.
+        canvas: height and width, pixels.
+        channels: 1 for grey (``grey``), 3 for RGB.
+        sizes: of each of them, the height and width that it had.
+        windows: of each of them, what is seen of it, see ``window``; None where that is all.
+        distinct: how many of them are left without those that equal another one in every pixel.
+        notes: what a person should know, one sentence each.
+        fingerprint: SHA-256, hexadecimal: equal fingerprints mean equal tensors.
+    """
+
+    path: Path
+    paths: list[Path]
+    canvas: tuple[int, int]
+    channels: int
+    sizes: list[tuple[int, int]]
+    windows: list[Window | None]
+    distinct: int
+    notes: tuple[str, ...]
+    fingerprint: str
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    @property
+    def scales(self) -> list[float]:
+        """Of each of the files, how many of the canvas's rows a row of it becomes."""
+        each = zip(self.sizes, self.windows, strict=True)
+        return [self.canvas[0] / (size[0] if seen is None else seen.height) for size, seen in each]
+
+    def load(self, i: int, view: int = 0) -> Tensor:
+        """Image number ``i``, ``(C, H, W)`` uint8.
+
+        Args:
+            view: 0 for the image as it is. Any other number is a part of it, at least ``LEAST_PART`` of either side and
+                anywhere in it, resized to the canvas: which one depends on ``i`` and the number alone.
+        """
+        raise TypeError(f"Expected images with a 'load' method, actual {type(self).__name__}.")
+
+    def some(self, most: int) -> Tensor:
+        """At most so many of the images, ``(l, C, H, W)`` uint8, evenly spread over all."""
+        number = min(most, len(self))
+        return torch.stack([self.load(i * len(self) // number) for i in range(number)])
+
+    def batches(self, size: int, view: int = 0) -> Iterator[Tensor]:
+        """All images in order, ``(B, C, H, W)`` uint8 with B = ``size``, fewer in the last batch; one is in memory at
+        a time.
+
+        Args:
+            view: of each image, see ``load``.
+
+        Raises:
+            DataError: see ``load``; a size that is not positive.
+        """
+        if size < 1:
+            raise DataError(f"Expected a positive batch size, actual {size}.")
+        for start in range(0, len(self), size):
+            yield torch.stack([self.load(i, view) for i in range(start, min(start + size, len(self)))])
+
+
+class ImageFolder(Images):
     """The PNG and JPEG files that lie directly in a folder, sorted by name; hidden files and subfolders are not read.
 
     Every file is decoded once when the folder is opened, so that nothing fails later; no image is kept. Truncated files
@@ -35,7 +99,7 @@ class ImageFolder:
     in the middle that has the canvas's shape is cut out (``window``).
 
     Args:
-        path: the folder.
+        path: the folder; or several files, wherever they lie.
         canvas: height and width, pixels.
         channels: 1 for grey (``grey``), 3 for RGB.
         skip_bad: leave out files that do not decode.
@@ -49,6 +113,7 @@ class ImageFolder:
         cropped: how many of them are of another shape.
         distinct: how many of them are left without those that equal another one in every pixel.
         bad: the files left out, each with the fault.
+        listed: whether the files were named, and not their folder.
         notes: what a person should know, one sentence each.
         fingerprint: SHA-256, hexadecimal, of the names, the bytes of the files, the canvas, the channels, and of what
             is seen where that is not all: equal fingerprints mean equal tensors.
@@ -59,18 +124,22 @@ class ImageFolder:
 
     def __init__(
         self,
-        path: Path,
+        path: Path | Sequence[Path],
         canvas: tuple[int, int],
         channels: int,
         skip_bad: bool = False,
         progress: Callable[[int, int], None] | None = None,
     ):
-        self.path, self.canvas, self.channels = Path(path), tuple(canvas), channels
-        files, others = _listed(self.path)
+        self.canvas, self.channels = (canvas[0], canvas[1]), channels
+        if isinstance(path, str | os.PathLike):
+            self.path = Path(path)
+            files, others = _listed(self.path)
+        else:
+            files, others = [Path(file) for file in path], []
+            self.path = _place(files)
+        self.listed = bool(isinstance(path, list | tuple))
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
-        self.paths: list[Path] = []
-        self.sizes: list[tuple[int, int]] = []
-        self.windows: list[Window | None] = []
+        self.paths, self.sizes, self.windows = [], [], []
         self.bad: dict[Path, str] = {}
         pictures = set()
         with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
@@ -97,15 +166,6 @@ class ImageFolder:
         self.resized, self.cropped = sizes.total(), cut.total()
         self.notes = self._notes(sizes, cut, others)
 
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    @property
-    def scales(self) -> list[float]:
-        """Of each of the files, how many of the canvas's rows a row of it becomes."""
-        each = zip(self.sizes, self.windows, strict=True)
-        return [self.canvas[0] / (size[0] if seen is None else seen.height) for size, seen in each]
-
     def load(self, i: int, view: int = 0) -> Tensor:
         """Image number ``i``, ``(C, H, W)`` uint8.
 
@@ -118,25 +178,10 @@ class ImageFolder:
         """
         try:
             with _quiet():
-                image, _ = decoded(read(self.paths[i]), self.canvas, self.channels, _part(i, view) if view else None)
+                image, _ = decoded(read(self.paths[i]), self.canvas, self.channels, part_of(i, view) if view else None)
         except Fault as fault:
             raise DataError(f"Expected the image {self.paths[i]} as it was, actual a file that {fault}.") from fault
         return torch.from_numpy(image)
-
-    def batches(self, size: int, view: int = 0) -> Iterator[Tensor]:
-        """All images in order, ``(B, C, H, W)`` uint8 with B = ``size``, fewer in the last batch; one is in memory at
-        a time.
-
-        Args:
-            view: of each image, see ``load``.
-
-        Raises:
-            DataError: see ``load``; a size that is not positive.
-        """
-        if size < 1:
-            raise DataError(f"Expected a positive batch size, actual {size}.")
-        for start in range(0, len(self), size):
-            yield torch.stack([self.load(i, view) for i in range(start, min(start + size, len(self)))])
 
     def _checked(self, file: Path) -> "_Checked | Fault":
         try:
@@ -228,7 +273,15 @@ def _listed(folder: Path) -> tuple[list[Path], list[str]]:
     return images, others
 
 
-def _part(i: int, view: int) -> Part:
+def _place(files: list[Path]) -> Path:
+    """The folder of a list of files, or the one that has all of theirs."""
+    if not files:
+        raise DataError("Expected PNG or JPEG images, actual an empty list of files.")
+    return Path(os.path.commonpath([file.resolve().parent for file in files]))
+
+
+def part_of(i: int, view: int) -> Part:
+    """The part of image number ``i`` that one of its further views shows."""
     share, down, along = np.random.default_rng([view, i]).random(3).tolist()
     return Part(LEAST_PART + (1 - LEAST_PART) * share, down, along)
 

@@ -92,13 +92,25 @@ def decoded(
     except Exception as error:  # what Pillow raises on bad bytes: OSError, SyntaxError, ValueError, struct.error, ...
         truncated = "truncated" in str(error).lower()
         raise Fault("is truncated" if truncated else f"does not decode ({error})") from error
-    pixels = _seen(pixels, size, canvas)
+    return fitted(pixels, canvas, part, size), size
+
+
+def fitted(
+    pixels: np.ndarray, canvas: tuple[int, int], part: Part | None = None, size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """``(h, w)`` or ``(h, w, 1 or 3)`` uint8 as ``(C, H, W)`` of the canvas's size.
+
+    Args:
+        part: of what is seen, all of it where None.
+        size: that the image had in its file, where it was decoded at a smaller one.
+    """
+    pixels = _seen(pixels, pixels.shape[:2] if size is None else size, canvas)
     if part is not None:
         h, w = (max(round(part.share * side), 1) for side in pixels.shape[:2])
         top, left = round(part.down * (pixels.shape[0] - h)), round(part.along * (pixels.shape[1] - w))
         pixels = pixels[top : top + h, left : left + w]
     pixels = _resized(pixels, canvas)
-    return np.ascontiguousarray(pixels[None] if channels == 1 else pixels.transpose(2, 0, 1)), size
+    return np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:

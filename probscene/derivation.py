@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from .errors import GrammarError
 from .grammar import Grammar
@@ -79,6 +80,42 @@ class Derivation:
             return rule
 
         return expand(grammar, choose, len(given), given.shape[1])
+
+    @staticmethod
+    def merged(grammar: Grammar, parts: "list[tuple[Tensor, Derivation]]") -> "Derivation":
+        """One batch out of several, each with the places ``(n,)`` of its scenes in it: all of 0..N-1 once, N >= 1."""
+        steps = max(part.rules.shape[1] for _, part in parts)
+        nodes = max(part.kind.shape[1] for _, part in parts)
+        order = torch.cat([places for places, _ in parts]).argsort()
+        wide = [part.padded(grammar, steps, nodes) for _, part in parts]
+        return Derivation(
+            *(
+                torch.cat([getattr(part, key) for part in wide])[order]
+                for key in ("rules", "complete", "kind", "parent")
+            ),
+            Frontier(*(torch.cat(each)[order] for each in zip(*(part.frontier for part in wide), strict=True))),
+        )
+
+    def padded(self, grammar: Grammar, steps: int, nodes: int) -> "Derivation":
+        """The same derivations with at least so many columns of steps and of nodes."""
+        steps, nodes = max(0, steps - self.rules.shape[1]), max(0, nodes - self.kind.shape[1])
+        finished = (len(grammar.nonterminals), 0, 0)
+        return Derivation(
+            pad(self.rules, (0, steps), value=-1),
+            self.complete,
+            pad(self.kind, (0, nodes), value=-1),
+            pad(self.parent, (0, nodes), value=-1),
+            Frontier(*(pad(x, (0, steps), value=end) for x, end in zip(self.frontier, finished, strict=True))),
+        )
+
+    def trimmed(self) -> "Derivation":
+        """The same derivations without the columns that pad every scene, as ``of`` gives them."""
+        steps = max(1, int(self.lengths.max())) if len(self) else 1
+        nodes = max(1, int((self.kind >= 0).sum(1).max())) if len(self) else 1
+        if (steps, nodes) == (self.rules.shape[1], self.kind.shape[1]):
+            return self
+        frontier = Frontier(*(x[:, :steps] for x in self.frontier))
+        return Derivation(self.rules[:, :steps], self.complete, self.kind[:, :nodes], self.parent[:, :nodes], frontier)
 
     def __len__(self) -> int:
         return self.rules.shape[0]

@@ -1,18 +1,56 @@
 """``derive``, the one Pyro program behind prior, PCFG and guide (Meta-Sim2, section 3.2).
 
 Each step samples the rule of the next nonterminal at the site ``rule_t`` from a Categorical whose illegal rules are
-masked. Axis letters: N scenes, T steps.
+masked. ``Given`` is an effect handler that hands ``derive`` what is derived already. Axis letters: N scenes, T steps.
 """
+
+from collections.abc import Callable
 
 import pyro
 import pyro.distributions as dist
 import torch
+from pyro.poutine.messenger import Messenger
+from pyro.poutine.runtime import effectful
 from torch import Tensor
 
 from .derivation import Derivation, expand
-from .errors import SamplingError
+from .errors import ModelError, SamplingError
 from .grammar import Grammar
 from .policy import Policy, masked
+
+
+@effectful(type="derive")
+def _derived(grammar: Grammar, choose: Callable[..., Tensor], num_scenes: int, max_steps: int) -> Derivation:
+    """``expand``, unless a handler has the derivations."""
+    return expand(grammar, choose, num_scenes, max_steps)
+
+
+class Given(Messenger):
+    """Inside it ``derive`` gives derivations that are known: the stack machine does not run, and no ``rule_t`` is a
+    site. A program that derives scenes of another grammar, or another number of them, still samples.
+
+    Args:
+        grammar: whose derivations they are.
+        derivation: the derivations, ``(N, T)``.
+        any_length: whether they may be longer than the program's own ``max_steps``.
+    """
+
+    def __init__(self, grammar: Grammar, derivation: Derivation, any_length: bool = False):
+        super().__init__()
+        self.grammar, self.derivation, self.any_length = grammar, derivation.trimmed(), any_length
+
+    def _pyro_derive(self, msg):
+        grammar, _, num_scenes, max_steps = msg["args"]
+        if msg["done"] or num_scenes != len(self.derivation) or grammar.rules != self.grammar.rules:
+            return
+        longest = self.derivation.rules.shape[1]
+        if longest > max_steps and not self.any_length:
+            raise ModelError(
+                f"Expected the program to derive with a max_steps of at least {longest}, the rules of the longest of "
+                f"these scenes, actual max_steps = {max_steps}: it would draw fewer objects than they have. Give "
+                "derive(...) the max_steps of the SceneModel, or say it once with scene_model."
+            )
+        msg["value"], msg["done"] = self.derivation, True
 
 
 def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) -> Derivation:
@@ -34,7 +72,7 @@ def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) ->
         value = pyro.sample(f"rule_{t}", rule.mask(active.unsqueeze(-1))).squeeze(-1)
         return value.where(active, -1)
 
-    return expand(grammar, choose, num_scenes, max_steps)
+    return _derived(grammar, choose, num_scenes, max_steps)
 
 
 def derive_complete(
@@ -48,17 +86,14 @@ def derive_complete(
     Raises:
         SamplingError: some scene failed ``attempts`` times.
     """
-    rules = torch.full((num_scenes, max_steps), -1)
     failures = torch.zeros(num_scenes, dtype=torch.int64)
-    todo = torch.arange(num_scenes)
+    todo, parts = torch.arange(num_scenes), []
     with torch.no_grad(), pyro.poutine.block():
         for _ in range(attempts):
             if not len(todo):
                 break
             drawn = derive(grammar, policy, len(todo), max_steps)
-            done = todo[drawn.complete]
-            rules[done] = -1
-            rules[done, : drawn.rules.shape[1]] = drawn.rules[drawn.complete]
+            parts.append((todo[drawn.complete], drawn[drawn.complete]))
             todo = todo[~drawn.complete]
             failures[todo] += 1
     if len(todo):
@@ -66,5 +101,6 @@ def derive_complete(
             f"Expected every scene to end within max_steps = {max_steps}, actual {len(todo)} of {num_scenes} scenes "
             f"still open after {attempts} attempts; raise max_steps or make the lists shorter."
         )
-    longest = int((rules >= 0).sum(1).max()) if num_scenes else 0
-    return Derivation.of(grammar, rules[:, : max(1, longest)]), failures
+    if not parts:
+        return Derivation.of(grammar, torch.full((0, 1), -1)), failures
+    return Derivation.merged(grammar, parts).trimmed(), failures

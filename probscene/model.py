@@ -1,12 +1,25 @@
-"""What a domain file exports: a ``SceneModel``."""
+"""What a domain file exports: a ``SceneModel``, and ``scene_model``, the short way to one.
 
-from collections.abc import Callable
+Axis letters: N scenes, M nodes.
+"""
+
+import functools
+import importlib
+import inspect
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import pyro
+
+from .batch import Renderer
+from .derive import derive
 from .drawing import Drawing
 from .errors import ModelError
 from .grammar import Grammar
 from .policy import Policy
+from .scene import SceneGraph
 from .world import World
 
 
@@ -39,9 +52,40 @@ class Groups:
             )
 
 
+class SceneProgram:
+    """The Pyro program ``program(num_scenes, structure)`` around a function of a scene graph: it makes the plate
+    ``"scenes"`` (dim -2), derives structures under the policy ``structure`` and hands over their ``SceneGraph``.
+
+    Args:
+        draw: samples parameters on the nodes and returns what to draw.
+        grammar: the grammar.
+        max_steps: T_max.
+    """
+
+    def __init__(self, draw: Callable[[SceneGraph], Drawing | World], grammar: Grammar, max_steps: int):
+        functools.update_wrapper(self, draw)
+        self.draw, self.grammar, self.max_steps = draw, grammar, max_steps
+
+    def __call__(self, num_scenes: int, structure: Policy) -> Drawing | World:
+        with pyro.plate("scenes", num_scenes, dim=-2):
+            return self.draw(SceneGraph(self.grammar, derive(self.grammar, structure, num_scenes, self.max_steps)))
+
+    def __deepcopy__(self, memo: dict) -> "SceneProgram":
+        return self
+
+    def __reduce__(self):
+        """The function's own name in its module is now the model, where another process finds it."""
+        return _found_again, (self.draw.__module__, self.draw.__qualname__, self.grammar, self.max_steps)
+
+
+def _found_again(module: str, name: str, grammar: Grammar, max_steps: int) -> SceneProgram:
+    model = operator.attrgetter(name)(importlib.import_module(module))
+    return SceneProgram(model.program.draw, grammar, max_steps)
+
+
 @dataclass(frozen=True, eq=False)
 class SceneModel:
-    """A generative model of one domain.
+    """A generative model of one domain; ``scene_model`` makes one with less to write.
 
     Args:
         name: how the command line and the run folder call it.
@@ -64,10 +108,15 @@ class SceneModel:
             scenes that it draws itself, so let this policy draw longer lists now and then if the target may have them.
         scenarios: the models that this one is joined of, by name, see ``scenarios.join``.
         target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
+        renderer: ``renderer(canvas, threads)`` makes the ``Renderer`` of what the program returns; ``threads`` is a
+            number, or None for one for every core. Sprites and meshes are drawn with the built-in ones where None.
+        assets_variable: the environment variable that names the folder for ``with_assets`` where no ``--assets`` does;
+            it is read when a model is loaded.
 
     Raises:
         ModelError: a class that the grammar has no object of, groups of no class or of the only one, stuff that is no
-            class or all classes, a canvas or ``max_steps`` that is not positive.
+            class or all classes, a canvas that is not two positive numbers, a ``max_steps`` that is not positive, a
+            renderer that cannot be called, a variable of a model without ``with_assets``.
     """
 
     name: str
@@ -85,6 +134,8 @@ class SceneModel:
     pretraining: Policy | None = None
     target: Callable[[int], "SceneModel"] | None = None
     scenarios: tuple[tuple[str, "SceneModel"], ...] = ()
+    renderer: Callable[[tuple[int, int], int | None], Renderer] | None = None
+    assets_variable: str = ""
 
     def __post_init__(self):
         unknown = [c for c in self.classes if c not in self.grammar.kinds]
@@ -103,13 +154,25 @@ class SceneModel:
                 f"Expected the stuff of model {self.name!r} among its classes {list(self.classes)} and not all of "
                 f"them, actual {list(self.stuff)}."
             )
-        if min(self.canvas) < 1 or self.max_steps < 1:
+        if not isinstance(self.canvas, Sequence) or len(self.canvas) != 2 or min(*self.canvas, self.max_steps) < 1:
             raise ModelError(
                 f"Expected a positive canvas and max_steps in model {self.name!r}, "
                 f"actual canvas {self.canvas} and max_steps {self.max_steps}."
             )
         if self.channels not in (1, 3):
             raise ModelError(f"Expected channels 1 or 3 in model {self.name!r}, actual {self.channels}.")
+        if self.renderer is not None and not callable(self.renderer):
+            raise ModelError(
+                f"Expected the renderer of model {self.name!r} as a class or function that is called with the canvas "
+                f"and a number of threads, actual {type(self.renderer).__name__}; give the class, not an instance."
+            )
+        if self.assets_variable and self.with_assets is None:
+            raise ModelError(
+                f"Expected with_assets in model {self.name!r}, whose assets {self.assets_variable} names, actual none."
+            )
+        if isinstance(self.program, SceneProgram):  # grammar and T_max are the model's, also after dataclasses.replace
+            program = SceneProgram(self.program.draw, self.grammar, self.max_steps)
+            object.__setattr__(self, "program", program)
 
     @property
     def pretraining_policy(self) -> Policy:
@@ -119,3 +182,79 @@ class SceneModel:
     def __call__(self, num_scenes: int, structure: Policy | None = None) -> Drawing | World:
         """Run the program; under the prior where no structure policy is given."""
         return self.program(num_scenes, self.prior if structure is None else structure)
+
+
+def scene_model(
+    grammar: Grammar,
+    prior: Policy,
+    *,
+    canvas: tuple[int, int],
+    max_steps: int,
+    classes: Sequence[str],
+    name: str | None = None,
+    **fields: Any,
+) -> Callable[[Callable[[SceneGraph], Drawing | World]], SceneModel]:
+    """Decorator that makes a ``SceneModel`` of a function of a scene graph.
+
+    The function samples parameters at Pyro sites on the nodes and returns ``scene.draw(...)`` or ``scene.build(...)``;
+    it runs inside the plate ``"scenes"`` (dim -2) of N scenes::
+
+        @scene_model(GRAMMAR, PRIOR, canvas=(256, 256), max_steps=40, classes=("plate", "mug"))
+        def tabletop(scene):
+            with scene.nodes("plate"):
+                x = pyro.sample("plate.x", dist.Uniform(50.0, 206.0))  # (N, M) pixels
+            ...
+            return scene.draw(Sprites.disc("plate", x, 128.0, radius=38.0))
+
+    What comes of it is still a Pyro program, ``tabletop(num_scenes, structure)``, with sites ``rule_t``.
+
+    Args:
+        grammar, prior, canvas, max_steps, classes, fields: as of a ``SceneModel``.
+        name: of the model, the function's own if None.
+
+    Raises:
+        ModelError: no grammar, or a prior of another one; a field that a ``SceneModel`` does not have or that the
+            function gives; no function of one argument; see ``SceneModel``.
+    """
+    if not isinstance(grammar, Grammar):
+        raise ModelError(
+            f"Expected scene_model(grammar, prior, canvas=..., max_steps=..., classes=...) above the function, actual "
+            f"{type(grammar).__name__} for a grammar; give it a Grammar."
+        )
+    if not callable(getattr(prior, "step", None)) or getattr(prior, "grammar", grammar).rules != grammar.rules:
+        raise ModelError(
+            "Expected the prior of scene_model to be a policy of the same grammar, such as StructurePrior(grammar), "
+            f"actual {type(prior).__name__}{' of another grammar' if hasattr(prior, 'grammar') else ''}."
+        )
+    unknown = sorted(fields.keys() - (SceneModel.__dataclass_fields__.keys() - {"program"}))
+    if unknown:
+        raise ModelError(f"Expected fields of a SceneModel in scene_model(...), actual {', '.join(unknown)}.")
+    kinds = (classes,) if isinstance(classes, str) else tuple(classes)
+
+    def decorated(draw: Callable[[SceneGraph], Drawing | World]) -> SceneModel:
+        called = getattr(draw, "__name__", "") if name is None else name
+        if not _takes_one(draw) or not called:
+            raise ModelError(
+                f"Expected scene_model above a function of one argument, the SceneGraph, actual {_described(draw)}; "
+                "for a program(num_scenes, structure) that derives by itself write SceneModel(...)."
+            )
+        program = SceneProgram(draw, grammar, max_steps)
+        return SceneModel(called, grammar, prior, program, canvas, max_steps, kinds, **fields)
+
+    return decorated
+
+
+def _takes_one(draw: Any) -> bool:
+    if not callable(draw) or isinstance(draw, type | SceneModel):
+        return False
+    try:
+        inspect.signature(draw).bind(None)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _described(draw: Any) -> str:
+    if inspect.isfunction(draw):
+        return f"{draw.__name__}{inspect.signature(draw)}"
+    return draw.__name__ if isinstance(draw, type) else type(draw).__name__

@@ -4,6 +4,7 @@ Axis letters: N scenes, M nodes.
 """
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import pyro
@@ -11,9 +12,10 @@ import torch
 from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
+from torch.nn.functional import pad
 
 from .derivation import Derivation
-from .derive import derive_complete
+from .derive import Given, derive_complete
 from .drawing import Drawing
 from .errors import ModelError
 from .model import SceneModel
@@ -61,16 +63,26 @@ def run_program(
 ) -> Scenes:
     """Run a model's program on given derivations, and on given parameters where there are any.
 
+    The program's ``derive`` is handed the derivations; they are not expanded again.
+
     Args:
         model: a scene model, or a Pyro program that is called with the number of scenes.
+        derivation: complete derivations.
 
     Raises:
-        ModelError: the program's sites are not what a scene model's must be, or it returns no ``Drawing``.
+        ModelError: a derivation that is not complete; the program's sites are not what a scene model's must be; it
+            returns no ``Drawing``, or one of other nodes than were derived.
     """
     N = len(derivation)
     sites = derivation.sites()
     name = getattr(model, "name", getattr(model, "__name__", "?"))
-    with torch.no_grad(), poutine.block():
+    if not derivation.complete.all():
+        raise ModelError(
+            f"Expected complete derivations for model {name!r}, actual {int((~derivation.complete).sum())} of {N} with "
+            "nonterminals left; draw them with derive_complete."
+        )
+    known = Given(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
+    with torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"]["value"]
@@ -79,6 +91,7 @@ def run_program(
             f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
             f"or scene.build(...)), actual {type(drawing).__name__}."
         )
+    _check_nodes(name, drawing, derivation.trimmed())
     values, site_mask = {}, {}
     log_prob = torch.zeros(N)
     for key, site in trace.nodes.items():
@@ -101,6 +114,25 @@ def run_program(
         log_prob,
         drawing,
         torch.zeros(N, dtype=torch.int64) if failures is None else failures,
+    )
+
+
+def _check_nodes(name: str, drawing: Drawing | World, derivation: Derivation) -> None:
+    """See that a program drew the nodes that were derived."""
+    M = max(drawing.kind.shape[1], derivation.kind.shape[1])
+    drawn, derived = (pad(kind, (0, M - kind.shape[1]), value=-1) for kind in (drawing.kind, derivation.kind))
+    other = (drawn != derived).any(1)
+    if not other.any():
+        return
+    i, names = int(other.nonzero()[0]), dict(enumerate(drawing.kinds))
+
+    def words(kind: Tensor) -> str:
+        return ", ".join(names.get(k, f"kind {k}") for k in kind[kind >= 0].tolist()) or "none"
+
+    raise ModelError(
+        f"Expected the program of model {name!r} to draw the nodes that were derived, actual other ones in scene {i}: "
+        f"derived {words(derived[i])}; drawn {words(drawn[i])}. Derive with the model's own grammar and max_steps, a "
+        "smaller one cuts scenes short, and draw with the SceneGraph of that derivation; scene_model does both."
     )
 
 

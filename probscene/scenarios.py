@@ -8,7 +8,7 @@ features, datasets, provenance, reports. Axis letters: N scenes, T steps, K rule
 """
 
 from collections.abc import Mapping
-from functools import partial
+from functools import cached_property, partial
 
 import pyro
 import torch
@@ -17,7 +17,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from .derivation import Derivation, Frontier, expand
-from .derive import derive
+from .derive import Given, derive
 from .drawing import Drawing
 from .enumeration import shortest_lengths
 from .errors import ModelError
@@ -75,12 +75,25 @@ class JointGrammar(Grammar):
         """The values ``(N, 1)`` of the sites ``rule_t`` of scenario ``number``'s own program: of its own scenes, and of
         a shortest derivation in all others."""
         own, rules = self.scenario(derivation) == number, derivation.rules[:, 1:]
-        shortest = _shortest(list(self.parts.values())[number])
+        shortest = self._shortest[number].rules[0]
         padded = torch.zeros(len(rules), max(rules.shape[1], len(shortest)), dtype=torch.int64)
         padded[:, : rules.shape[1]] = (rules - self.first_rule[number]).masked_fill(rules < 0, 0)
         padded[~own] = 0
         padded[~own, : len(shortest)] = shortest
         return {f"rule_{t}": padded[:, t : t + 1] for t in range(padded.shape[1])}
+
+    def part(self, derivation: Derivation, number: int) -> Derivation:
+        """What scenario ``number``'s own program derives of N joint scenes: its own ones, and a shortest derivation in
+        all others. See ``sites``."""
+        own = self.scenario(derivation) == number
+        grammar, short = list(self.parts.values())[number], self._shortest[number]
+        parts = [(own.nonzero().flatten(), self.own(derivation[own], number))]
+        parts.append(((~own).nonzero().flatten(), short[torch.zeros(int((~own).sum()), dtype=torch.int64)]))
+        return Derivation.merged(grammar, [(rows, part) for rows, part in parts if len(rows)])
+
+    @cached_property
+    def _shortest(self) -> list[Derivation]:
+        return [_shortest(grammar) for grammar in self.parts.values()]
 
     def part_frontier(self, frontier: Frontier, number: int) -> tuple[Frontier, Tensor]:
         """What scenario ``number``'s own policy sees of a joint frontier, and in which scenes ``(N,)``; elsewhere, and
@@ -161,17 +174,18 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         models: by scenario.
 
     Raises:
-        ModelError: no models, or models that differ in canvas or channels.
+        ModelError: no models, or models that differ in canvas, channels or renderer.
     """
     if not models:
         raise ModelError("Expected at least one scenario, actual none.")
     each = list(models.values())
-    for what in ("canvas", "channels"):
+    for what in ("canvas", "channels", "renderer"):
         found = {key: getattr(model, what) for key, model in models.items()}
         if len(set(found.values())) > 1:
             raise ModelError(f"Expected scenarios of one {what}, actual {found}.")
     grammar = JointGrammar({key: model.grammar for key, model in models.items()})
     groups = {model.groups for model in each}
+    variables = {model.assets_variable for model in each}
     targets = [model.target for model in each]
     pretraining = None
     if any(model.pretraining is not None for model in each):
@@ -201,6 +215,8 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         pretraining=pretraining,
         target=target if all(targets) else None,
         scenarios=tuple(models.items()),
+        renderer=each[0].renderer,
+        assets_variable=variables.pop() if len(variables) == 1 else "",
     )
 
 
@@ -222,7 +238,8 @@ def _program(
     for number, (name, model) in enumerate(models.items()):
         own = scenario == number
         sites = grammar.sites(derivation, number)
-        with Within(name), poutine.mask(mask=own.unsqueeze(1)), poutine.block(hide=list(sites)):
+        known = Given(model.grammar, grammar.part(derivation, number), any_length=True)
+        with Within(name), poutine.mask(mask=own.unsqueeze(1)), poutine.block(hide=list(sites)), known:
             drawn.append((own, poutine.condition(model, data=sites)(num_scenes)))
     return join_drawings(derivation.kind, grammar.kinds, drawn)
 
@@ -234,10 +251,10 @@ def _marked(symbol: str | Node, name: str) -> str | Node:
     return f"{symbol}-{name}" if is_nonterminal(symbol) else symbol
 
 
-def _shortest(grammar: Grammar) -> Tensor:
-    """The rules ``(T,)`` of a derivation with the fewest rules."""
+def _shortest(grammar: Grammar) -> Derivation:
+    """One derivation with the fewest rules."""
     lengths = torch.tensor(shortest_lengths(grammar), dtype=torch.float64)
     needed = 1 + (lengths[grammar.children.clamp(min=0)] * (grammar.children >= 0)).sum(1)
     best = needed.where(grammar.legal[:-1], torch.inf).argmin(1)
     steps = int(lengths[0])
-    return expand(grammar, lambda t, frontier, previous: best[frontier.symbol], 1, steps).rules[0]
+    return expand(grammar, lambda t, frontier, previous: best[frontier.symbol], 1, steps)

@@ -22,8 +22,13 @@ def threads(number: int) -> Iterator[None]:
     what is to be the same bytes everywhere has a number of its own.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(number)
+    use_threads(number)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        use_threads(before)
+
+
+def use_threads(number: int) -> None:
+    """So many of torch's threads from now on: for a process that is all one's own, such as a worker or a benchmark."""
+    torch.set_num_threads(number)

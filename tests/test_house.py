@@ -182,7 +182,7 @@ RIGHT = {
 
 @pytest.mark.parametrize("filename", WRONG)
 def test_lint_catches_a_wrong_import(filename):
-    own = f"{filename.split('/')[0]}."  # ruff takes "from .y import z" for that; see the test of relative imports
+    own = filename.split("/")[0]  # ruff takes "from .y import z" for that; see the test of relative imports
     for source in WRONG[filename] + [source for source in EVERYWHERE if own not in source]:
         assert tidy_codes(filename, source + "\n") == {"TID251"}, source
 

@@ -5,13 +5,17 @@ features, C H W.
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from probscene.batch import RenderBatch
 from probscene.errors import ProbsceneError
+from probscene.model import SceneModel
+
+from ..divergence import Divergence
+from ..training import Training
 
 
 class Examples(NamedTuple):
@@ -38,14 +42,123 @@ class Examples(NamedTuple):
 
 
 class FeatureNet(Protocol):
-    """``embed((N, 1 or 3, H, W) uint8) -> (N, D)``, in batches of any size; ``names`` has one name a feature."""
+    """What turns images into features. A ``torch.nn.Module`` has its ``state_dict`` kept in the run; anything else has
+    no state.
+
+    Laws: an image's features do not depend on the other images of the batch, nor on the call.
+
+    Attributes:
+        names: one name a feature, D.
+    """
 
     names: tuple[str, ...]
 
-    def embed(self, images: Tensor) -> Tensor: ...
+    def embed(self, images: Tensor) -> Tensor:
+        """Features ``(N, D)`` float32, finite, of images ``(N, C, H, W)`` uint8, N >= 0. Renders come with C = 3;
+        target images with C = 1 where the model's colour carries nothing, else 3."""
+        ...
 
 
 Draw = Callable[[int], Examples]
+
+
+class Renders(Protocol):
+    """Renders of a model's scenes for a feature network to be trained on; each call draws new ones.
+
+    Attributes:
+        model: the scene model.
+    """
+
+    model: SceneModel
+
+    def draw(self, num: int) -> Examples:
+        """``num`` labelled renders of the prior."""
+        ...
+
+    def draw_twice(self, num: int) -> Examples:
+        """Labelled renders of ``num`` structures, and as many more of the same structures, their parameters anew; of
+        the policy that guides are pretrained on."""
+        ...
+
+    def embed_twice(self, num: int, net: FeatureNet) -> tuple[Tensor, Tensor]:
+        """``draw_twice`` through a network: two times ``(num, D)`` features."""
+        ...
+
+    def object_size(self) -> float:
+        """Pixels: a tenth of the visible objects of the prior's renders are smaller; infinite where there are none."""
+        ...
+
+
+class Photographs(Protocol):
+    """The target's unlabelled images, for a feature network that looks at them before it is used.
+
+    Attributes:
+        fingerprint: of the images, SHA-256 hexadecimal.
+    """
+
+    fingerprint: str
+
+    def some(self, most: int) -> Tensor:
+        """At most so many of them, evenly spread, ``(L, C, H, W)`` uint8."""
+        ...
+
+
+class Features(Protocol):
+    """A choice of features: how its network is built and trained, and what suits it. Subclass it, give ``build``, and
+    what else differs from the defaults.
+
+    Attributes:
+        name: in records and messages; another name is another choice.
+        resolution: features that differ by less count as equal in the verdict, such as 0.5 of a count.
+    """
+
+    name: str
+    resolution: float = 0.0
+
+    def build(self, model: SceneModel) -> FeatureNet:
+        """The network, untrained or pretrained; the random numbers it takes are the run's. Called once a fit, and again
+        whenever the run is opened: a state that was kept is then loaded into it."""
+        ...
+
+    def training(
+        self, net: FeatureNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
+    ) -> Training | None:
+        """How the network is trained in place; None where there is nothing to train.
+
+        Args:
+            photographs: opens the target; a network that learns from it is bound to it, see ``taught_by``.
+            seed: of everything random.
+        """
+        return None
+
+    def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
+        """The divergence that suits the network's features, given the fit's own."""
+        return chosen
+
+    def taught_by(self, net: FeatureNet) -> str:
+        """The fingerprint of the photographs that the network has learnt from, empty for none: it is used with no
+        others."""
+        return ""
+
+    def settings(self, preset: Any) -> dict[str, Any]:
+        """Other values of the preset's fields that suit these features, such as fewer scenes for a slow network."""
+        return {}
+
+
+class Fixed(Features):
+    """A network as it is: nothing is trained.
+
+    Args:
+        net: with ``names`` and ``embed``.
+        name: its class's where none is given.
+    """
+
+    def __init__(self, net: FeatureNet, name: str = ""):
+        self.net, self.name = net, name or type(net).__name__
+
+    def build(self, model: SceneModel) -> FeatureNet:
+        """The network."""
+        return self.net
 
 
 def examples(batch: RenderBatch, classes: Tensor, group: Tensor | None = None, along: str = "y") -> Examples:

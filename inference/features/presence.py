@@ -5,18 +5,18 @@ layers; binary presences under sigmoid cross-entropy. The features are the avera
 connected layers. Widths are not given in the paper and are arguments here; grey images are copied to three channels.
 """
 
-import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from probscene.errors import ProbsceneError
+from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 
-from ..training import batch_seed, restore_training, training_state
-from .base import Draw, Examples
+from ..training import Report, batch_seed, check_finite, restore_training, training_state
+from .base import Draw, Examples, Features, Photographs, Renders
 
 LAST = torch.channels_last  # in memory; half as fast again on a CPU
 
@@ -70,6 +70,30 @@ class _Block(nn.Module):
         return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x[..., ::2, ::2].contiguous(memory_format=LAST)), 0.01)
 
 
+@dataclass(frozen=True)
+class PresenceFeatures(Features):
+    """The paper's network, ``PresenceNet``, trained on the prior's renders.
+
+    Args:
+        images, epochs: of its training.
+    """
+
+    images: int = 5000
+    epochs: int = 10
+
+    name = "presence"
+
+    def build(self, model: SceneModel) -> PresenceNet:
+        """Untrained."""
+        return PresenceNet(model.classes)
+
+    def training(
+        self, net: PresenceNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
+    ) -> "PresenceTraining":
+        """On renders alone."""
+        return PresenceTraining(net, renders.draw, self.images, self.epochs, seed=batch_seed(seed, 1))
+
+
 class PresenceTraining:
     """Adam on one fixed set of prior renders until 75 % of the presences are right, at most ``epochs`` (supplement).
 
@@ -80,7 +104,7 @@ class PresenceTraining:
         seed: of everything random.
 
     Attributes:
-        done: epochs taken; ``steps`` of them at most.
+        unit, total, done: see ``Training``; it ends early where the presences are right.
     """
 
     def __init__(
@@ -95,12 +119,13 @@ class PresenceTraining:
         seed: int = 0,
     ):
         self.net, self.draw, self.seed = net, draw, seed
-        self.images, self.steps, self.batch_size, self.accuracy = images, epochs, batch_size, accuracy
+        self.images, self.batch_size, self.accuracy = images, batch_size, accuracy
+        self.unit, self.total = "epochs", epochs
         self.optimiser = torch.optim.Adam(net.parameters(), lr=learning_rate)
         self.done, self.reached = 0, 0.0
 
-    def run(self, each: Callable[["PresenceTraining", float], None] | None = None) -> None:
-        """Take the epochs that are left; ``each`` sees the training and the mean loss after every one.
+    def run(self, each: Report | None = None) -> None:
+        """Take the epochs that are left; ``each`` hears the mean loss after every one.
 
         Raises:
             ProbsceneError: the loss, or a parameter, is no longer finite.
@@ -115,7 +140,7 @@ class PresenceTraining:
             image[start : start + 250] = part.image
             present[start : start + 250] = _present(part, classes)
         self.net.train()
-        while self.done < self.steps and self.reached < self.accuracy:
+        while self.done < self.total and self.reached < self.accuracy:
             seed_everything(batch_seed(self.seed, 1, self.done))
             total, right = 0.0, 0.0
             for rows in torch.randperm(len(image)).split(self.batch_size):
@@ -127,15 +152,16 @@ class PresenceTraining:
                 total += loss.item() * len(rows)
                 right += ((logits > 0) == (present[rows] > 0)).float().mean().item() * len(rows)
             self.done += 1
-            if not math.isfinite(total) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
-                raise ProbsceneError(
-                    f"Expected a finite loss of the presence network, actual {total} in epoch {self.done}; begin again "
-                    "with features=count."
-                )
+            where = f"in epoch {self.done}"
+            check_finite(total, self.net.parameters(), "the presence network", where, "begin again with features=count")
             self.reached = right / len(image)
             if each is not None:
-                each(self, total / len(image))
+                each(self, {"loss": total / len(image)})
         self.net.eval()
+
+    def summary(self) -> dict[str, float]:
+        """Nothing more for the log."""
+        return {}
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""

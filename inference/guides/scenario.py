@@ -1,9 +1,13 @@
 """One guide a scenario, learnt together (Meta-Sim2, supplement): densities are estimated over the scenes of all of
 them, and each guide is scored on its own scenes."""
 
+from collections.abc import Callable
+from functools import partial
+
 from torch import Tensor, nn
 
 from probscene.derivation import Derivation, Frontier
+from probscene.grammar import Grammar
 from probscene.scenarios import JointGrammar, Mixture
 
 from .base import Guide
@@ -18,6 +22,7 @@ class ScenarioGuide(Guide):
         max_steps: T_max of the joint model.
         weights: of the scenarios; equal if None, as in the paper.
         kind, settings: of each scenario's guide, see ``make_guide``.
+        make: makes each scenario's guide instead, from its grammar and T_max.
     """
 
     def __init__(
@@ -26,12 +31,12 @@ class ScenarioGuide(Guide):
         max_steps: int,
         weights: list[float] | None = None,
         kind: str = "lstm",
+        make: Callable[[Grammar, int], Guide] | None = None,
         **settings,
     ):
         super().__init__(grammar, max_steps)
-        self.guides = nn.ModuleList(
-            make_guide(kind, part, max_steps - 1, **settings) for part in grammar.parts.values()
-        )
+        make = partial(make_guide, kind, **settings) if make is None else make
+        self.guides = nn.ModuleList(make(part, max_steps - 1) for part in grammar.parts.values())
         self.mixture = Mixture(grammar, list(self.guides), weights)
 
     def start(self, num_scenes: int) -> list:

@@ -198,7 +198,7 @@ def fit(
         else:
             run, images = session.begin(model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets)
             ctx.obj.words.append("--resume")
-        if not session.is_finished(run):
+        if not run.is_finished:
             session.carry_out(run, images, show)
     print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")
 
@@ -220,11 +220,11 @@ def generate(
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
     from .datasets.generate import generate
-    from .fitting.run import Run
+    from .fitting.run import RunFolder
     from .progress import Display
 
     with Display() as show:
-        dataset = generate(Run.open(run), num, out, seed, workers, format or "coco", show.stage("generating"))
+        dataset = generate(RunFolder.at(run), num, out, seed, workers, format or "coco", show.stage("generating"))
     print(f"{num} images in {dataset.path}, {dataset.made} of them made now")
 
 
@@ -257,12 +257,12 @@ def evaluate(
     from .evaluation.labels import read_labels
     from .files import make_folder, write_json
     from .fitting import session
-    from .fitting.run import Run
+    from .fitting.run import RunFolder
     from .progress import Display
     from .views import tables, verdict_text
 
-    opened = Run.open(run)
-    opened.guide()
+    opened = RunFolder.at(run)
+    opened.check_finished()
     if json is not None:
         make_folder(json.parent)
     with Display() as show:
@@ -291,12 +291,12 @@ def report(
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
 ) -> None:
     """Write one self-contained HTML page about a run."""
-    from .fitting.run import Run
+    from .fitting.run import RunFolder
     from .progress import Display
     from .views.report import report
 
     with Display() as show:
-        path = report(Run.open(run), show, out, labels, num, scenes)
+        path = report(RunFolder.at(run), show, out, labels, num, scenes)
     print(f"The report is {path}")
 
 

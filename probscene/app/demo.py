@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.errors import ModelError
 from probscene.model import SceneModel
 
@@ -26,7 +26,7 @@ from .evaluation.labels import counts_of_dataset, read_labels, write_counts
 from .files import make_folder, write_json
 from .fitting import session
 from .fitting.presets import QUICK, Preset
-from .fitting.run import Run
+from .fitting.run import RunFolder
 from .loading import load_model
 from .pictures import pixels, side_by_side, write_picture
 from .progress import Display
@@ -93,17 +93,17 @@ def _draw(truth: SceneModel, images: int, out: Path, seed: int, show: Display) -
 
 def _fit(
     model: str, target: Path, out: Path, preset: Preset, seed: int, threads: int | None, show: Display
-) -> tuple[Run, ImageFolder | None]:
+) -> tuple[RunFolder, Images | None]:
     if (out / "run.json").exists():
         run, opened = session.resume(out, show, model, target, preset, seed=seed, threads=threads)
     else:
         run, opened = session.begin(model, target, out, preset, seed, False, threads, show)
-    if not session.is_finished(run):
+    if not run.is_finished:
         session.carry_out(run, opened, show)
     return run, opened
 
 
-def _judge(run: Run, target: ImageFolder, out: Path, show: Display) -> None:
+def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:
     model = run.model
     found = evaluate(run, target, read_labels(out / "truth.csv", model, target), show)
     judged = judge(run, target, show, evaluation=found)
@@ -111,7 +111,7 @@ def _judge(run: Run, target: ImageFolder, out: Path, show: Display) -> None:
     report.write(run, found, target, judged=judged)
     pictures = {
         "Prior": pixels(scenes(model, model.prior, SAMPLES, 0).image),
-        "Learnt": pixels(scenes(model, run.guide(), SAMPLES, 0).image),
+        "Learnt": pixels(scenes(model, run.guide, SAMPLES, 0).image),
         "Target": [pixels(target.load(i)[None])[0] for i in range(min(SAMPLES, len(target)))],
     }
     write_picture(out / "grid.png", side_by_side(pictures))

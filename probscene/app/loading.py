@@ -4,23 +4,26 @@ A file may export several models by name, ``SCENARIOS = {"city": ..., "rural": .
 them joined into one (``scenarios.join``), ``streets.py:city,rural`` is these two, and ``streets.py:city`` is one model.
 """
 
-import hashlib
 import importlib
-import importlib.util
 import os
-import sys
-import traceback
+import re
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+
+import torch
 
 from probscene.batch import RenderBatch, Renderer
 from probscene.drawing import Drawing
 from probscene.errors import ModelError, ProbsceneError
 from probscene.model import SceneModel
+from probscene.render_check import check_renderer
 from probscene.renderers.meshes import MeshRenderer
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.scenarios import join
 from probscene.world import World
+
+from .modules import import_file
 
 BUILT_IN = {
     "multi_mnist": "probscene.models.multi_mnist",
@@ -28,13 +31,14 @@ BUILT_IN = {
     "driving": "probscene.models.driving",
     "driving_simple": "probscene.models.driving_simple",
 }
+_VARIABLE = re.compile(r" (\(PROBSCENE_\w+\)|of PROBSCENE_\w+)$")  # at the end of the words; "of" is of older runs
 
 
 def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
     """The scene model that a name or a file gives.
 
     Args:
-        assets: a folder of what it is to be drawn with.
+        assets: a folder of what it is to be drawn with; if None, that which the model's ``assets_variable`` names.
 
     Raises:
         ModelError: no such name or file, a file that does not import, one that exports none or several models, a
@@ -43,7 +47,7 @@ def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
     """
     model = _loaded(reference)
     if assets is None:
-        return model
+        return _with_environment(model)
     if model.with_assets is None:
         raise ModelError(
             f"Expected a model that can be drawn with a folder of assets, actual {reference!r}, which has no "
@@ -52,32 +56,33 @@ def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
     return model.with_assets(os.path.abspath(assets))
 
 
+def _with_environment(model: SceneModel) -> SceneModel:
+    """The model with the assets that an environment variable names, if it has one that is set."""
+    folder = os.environ.get(model.assets_variable, "") if model.assets_variable else ""
+    if not folder:
+        return model
+    try:
+        drawn = model.with_assets(os.path.abspath(folder))
+    except ProbsceneError as error:
+        raise type(error)(f"{error} The variable {model.assets_variable} names {folder}.") from error
+    return replace(drawn, assets=f"{drawn.assets} ({model.assets_variable})")
+
+
+def same_assets(one: str, other: str) -> bool:
+    """Whether two models draw with the same assets, by their words; ``--assets`` and an environment variable that name
+    one folder give the same."""
+    return _VARIABLE.sub("", one) == _VARIABLE.sub("", other)
+
+
 def _loaded(reference: str) -> SceneModel:
     base, scenarios = split_reference(reference)
     if base in BUILT_IN:
         return _exported(vars(importlib.import_module(BUILT_IN[base])), base, scenarios)
-    path = Path(base)
-    if path.suffix != ".py":
+    if Path(base).suffix != ".py":
         raise ModelError(
             f"Expected a built-in model ({', '.join(BUILT_IN)}) or a path to a .py file, actual {reference!r}."
         )
-    if not path.is_file():
-        raise ModelError(f"Expected a model file, actual {base!r}, which is not there.")
-    name = "probscene_model_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
-    except ProbsceneError:
-        raise
-    except Exception as error:
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        raise ModelError(
-            f"Model file {base} does not import: {type(error).__name__}: {error} "
-            f"({Path(where.filename).name}, line {where.lineno}). Try 'python {base}'."
-        ) from error
-    return _exported(vars(module), base, scenarios)
+    return _exported(vars(import_file(Path(base))), base, scenarios)
 
 
 def split_reference(reference: str) -> tuple[str, tuple[str, ...]]:
@@ -114,9 +119,36 @@ class _AnyRenderer:
         return MeshRenderer(*self._options)
 
 
+class _OwnRenderer:
+    """A model's own renderer; the first batch that it gives is checked."""
+
+    def __init__(self, renderer: Renderer, canvas: tuple[int, int]):
+        self._renderer, self._canvas, self._checked = renderer, canvas, False
+
+    def __call__(self, drawing: Drawing | World) -> RenderBatch:
+        batch = self._renderer(drawing)
+        if not self._checked and len(drawing):
+            check_renderer(self._renderer, drawing, self._canvas, batch)
+            self._checked = True
+        return batch._replace(image=batch.image.contiguous(memory_format=torch.channels_last))
+
+
 def renderer_for(model: SceneModel, threads: int | None = None) -> Renderer:
-    """The renderer that reads what the model returns; one thread for every core where no number is given."""
-    return _AnyRenderer(model.canvas, threads)
+    """The model's own renderer, or the built-in one that reads what the model returns; one thread for every core where
+    no number is given.
+
+    Raises:
+        ModelError: the model's own is none; when it is called, see ``check_renderer``.
+    """
+    if model.renderer is None:
+        return _AnyRenderer(model.canvas, threads)
+    renderer = model.renderer(model.canvas, threads)
+    if not callable(renderer):
+        raise ModelError(
+            f"Expected the renderer of model {model.name!r}, called with the canvas and a number of threads, to give "
+            f"what can be called with a drawing, actual {type(renderer).__name__}; see Renderer in probscene.batch."
+        )
+    return _OwnRenderer(renderer, model.canvas)
 
 
 def _exported(names: dict, reference: str, wanted: tuple[str, ...] = ()) -> SceneModel:

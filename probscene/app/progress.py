@@ -5,15 +5,18 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     ProgressColumn,
     Task,
     TextColumn,
+)
+from rich.progress import (
+    Progress as Bars,
 )
 from rich.table import Column
 from rich.text import Text
@@ -34,6 +37,24 @@ STAGES = {
 """By stage: what it does, and in what it counts."""
 
 
+class Progress(Protocol):
+    """Hears how far a stage is."""
+
+    def __call__(self, name: str, done: int, total: int, note: str = "", unit: str = "") -> None:
+        """``done`` of ``total`` of a stage.
+
+        Args:
+            name: of ``STAGES``.
+            note: such as the loss.
+            unit: in what it counts, where that is not the stage's own.
+        """
+        ...
+
+
+def silent(name: str, done: int, total: int, note: str = "", unit: str = "") -> None:
+    """A ``Progress`` that says nothing."""
+
+
 @dataclass
 class _Stage:
     name: str
@@ -48,7 +69,7 @@ class _Stage:
 
 
 class Display(AbstractContextManager):
-    """Shows the progress of stages, one after the other; call it as a ``fit.Progress``, inside ``with``.
+    """Shows the progress of stages, one after the other; call it as a ``Progress``, inside ``with``.
 
     Args:
         console: where to show it.
@@ -64,7 +85,7 @@ class Display(AbstractContextManager):
         self.seconds: dict[str, float] = {}
         self._stage: _Stage | None = None
         self._last = time.monotonic()
-        self._bars = Progress(
+        self._bars = Bars(
             TextColumn("{task.description}", table_column=_wide(17)),
             BarColumn(bar_width=8, table_column=_wide(8)),
             MofNCompleteColumn(table_column=_wide(9)),
@@ -85,9 +106,11 @@ class Display(AbstractContextManager):
         if self.console.is_terminal:
             self._bars.stop()
 
-    def __call__(self, name: str, done: int, total: int, note: str = "") -> None:
-        """``done`` of ``total`` of a stage."""
+    def __call__(self, name: str, done: int, total: int, note: str = "", unit: str = "") -> None:
+        """See ``Progress``."""
         now = time.monotonic()
+        if unit:
+            self.units[name] = unit
         if self._stage is None or self._stage.name != name:
             self._end()
             bar = self._bars.add_task(STAGES[name][0], unit=self.units[name], note="", completed=done)

@@ -1,9 +1,11 @@
 """A target folder, and a run that the command line has fitted to it in a few seconds."""
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -35,6 +37,18 @@ def probscene(*words) -> SimpleNamespace:
 @pytest.fixture(scope="session")
 def call() -> Callable[..., SimpleNamespace]:
     return probscene
+
+
+@pytest.fixture(scope="session")
+def idx_folder(tmp_path_factory) -> Path:
+    """Digits in the original IDX files: 20 random images for a model, and 20 for its target."""
+    folder, rng = tmp_path_factory.mktemp("digits"), np.random.default_rng(0)
+    for name in ("train", "t10k"):
+        labels = np.arange(20, dtype=np.uint8) % 10
+        for what, array in (("images-idx3", rng.integers(0, 256, (20, 28, 28), np.uint8)), ("labels-idx1", labels)):
+            header = struct.pack(f">BBBB{array.ndim}I", 0, 0, 8, array.ndim, *array.shape)
+            (folder / f"{name}-{what}-ubyte").write_bytes(header + array.tobytes())
+    return folder
 
 
 @pytest.fixture(scope="session")

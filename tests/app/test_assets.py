@@ -1,17 +1,21 @@
 """``--assets DIR``: a model is drawn with what is in a folder, and a run remembers which."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from probscene.app.fitting.run import Run
-from probscene.app.loading import load_model
+from probscene.app.fitting.run import RunFolder
+from probscene.app.loading import load_model, same_assets
 from probscene.errors import DataError, ModelError, RunError
 from probscene.models.assets.catalogue import street
+from probscene.sampling import sample
 
 SLAB = "".join(f"v {x} {y} {z}\n" for x in (-0.9, 0.9) for y in (0, 1.5) for z in (-2.2, 2.2)) + (
     "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
@@ -22,6 +26,7 @@ SLAB = "".join(f"v {x} {y} {z}\n" for x in (-0.9, 0.9) for y in (0, 1.5) for z i
 def _own_assets(monkeypatch):
     monkeypatch.delenv("PROBSCENE_ASSETS", raising=False)
     monkeypatch.delenv("PROBSCENE_SPRITES", raising=False)
+    monkeypatch.delenv("PROBSCENE_MNIST", raising=False)
 
 
 def meshes(folder: Path, text: str = SLAB) -> Path:
@@ -47,13 +52,68 @@ def test_every_scenario_is_drawn_with_the_folder(tmp_path, reference):
     assert other.target(0).assets == other.assets and all(cars(other.target(0)))
 
 
-def test_aerial_pictures(tmp_path):
+def pictures(folder: Path) -> Path:
     for kind, size in (("car", (40, 20)), ("tree", (30, 30)), ("house", (50, 40))):
-        (tmp_path / kind).mkdir()
-        Image.fromarray(np.full((*size[::-1], 4), 255, np.uint8)).save(tmp_path / kind / "a.png")
-    model = load_model("aerial2d", tmp_path)
+        (folder / kind).mkdir()
+        Image.fromarray(np.full((*size[::-1], 4), 255, np.uint8)).save(folder / kind / "a.png")
+    return folder
+
+
+def test_aerial_pictures(tmp_path):
+    model = load_model("aerial2d", pictures(tmp_path))
     assert model.assets == f"pictures in {tmp_path}" and model.target(0).assets == model.assets
     assert model.with_assets(str(tmp_path))(2).kinds == model.grammar.kinds
+
+
+def test_digits_of_a_folder(idx_folder, tmp_path):
+    model = load_model("multi_mnist", idx_folder)
+    assert model.assets == model.target(0).assets == f"IDX digits in {idx_folder}"
+    atlases = [sample(m, m.prior, 8).drawing.layers[0].atlas for m in (model, model.target(0))]
+    assert [len(atlas) for atlas in atlases] == [20, 20] and atlases[0] is not atlases[1]
+    with pytest.raises(DataError, match=f"in {tmp_path}, actual none"):
+        load_model("multi_mnist", tmp_path)
+
+
+VARIABLES = {"aerial2d": "PROBSCENE_SPRITES", "driving:city": "PROBSCENE_ASSETS", "driving": "PROBSCENE_ASSETS",
+             "multi_mnist": "PROBSCENE_MNIST"}  # fmt: skip
+
+
+@pytest.mark.parametrize("reference", VARIABLES)
+def test_a_variable_names_the_folder_where_no_option_does(reference, tmp_path, monkeypatch, idx_folder):
+    variable, own = VARIABLES[reference], load_model(reference)
+    folder = {"aerial2d": pictures, "multi_mnist": lambda _: idx_folder}.get(reference, meshes)(tmp_path)
+    named = load_model(reference, folder)
+    monkeypatch.setenv(variable, "relative/" * 3)
+    assert load_model(reference, folder).assets == named.assets
+    with pytest.raises(DataError, match=f"The variable {variable} names relative/"):
+        load_model(reference)
+    monkeypatch.chdir(folder.parent)
+    monkeypatch.setenv(variable, folder.name)
+    model = load_model(reference)
+    assert model.assets == f"{named.assets} ({variable})" and same_assets(model.assets, named.assets)
+    assert same_assets(f"{named.assets} of {variable}", model.assets) and not same_assets(own.assets, model.assets)
+    assert (model.name, model.assets_variable) == (own.name, variable)
+    monkeypatch.setenv(variable, "")
+    assert load_model(reference).assets == own.assets
+
+
+@pytest.mark.parametrize("module", ["aerial2d", "driving", "multi_mnist", "driving_simple"])
+def test_the_environment_is_not_read_when_a_model_is_imported(module, tmp_path):
+    program = (
+        f"import sys; from probscene.models import {module} as m; "
+        "models = [m.MODEL] if hasattr(m, 'MODEL') else list(m.SCENARIOS.values()); "
+        "assert all(model.assets in ('', 'digits of the install') for model in models); models[0](1)"
+    )
+    root = Path(__file__).resolve().parents[2]
+    environment = {**os.environ, **dict.fromkeys(VARIABLES.values(), str(tmp_path)), "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_run_begun_with_a_variable_opens_with_it(tmp_path, monkeypatch, idx_folder):
+    monkeypatch.setenv("PROBSCENE_MNIST", str(idx_folder))
+    RunFolder.create(tmp_path / "run", "multi_mnist", {})
+    assert RunFolder.at(tmp_path / "run").model.assets == f"IDX digits in {idx_folder} (PROBSCENE_MNIST)"
 
 
 def test_a_model_without_assets_says_so(tmp_path, discs):
@@ -64,24 +124,24 @@ def test_a_model_without_assets_says_so(tmp_path, discs):
 def test_a_run_remembers_its_folder(tmp_path, monkeypatch, fresh_folders):
     folder = meshes(tmp_path / "mine")
     monkeypatch.chdir(tmp_path)
-    made = Run.create(tmp_path / "run", "driving:city", {}, Path("mine"))
+    made = RunFolder.create(tmp_path / "run", "driving:city", {}, Path("mine"))
     monkeypatch.chdir("/")
-    run = Run.open(tmp_path / "run")
+    run = RunFolder.at(tmp_path / "run")
     assert run.model.assets == made.record["assets"] and str(folder) in run.model.assets
     assert json.loads((tmp_path / "run" / "run.json").read_text())["assets_folder"] == str(folder)
     shutil.move(folder, tmp_path / "moved")
     fresh_folders()
     with pytest.raises(DataError, match="Expected a folder of meshes, actual .*mine"):
-        Run.open(tmp_path / "run").model.program  # noqa: B018
+        RunFolder.at(tmp_path / "run").model.program  # noqa: B018
 
 
 def test_a_run_is_bound_to_what_is_in_the_folder(tmp_path, fresh_folders):
     folder = meshes(tmp_path / "mine")
-    Run.create(tmp_path / "run", "driving:city", {}, folder)
+    RunFolder.create(tmp_path / "run", "driving:city", {}, folder)
     meshes(folder, SLAB.replace("2.2", "2.3"))
     fresh_folders()
     with pytest.raises(RunError, match="to draw with meshes in .*, as when the run .* was begun, actual meshes in"):
-        Run.open(tmp_path / "run").model.program  # noqa: B018
+        RunFolder.at(tmp_path / "run").model.program  # noqa: B018
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from probscene.app import cli
 from probscene.app.fitting import fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import OBJECTIVES, PRESETS, QUICK
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES
 
@@ -170,7 +170,7 @@ def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, d
     assert result.err.count("000003.png") == 1 and result.err.count("resized to 64x64") == 1
     stages = [line.split(":")[0] for line in result.err.splitlines() if not line.startswith("Note: ")]
     assert stages == ["Target's images", "Feature network", "Target's features", "Pretraining", "Structure"]
-    assert len(Run.open(tmp_path / "run").load("real")["features"]) == 40
+    assert len(RunFolder.at(tmp_path / "run").load("real")["features"]) == 40
 
 
 def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp_path):
@@ -388,17 +388,18 @@ def test_a_bug_is_one_line_and_a_traceback_on_demand(call, discs, tmp_path, monk
 
 CHILD = """
 import os, signal, sys
-from probscene.app import cli, files, keeper
+from probscene.app import cli, files
+from probscene.app.fitting import checkpoints
 
 kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
-keeper.SAVE_EVERY = 0.0
+checkpoints.SAVE_EVERY = 0.0
 line, replace = [{}], os.replace
 
 def at_once():
     if line[0].get("stage") == stage and line[0].get("step", line[0].get("batch")) >= number:
         os.kill(os.getpid(), kind)
 
-keep = keeper.Keeper.__call__
+keep = checkpoints.Keeper.__call__
 def keeping(self, said):
     line[0] = said
     keep(self, said)
@@ -410,7 +411,7 @@ def replacing(source, path):  # the worst moment: the log is ahead, the checkpoi
         at_once()
     replace(source, path)
 
-keeper.Keeper.__call__, os.replace = keeping, replacing
+checkpoints.Keeper.__call__, os.replace = keeping, replacing
 del sys.argv[1:4]
 cli.main()
 """

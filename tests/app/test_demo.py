@@ -11,7 +11,7 @@ from probscene.app.demo import demo
 from probscene.app.fitting import session
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.errors import DataError, ModelError
 
 SHORT = override(
@@ -45,7 +45,7 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     assert {path.suffix for path in (out / "target" / "images").iterdir()} == {".png"}
     assert len(list((out / "target" / "images").iterdir())) == 40
     assert len(json.loads((out / "dataset" / "annotations.json").read_text())["images"]) == 5
-    assert Run.open(out / "run").record["target"] == str((out / "target" / "images").resolve())
+    assert RunFolder.at(out / "run").record["target"] == str((out / "target" / "images").resolve())
     assert (out / "run" / "report.html").stat().st_size > 10000
     with Image.open(out / "grid.png") as grid:
         assert grid.width > 3 * 4 * 64 and grid.height > 4 * 64

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 
 TABLETOP = Path(__file__).resolve().parents[2] / "examples" / "tabletop.py"
@@ -46,8 +46,8 @@ def test_other_presets_and_objectives_run(words, call, photos, tmp_path):
     few = [word for setting in few for word in ("--set", setting)]
     done = call("fit", TABLETOP, "--target", photos, "--out", tmp_path / "run", "--threads", 1, *words, *few)
     assert done.code == 0, done.err
-    run = Run.open(tmp_path / "run")
+    run = RunFolder.at(tmp_path / "run")
     guide = "lstm" if "--guide" not in words else words[words.index("--guide") + 1]
     assert run.record["guide"]["kind"] == run.record["preset"]["guide"] == guide
-    assert len(getattr(run.guide(), "latents", [0])) == run.record["preset"]["num_latents"]
+    assert len(getattr(run.guide, "latents", [0])) == run.record["preset"]["num_latents"]
     assert run.record["preset"]["objective"] == ("mmd" if "mmd" in words else "kde")

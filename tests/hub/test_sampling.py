@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from probscene.derive import derive
+from probscene.derivation import Derivation, expand
+from probscene.derive import derive, derive_complete
 from probscene.drawing import Sprites
 from probscene.errors import ModelError, SamplingError
 from probscene.grammar import Grammar
 from probscene.model import SceneModel
 from probscene.sampling import log_prob, run_program, sample, seed_everything
+from probscene.scenarios import join
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, weights
 
@@ -143,3 +145,78 @@ def test_programs_that_are_none():
 def test_models_that_are_none(changed, message):
     with pytest.raises(ModelError, match=message):
         replace(MODEL, **changed)
+
+
+@pytest.fixture
+def expanded(monkeypatch):
+    """The numbers of scenes that the stack machine has run over."""
+    ran = []
+
+    def counting(grammar, choose, N, max_steps):
+        ran.append(N)
+        return expand(grammar, choose, N, max_steps)
+
+    for module in ("derivation", "derive", "scenarios"):
+        monkeypatch.setattr(f"probscene.{module}.expand", counting)
+    return ran
+
+
+def test_a_batch_is_expanded_once(expanded):
+    ended = StructurePrior(GRAMMAR, Plates=counts(1, 2, 1), Mugs=weights(0, 1, 3))
+    scenes = sample(MODEL, ended, 7)
+    assert expanded == [7]
+    run_program(MODEL, scenes.derivation)
+    assert expanded == [7]
+    joint = join("both", {"one": MODEL, "other": MODEL})
+    sample(joint, joint.prior, 5)
+    assert expanded[1] == 5 and set(expanded[2:]) <= {1}  # of one scene: each scenario's shortest derivation
+    del expanded[:]
+    sample(joint, joint.prior, 5)
+    assert expanded == [5]
+
+
+@given(st.integers(0, 2**31), st.integers(1, 9), st.integers(4, 30))
+def test_complete_derivations_are_those_that_their_rules_spell(seed, num_scenes, max_steps):
+    """Whatever was redrawn, and for any part of a batch."""
+    seed_everything(seed)
+    derivation, failures = derive_complete(GRAMMAR, PRIOR, num_scenes, max_steps)
+    for some in (derivation, derivation[failures == 0].trimmed(), derivation[:1].trimmed()):
+        spelt = Derivation.of(GRAMMAR, some.rules)
+        for name in ("rules", "complete", "kind", "parent"):
+            assert torch.equal(getattr(some, name), getattr(spelt, name))
+        assert all(map(torch.equal, some.frontier, spelt.frontier))
+
+
+def test_a_program_with_a_smaller_max_steps_is_refused():
+    def short(num_scenes, structure):
+        with pyro.plate("scenes", num_scenes, dim=-2):
+            return SceneGraph(GRAMMAR, derive(GRAMMAR, structure, num_scenes, max_steps=9)).draw()
+
+    model = replace(MODEL, program=short)
+    full = StructurePrior(GRAMMAR, Plates=counts(0, 0, 0, 1), Mugs=weights(0, 0, 1))
+    with pytest.raises(ModelError, match=r"max_steps of at least 1\d, .* actual max_steps = 9: .*fewer objects"):
+        sample(model, full, 4)
+    assert len(sample(model, StructurePrior(GRAMMAR, Plates=counts(1)), 4).drawing) == 4
+
+
+@pytest.mark.parametrize("of", ["another derivation", "another grammar"])
+def test_a_program_that_draws_other_nodes_is_refused(of):
+    other = Grammar("Scene -> table(Plates)\nPlates -> plate Plates | ε")
+    grammar = GRAMMAR if of == "another derivation" else other
+
+    def loose(num_scenes, structure):
+        derivation, _ = derive_complete(grammar, StructurePrior(grammar, Plates=counts(1)), num_scenes, STEPS)
+        return SceneGraph(grammar, derivation).draw()
+
+    plates = StructurePrior(GRAMMAR, Plates=counts(0, 1), Mugs=weights(0, 0, 1))
+    with pytest.raises(
+        ModelError, match="'tabletop' to draw .* scene 0: derived table, plate; drawn table. Derive with"
+    ):
+        sample(replace(MODEL, program=loose), plates, 4)
+
+
+def test_derivations_that_are_not_complete_are_refused():
+    with torch.no_grad(), pyro.plate("scenes", 3, dim=-2):
+        cut = derive(GRAMMAR, StructurePrior(GRAMMAR, Plates=counts(0, 0, 1)), 3, max_steps=2)
+    with pytest.raises(ModelError, match="Expected complete derivations for model 'tabletop', actual 3 of 3"):
+        run_program(MODEL, cut)

@@ -162,7 +162,7 @@ def test_scenes_of_the_joint_model_are_those_of_the_scenarios():
         total[rows] = alone.log_prob
         for site in sites:
             counted = scenes.site_mask[site][rows]
-            assert torch.equal(counted[:, :M], alone.counted[site.split("/")[1]]) and not counted[:, M:].any()
+            assert torch.equal(counted[:, :M], alone.site_mask[site.split("/")[1]]) and not counted[:, M:].any()
         drawn = {}
         for drawing, which, names in (
             (scenes.drawing, rows, MODEL.grammar.kinds),

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare, kstest, poisson
 
+from probscene.app.loading import load_model
 from probscene.checks import check
 from probscene.errors import DataError
-from probscene.models.aerial2d import APART, CANVAS, GRAMMAR, LANE, MODEL, PRETRAINING, ROAD, TARGET, aerial2d, scenery
+from probscene.models.aerial2d import APART, CANVAS, GRAMMAR, LANE, MODEL, PRETRAINING, ROAD, TARGET
 from probscene.models.aerial_sprites import folder
 from probscene.relations import per_parent
 from probscene.renderers.sprites import SpriteRenderer
@@ -137,7 +138,7 @@ def pictures(path, size=(24, 50)):
 
 def test_a_folder_of_pictures(tmp_path, monkeypatch):
     monkeypatch.setenv("PROBSCENE_SPRITES", str(pictures(tmp_path)))
-    model = aerial2d(scenery)
+    model = load_model("aerial2d")
     seed_everything(4)
     scenes = sample(model, StructurePrior(GRAMMAR, Cars=counts(0, 0, 1)), 4)
     atlas = scenes.drawing.layers[LAYERS["car"]].atlas

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from probscene.app.loading import load_model, renderer_for
-from probscene.models.driving import SCENARIOS, SIMPLE, assets, driving
+from probscene.models.driving import SCENARIOS, SIMPLE, driving
 from probscene.models.streets.grammars import grammar
 from probscene.models.streets.layout import STRIPS, in_line
 from probscene.models.streets.parameters import PARAMETERS
@@ -205,7 +205,7 @@ def test_a_seed_gives_the_same_scenes_and_parameters_keep_to_their_ranges(model)
     expected = torch.zeros(20)
     for key, value in a.parameters.items():
         low, high = named[key]
-        counted = a.counted[key]
+        counted = a.site_mask[key]
         assert (value[counted] >= low).all() and (value[counted] <= high).all()
         expected -= counted.sum(1) * math.log(high - low)
     assert torch.allclose(a.log_prob, expected, atol=1e-2, rtol=1e-4)
@@ -267,9 +267,7 @@ def wide_cars(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("wide_cars")
 def test_meshes_of_ones_own_decide_how_far_things_stand_apart():
-    own = assets("suburban").meshes
-    assert len(own["car"]) == 1 and own["car"][0].size.tolist() == pytest.approx([6.0, 2.4, 1.5], abs=1e-3)
-    monkeyed = driving("suburban")
+    monkeyed = load_model("driving:suburban")
     seed_everything(6)
     scenes = sample(monkeyed, crowded("suburban"), 2)
     cars = scenes.derivation.kind == monkeyed.grammar.kind("car")

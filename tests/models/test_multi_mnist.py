@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare, kstest
 
+from probscene.app.loading import load_model
 from probscene.checks import check
 from probscene.models.digits import shipped
-from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL, default_digits, target
+from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL, target
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
@@ -158,7 +159,7 @@ def test_the_same_seed_gives_the_same_scenes():
 
 def test_model_and_target_share_no_exemplar():
     model, truth = (sample(m, m.prior, 5).drawing.layers[0].atlas for m in (MODEL, MODEL.target(0)))
-    assert model is default_digits(False).atlas and truth is default_digits(True).atlas
+    assert model is shipped(False).atlas and truth is shipped(True).atlas
     assert not {s.tobytes() for s in model.sprites} & {s.tobytes() for s in truth.sprites}
 
 
@@ -166,5 +167,6 @@ def test_the_environment_names_another_folder_of_digits(data_dir, monkeypatch):
     if not (data_dir / "mnist").is_dir():
         pytest.skip(f"no folder mnist in {data_dir}")
     monkeypatch.setenv("PROBSCENE_MNIST", str(data_dir / "mnist"))
-    atlas = sample(target(0), target(0).prior, 2).drawing.layers[0].atlas
+    truth = load_model("multi_mnist").target(0)
+    atlas = sample(truth, truth.prior, 2).drawing.layers[0].atlas
     assert len(atlas) == 10_000

@@ -72,6 +72,15 @@ class PretrainedCountNet(nn.Module):
         self.register_buffer("projected_weight", torch.zeros(len(frozen.names), directions))
         self.heads = nn.ModuleList(_head(frozen.channels, 1 + len(classes)) for _ in range(HEADS))
 
+    @property
+    def taught_by_fingerprint(self) -> str:
+        """``taught_by`` in hexadecimal; empty for none."""
+        return bytes(self.taught_by.tolist()).hex() if self.taught_by.any() else ""
+
+    def learn_from(self, fingerprint: str) -> None:
+        """Remember whose images the heads teach themselves on."""
+        self.taught_by.copy_(torch.tensor(list(bytes.fromhex(fingerprint)), dtype=torch.uint8))
+
     @torch.no_grad()
     def begin(self, maps: Tensor, target: Tensor) -> None:
         """Take over channels' means and scales, and start from what places hold in the mean: from anywhere else the

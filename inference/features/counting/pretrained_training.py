@@ -16,16 +16,14 @@ References:
 """
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from probscene.errors import ProbsceneError
 from probscene.sampling import seed_everything
 
-from ...training import batch_seed, restore_training, training_state
+from ...training import Report, batch_seed, check_finite, restore_training, training_state
 from ..base import Draw, Examples
 from ..projection import discriminant
 from .batches import STRIDE, cells
@@ -68,8 +66,11 @@ class PretrainedCountTraining:
             on them.
 
     Attributes:
-        done: epochs taken.
+        unit, total, done: see ``Training``.
+        found: how well structure is seen, once it is finished.
     """
+
+    unit = "epochs"
 
     def __init__(
         self,
@@ -87,27 +88,25 @@ class PretrainedCountTraining:
         self.net, self.draw_twice, self.pairs, self.epochs, self.held_out = net, draw_twice, pairs, epochs, held_out
         self.photographs, self.batch_size, self.min_visible, self.seed = photographs, batch_size, min_visible, seed
         self.learning_rate, self.done = learning_rate, 0
+        self.total = epochs + (photographs is not None and len(photographs) > 0)
+        self.found: Found | None = None
         self.optimiser = torch.optim.AdamW(net.heads.parameters(), lr=learning_rate, weight_decay=5e-2)
 
-    def run(
-        self,
-        each: Callable[["PretrainedCountTraining", float], None] | None = None,
-        drawn: Callable[[int, int], None] | None = None,
-    ) -> Found:
+    def run(self, each: Report | None = None) -> None:
         """Take the epochs that are left.
 
         Args:
-            each: sees the training and the mean loss after every epoch.
-            drawn: is told how many images have been looked at, of how many.
+            each: hears how many images have been looked at, ``images``, ``of`` how many; then the mean loss after every
+                epoch.
 
         Raises:
             ProbsceneError: the loss is no longer finite; see also ``discriminant``.
         """
-        maps, pooled, target, photographs = self._look(drawn)
+        maps, pooled, target, photographs = self._look(each)
         n, own = 2 * self.pairs, None
         if self.done == 0:
             self.net.begin(maps[: min(n, 512)].float(), target[: min(n, 512)].float())
-        while self.done < self.epochs + (len(photographs) > 0):
+        while self.done < self.total:
             seed_everything(batch_seed(self.seed, 1, self.done))
             if self.done == self.epochs:
                 own = photographs, self._own(photographs)
@@ -116,19 +115,24 @@ class PretrainedCountTraining:
             losses = [self._step(maps[rows], target[rows], i / len(batches), own) for i, rows in enumerate(batches)]
             self.done += 1
             loss = sum(losses) / len(losses)
-            if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
-                raise ProbsceneError(
-                    f"Expected a finite loss of the count heads, actual {loss} in epoch {self.done}; begin again with "
-                    "features=count."
-                )
+            where = f"in epoch {self.done}"
+            check_finite(loss, self.net.parameters(), "the count heads", where, "begin again with features=count")
             if each is not None:
-                each(self, loss)
+                each(self, {"loss": loss})
         self.net.eval()
         projection = discriminant(*pooled[:n].chunk(2), self.net.blocks[-1], self.held_out)
         self.net.finish(projection, maps[n:])
         seen, true = self.net.counts(maps[n:]), target[n:, 1:].float().sum((2, 3))
         each_class = zip(seen.T, true.T, strict=True)
-        return Found(torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class]), projection.ratio)
+        correlation = torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class])
+        self.found = Found(correlation, projection.ratio)
+
+    def summary(self) -> dict[str, Any]:
+        """For the log: what was found."""
+        if self.found is None:
+            return {}
+        plain = {name: [x if x == x else None for x in part.tolist()] for name, part in self.found._asdict().items()}
+        return {"stage": "counts", **plain}
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
@@ -138,7 +142,7 @@ class PretrainedCountTraining:
         """Go on from a ``state``."""
         self.done = int(restore_training(self.net, {"adam": self.optimiser}, tensors)["done"])
 
-    def _look(self, drawn: Callable[[int, int], None] | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _look(self, each: Report | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of renders: maps ``(N, C, h, w)`` float16, pooled features ``(N, P)`` and what the places should hold
         ``(N, 1 + classes, h, w)`` float16: all first drawings, all second ones, then what is held out. Of photographs:
         maps, as of renders."""
@@ -151,8 +155,8 @@ class PretrainedCountTraining:
             nonlocal done
             maps, pooled = self.net.look(images)
             done += len(images)
-            if drawn is not None:
-                drawn(done, total)
+            if each is not None:
+                each(self, {"images": done, "of": total})
             return maps.half(), pooled
 
         parts = ([], [], [])

@@ -9,16 +9,15 @@ Reference:
 """
 
 import math
-from collections.abc import Callable
 from contextlib import closing
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from probscene.errors import ProbsceneError
+from probscene.threads import threads
 
-from ...training import restore_training, training_state
+from ...training import Report, check_finite, restore_training, training_state
 from ..base import Draw
 from .batches import CountBatch, CountBatches, CountSchedule, Votes
 from .net import CountNet
@@ -34,11 +33,11 @@ class CountTraining:
         seed: of everything random.
 
     Attributes:
-        done: steps taken.
+        unit, total, done: see ``Training``.
     """
 
     def __init__(self, net: CountNet, draw: Draw, schedule: CountSchedule, seed: int = 0):
-        self.net, self.schedule = net, schedule
+        self.net, self.schedule, self.unit, self.total = net, schedule, "steps", schedule.steps
         self.batches = CountBatches(net, draw, schedule, seed)
         # Muon [1] takes matrices: a second parameter over the storage of each convolution that batch norm follows.
         inner = [m.weight for m in net.modules() if isinstance(m, nn.Conv2d) and m.bias is None and m.in_channels > 3]
@@ -52,26 +51,30 @@ class CountTraining:
         }
         self.done = 0
 
-    def run(self, each: Callable[["CountTraining", float], None] | None = None) -> None:
-        """Take the steps that are left; ``each`` sees the training and the mean loss after every draw.
+    def run(self, each: Report | None = None) -> None:
+        """Take the steps that are left; ``each`` hears the mean loss after every draw.
 
         Raises:
             ProbsceneError: the loss is no longer finite.
         """
         s = self.schedule
         self.net.train()
-        with closing(self.batches.after(self.done)) as draws:
+        # The next batches are drawn on another core meanwhile.
+        with threads(1), closing(self.batches.after(self.done)) as draws:
             for batches in draws:
                 loss = sum(map(self._step, batches)) / len(batches)
-                if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in self.net.parameters()):
-                    raise ProbsceneError(
-                        f"Expected a finite loss of the count network, actual {loss} at step {self.done}; begin again "
-                        f"with lower rates, such as count.muon_rate={s.muon_rate / 4:g} and "
-                        f"count.learning_rate={s.learning_rate / 4:g}."
-                    )
+                remedy = (
+                    f"begin again with lower rates, such as count.muon_rate={s.muon_rate / 4:g} and "
+                    f"count.learning_rate={s.learning_rate / 4:g}"
+                )
+                check_finite(loss, self.net.parameters(), "the count network", f"at step {self.done}", remedy)
                 if each is not None:
-                    each(self, loss)
+                    each(self, {"loss": loss})
         self.net.eval()
+
+    def summary(self) -> dict[str, float]:
+        """Nothing more for the log."""
+        return {}
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""

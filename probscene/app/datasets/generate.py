@@ -26,7 +26,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 
 from ..chunks import CHUNK, as_written, draw_chunk
-from ..fitting.run import Run
+from ..fitting.run import RunFolder
 from ..loading import renderer_for
 from . import coco, kitti, shards, yolo
 from .folder import LINES, Parts
@@ -45,7 +45,7 @@ class Dataset(NamedTuple):
 
 
 def generate(
-    run: Run,
+    run: RunFolder,
     num: int,
     out: Path,
     seed: int = 0,
@@ -65,16 +65,20 @@ def generate(
         ProbsceneError: a number that is not positive, a negative seed, an unknown format, more classes or objects than
             KITTI's masks can number.
         DataError: the folder holds other files, or a dataset of other settings.
-        RunError: see ``Run.guide`` and ``Run.model``.
+        RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped.
     """
     if workers < 1:
         raise ProbsceneError(f"Expected a positive number of workers, actual {workers}.")
-    settings = (run.path, num, Path(out), seed, chosen(format))
-    job = _of_run(*settings)
+    job = Job(run.model, run.guide, num, Path(out), seed, chosen(format), run.guide_hash())
     if workers == 1:
         return job.run(job.each, progress)
-    return job.run(partial(spread, _worker, settings, workers), progress)
+    if run.in_memory:
+        raise ProbsceneError(
+            f"Expected one worker for a run of {run.in_memory} that are in memory alone, actual {workers}; fit a model "
+            "and parts in files for more."
+        )
+    return job.run(partial(spread, _worker, (run.path, num, Path(out), seed, job.formats), workers), progress)
 
 
 def generate_scenes(
@@ -218,14 +222,10 @@ class Job:
         shards.write(path, samples())
 
 
-def _of_run(run: Path, num: int, out: Path, seed: int, format: tuple[str, ...]) -> Job:
-    opened = Run.open(run)
-    return Job(opened.model, opened.guide(), num, out, seed, format, opened.guide_hash())
-
-
-def _worker(*settings) -> Callable[[int], int]:
+def _worker(run: Path, num: int, out: Path, seed: int, format: tuple[str, ...]) -> Callable[[int], int]:
     """What a worker process does with a chunk's number."""
-    return _of_run(*settings).make
+    opened = RunFolder.at(run)
+    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash()).make
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:

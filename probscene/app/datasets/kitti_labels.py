@@ -4,7 +4,7 @@
 
 Boxes are in 0-based pixels of the image as it is in its file. A type counts as the class of the model that has its
 name, whatever the case, else by ``TYPES``; types that the model has no class for, and DontCare, are left out, which the
-notes say. So are objects whose middle lies where the target's image is cut, see ``ImageFolder``. Labelled are the
+notes say. So are objects whose middle lies where the target's image is cut, see ``Images``. Labelled are the
 classes that one of KITTI's own types counts as, and those that occur.
 """
 
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.decoding import Window
 from probscene.errors import DataError
 from probscene.model import SceneModel
@@ -77,7 +77,7 @@ def read_objects(file: Path) -> list[Object]:
 
 
 def read_kitti(
-    folder: Path, model: SceneModel, target: ImageFolder, some: bool = False, min_height: float = 0.0
+    folder: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0
 ) -> tuple[Counts, tuple[str, ...], tuple[str, ...]]:
     """The counts ``(L, C)`` of a target's images, the C labelled classes in the model's order, and notes.
 
@@ -167,7 +167,7 @@ def _class(type: str, classes: tuple[str, ...]) -> str | None:
     return next((own[name] for name in names if name in own and type != DONT_CARE), None)
 
 
-def _unread(folder: Path, target: ImageFolder) -> list[str]:
+def _unread(folder: Path, target: Images) -> list[str]:
     """Which files are of no image."""
     images = {path.stem for path in (*target.paths, *target.bad)}
     others = sorted(file.name for file in folder.glob("*.txt") if file.stem not in images)

@@ -72,6 +72,10 @@ def remake(model: SceneModel, line: dict[str, Any]) -> tuple[Tensor, RenderBatch
         derivation = Derivation.of(model.grammar, torch.tensor([rules], dtype=torch.int64))
     except GrammarError as error:
         raise DataError(f"Expected a derivation of model {model.name!r}, {_named(line)}: {error}") from error
+    if not derivation.complete.all():
+        raise DataError(
+            f"Expected a whole derivation of model {model.name!r}, {_named(line)}, whose rules end too soon."
+        )
     recorded = _Recorded(parameters)
     with chunk_randomness(0, 0):  # what does not count is drawn; that must change neither the image nor the caller
         scenes = run_program(replace(model, program=recorded(model.program)), derivation)

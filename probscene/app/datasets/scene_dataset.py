@@ -31,7 +31,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 
 from ..chunks import CHUNK, as_written, draw_chunk
-from ..fitting.run import Run, is_run
+from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
 from .coco import labelled
 
@@ -65,12 +65,12 @@ class SceneDataset(IterableDataset):
 
     Raises:
         ProbsceneError: a number out of its range.
-        RunError, ModelError: see ``Run.open``, ``Run.guide`` and ``load_model``; while iterating, see ``sample``.
+        RunError, ModelError: see ``RunFolder`` and ``load_model``; while iterating, see ``sample``.
     """
 
     def __init__(
         self,
-        source: Run | SceneModel | Path | str,
+        source: RunFolder | SceneModel | Path | str,
         num: int | None = None,
         seed: int = 0,
         min_visible: float = 0.0,
@@ -179,8 +179,8 @@ class SceneDataset(IterableDataset):
             if isinstance(self._source, SceneModel):
                 model, policy = self._source, self._source.prior
             elif is_run(self._source):
-                run = Run.open(Path(self._source))
-                model, policy = run.model, run.guide()
+                run = RunFolder.at(Path(self._source))
+                model, policy = run.model, run.guide
             else:
                 model = load_model(self._source)
                 policy = model.prior
@@ -202,7 +202,7 @@ class SceneDataset(IterableDataset):
         return {**self.__dict__, "_opened": None}
 
 
-def _resolved(source: Run | Path | str) -> str:
+def _resolved(source: RunFolder | Path | str) -> str:
     """A folder or a file that another process finds, whatever its working folder."""
-    path = str(source.path if isinstance(source, Run) else source)
+    path = str(source.path if isinstance(source, RunFolder) else source)
     return lasting_reference(path) if Path(split_reference(path)[0]).exists() else path

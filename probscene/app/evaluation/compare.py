@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import probscene
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.errors import ProbsceneError, RunError
 from probscene.inference.judging.metrics import Shares, histogram, pooled_shares, total_variation
 from probscene.inference.judging.tally import Tally
 
 from ..fitting.fit import Progress
-from ..fitting.run import Run
+from ..fitting.run import RunFolder
 from .evaluate import Evaluation, network_counts
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
@@ -55,7 +55,7 @@ class Comparison(Evaluation):
         runs: by name.
     """
 
-    runs: dict[str, Run] = field(default_factory=dict)
+    runs: dict[str, RunFolder] = field(default_factory=dict)
 
     @property
     def reference(self) -> str | None:
@@ -118,15 +118,15 @@ class Comparison(Evaluation):
         return Row(words, shares, means, {name: total_variation(p, known) for name, p in others.items()})
 
 
-def open_runs(paths: Sequence[Path]) -> dict[str, Run]:
+def open_runs(paths: Sequence[Path]) -> dict[str, RunFolder]:
     """Finished runs of one model, by the names of their folders.
 
     Raises:
-        RunError: see ``Run.open``; runs of different models or of the same name, or one that is not finished.
+        RunError: see ``RunFolder.at``; runs of different models or of the same name, or one that is not finished.
     """
-    runs: dict[str, Run] = {}
+    runs: dict[str, RunFolder] = {}
     for path in paths:
-        run, name = Run.open(path), path.resolve().name
+        run, name = RunFolder.at(path), path.resolve().name
         if name in runs or name in (PRIOR, TRUTH, ESTIMATE):
             raise RunError(
                 f"Expected runs in folders of different names, none of them {PRIOR}, {TRUTH} or {ESTIMATE}, actual "
@@ -139,14 +139,14 @@ def open_runs(paths: Sequence[Path]) -> dict[str, Run]:
                 f"Expected runs of one model, actual {first.path} of {first.record['model']} and {path} of "
                 f"{run.record['model']}{what}; compare runs of the same model."
             )
-        run.guide()
+        run.check_finished()
         runs[name] = run
     return runs
 
 
 def compare(
-    runs: dict[str, Run],
-    target: ImageFolder | None,
+    runs: dict[str, RunFolder],
+    target: Images | None,
     truth: Labels | None,
     progress: Progress,
     num: int = 10000,
@@ -167,11 +167,11 @@ def compare(
     if num < 1:
         raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
     first = next(iter(runs.values()))
-    path = Path(first.record["target"]) if target is None else target.path
-    if target is None and (other := next((r for r in runs.values() if Path(r.record["target"]) != path), None)):
+    path = first.target if target is None else target.path
+    if target is None and (other := next((r for r in runs.values() if r.target != path), None)):
         raise RunError(
             f"Expected runs that were fitted to the same images, actual {first.path} to {path} and {other.path} to "
-            f"{other.record['target']}; say with --target which to compare with."
+            f"{other.target}; say with --target which to compare with."
         )
     model, done = first.model, 0
     columns = list(range(len(model.classes))) if truth is None else truth.columns(model)
@@ -183,7 +183,7 @@ def compare(
 
     sources: dict[str, Source] = {}
     likelihoods: dict[str, Likelihood] = {}
-    for name, policy in {PRIOR: model.prior, **{name: run.guide() for name, run in runs.items()}}.items():
+    for name, policy in {PRIOR: model.prior, **{name: run.guide for name, run in runs.items()}}.items():
         found = counted(model, policy, num, seed, truth, each)
         sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:

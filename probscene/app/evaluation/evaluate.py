@@ -17,15 +17,13 @@ import numpy as np
 import torch
 
 import probscene
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.errors import ProbsceneError
 from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation, wasserstein
 from probscene.inference.judging.tally import Tally
 
 from ..fitting.fit import Progress
-from ..fitting.observer import feature_net
-from ..fitting.presets import Preset
-from ..fitting.run import Run
+from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from .estimate import estimated
 from .image_distances import IMAGES, Distances, image_distances
@@ -50,7 +48,7 @@ class Evaluation:
         notes: of the labels.
     """
 
-    run: Run
+    run: RunFolder
     target: Path
     classes: tuple[str, ...]
     sources: dict[str, Source]
@@ -126,8 +124,8 @@ class Evaluation:
 
 
 def evaluate(
-    run: Run,
-    target: ImageFolder | None,
+    run: RunFolder,
+    target: Images | None,
     truth: Labels | None,
     progress: Progress,
     num: int = 10000,
@@ -152,7 +150,7 @@ def evaluate(
         raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
     if features and target is None:
         raise ProbsceneError("Expected the target's images to compare features with, actual none.")
-    policies = {"prior": run.model.prior, "learnt": run.guide()}
+    policies = {"prior": run.model.prior, "learnt": run.guide}
     done = 0
 
     def each(scenes):
@@ -173,18 +171,18 @@ def evaluate(
     estimate = network_counts(run, target, progress)
     if estimate is not None:
         sources["estimate"] = estimate.only(columns)
-    path = Path(run.record["target"]) if target is None else target.path
+    path = run.target if target is None else target.path
     classes, notes = tuple(run.model.classes[c] for c in columns), () if truth is None else truth.notes
     return Evaluation(run, path, classes, sources, likelihoods, compared, notes)
 
 
-def network_counts(run: Run, target: ImageFolder | None, progress: Progress) -> Source | None:
+def network_counts(run: RunFolder, target: Images | None, progress: Progress) -> Source | None:
     """What the run's feature network counts in the target's images, rounded; None where it does not count.
 
     The features that the fit kept are taken where the images are the fit's, else the images are embedded anew.
     """
     model = run.model
-    names = feature_net(Preset.of(run.record["preset"]), model).names
+    names = run.feature_names
     if estimated(model, names, torch.zeros(0, len(names))) is None:
         return None
     features, done = kept_features(run, target), 0

@@ -10,10 +10,10 @@ from typing import Any
 
 import torch
 
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
 
-from ..fitting.run import Run
+from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, features_of, network
 
 IMAGES = 1000
@@ -22,8 +22,8 @@ Distances = dict[str, tuple[Any, ...]]
 
 
 def image_distances(
-    run: Run,
-    target: ImageFolder,
+    run: RunFolder,
+    target: Images,
     choices: list[str],
     progress: Callable[[str, int, int, str], None],
     num: int = IMAGES,
@@ -62,7 +62,7 @@ def image_distances(
         real = features_in(run, target, net, each)[order]
         sides = {
             source: features_of(run, policy, m, net, seed, each)
-            for source, policy in (("prior", run.model.prior), ("learnt", run.guide()))
+            for source, policy in (("prior", run.model.prior), ("learnt", run.guide))
         } | {"floor": real[m : 2 * m]}
         found[name] = {
             source: (fid(real[:m], side, name, seed=seed), kid(real[:m], side, name, seed=seed))

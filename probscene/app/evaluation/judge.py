@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.judging.trust import Trust, trust
@@ -22,8 +22,7 @@ from probscene.sampling import sample
 from ..chunks import CHUNK, chunk_randomness
 from ..fitting.fit import Progress
 from ..fitting.observer import Observer
-from ..fitting.presets import Preset
-from ..fitting.run import Run
+from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net, threads
 from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
@@ -33,7 +32,6 @@ SCENES = 1000  # of the guide, and as many of the prior
 LOOKS = 32  # images of each source that are compared by their looks, twice as many of the target's
 SHOWN = 8  # images in each picture
 THUMB = 128  # pixels
-COUNT = 0.5  # of a count: what differs by less is the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +65,8 @@ class Judged:
 
 
 def judge(
-    run: Run,
-    target: ImageFolder,
+    run: RunFolder,
+    target: Images,
     progress: Progress,
     num: int = SCENES,
     evaluation: Evaluation | None = None,
@@ -82,7 +80,7 @@ def judge(
 
     Raises:
         ProbsceneError: fewer scenes than a verdict needs.
-        RunError: see ``Run.guide`` and ``own_net``.
+        RunError: see ``RunFolder.guide`` and ``own_net``.
     """
     if num < NEEDED:
         raise ProbsceneError(f"Expected at least {NEEDED} scenes to judge by, actual {num}; or 0 for no verdict.")
@@ -92,8 +90,8 @@ def judge(
         return Judged(
             None, f"Expected at least {NEEDED} real images for a verdict, actual {len(target)} in {target.path}."
         )
-    preset, model, net, looks = Preset.of(run.record["preset"]), run.model, own_net(run), EfficientNetLite()
-    policies = (run.guide(), model.pretraining_policy)
+    preset, model, net, looks = run.preset, run.model, own_net(run), EfficientNetLite()
+    policies = (run.guide, model.pretraining_policy)
     done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target)
 
     def each(images: int) -> None:
@@ -114,7 +112,7 @@ def judge(
             real.numpy(),
             scenes[1].numpy(),
             tuple(net.names),
-            resolution=COUNT if preset.features == "count" else 0.0,
+            resolution=run.features.resolution,
             looks=(seen.numpy(), torch.cat([look for eye in eyes for look in eye.looks]).numpy()),
             seed=seed,
         )
@@ -147,7 +145,7 @@ class _Eyes:
         return self.net.embed(images)
 
 
-def _features(run: Run, policy: Policy, net: FeatureNet, draws_per_structure: int, num: int, seed: int) -> Tensor:
+def _features(run: RunFolder, policy: Policy, net: FeatureNet, draws_per_structure: int, num: int, seed: int) -> Tensor:
     """``(num, D)`` features of scenes, seen as the fit has seen them; the same for the same seed."""
     view = Observer(run.model, run.record["threads"])
     observe, parts = view.observe(net, draws_per_structure), []
@@ -157,7 +155,7 @@ def _features(run: Run, policy: Policy, net: FeatureNet, draws_per_structure: in
     return torch.cat(parts)[:num]
 
 
-def _real(run: Run, target: ImageFolder, net: FeatureNet, each) -> Tensor:
+def _real(run: RunFolder, target: Images, net: FeatureNet, each) -> Tensor:
     """The features that the fit kept where the images are the fit's, else new ones."""
     kept = kept_features(run, target)
     if kept is None:

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
@@ -59,7 +59,7 @@ class Labels(NamedTuple):
 
 
 def read_labels(
-    path: Path, model: SceneModel, target: ImageFolder, some: bool = False, min_height: float = 0.0
+    path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0
 ) -> Labels:
     """The labels of a target's images, from a ``.jsonl`` of provenance, a CSV of counts or a folder of KITTI's labels.
 
@@ -93,7 +93,7 @@ def _labelled(path: Path, classes: tuple[str, ...]) -> tuple[str, ...]:
     return found if found and header == {"image", *found} else classes
 
 
-def read_counts(path: Path, classes: tuple[str, ...], target: ImageFolder, some: bool = False) -> Counts:
+def read_counts(path: Path, classes: tuple[str, ...], target: Images, some: bool = False) -> Counts:
     """The counts ``(L, C)`` of a target's images, in the order of its files.
 
     Rows of files that the target left out as bad are passed over; with ``some``, so are images without a row.
@@ -148,7 +148,7 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
 class _Named:
     """What a file of labels says of a target's images, or of some, by name, each exactly once."""
 
-    def __init__(self, path: Path, target: ImageFolder, some: bool):
+    def __init__(self, path: Path, target: Images, some: bool):
         self.path, self.target, self.some = path, target, some
         self.known = {file.name for file in target.paths}
         self.left_out = {file.name for file in target.bad}
@@ -180,7 +180,7 @@ class _Named:
         return [file.name for file in self.target.paths if file.name in self.found]
 
 
-def _read_derivations(path: Path, model: SceneModel, target: ImageFolder, some: bool) -> Derivation:
+def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool) -> Derivation:
     named = _Named(path, target, some)
     for number, text in enumerate(_text(path).split("\n"), 1):
         if not text.strip():

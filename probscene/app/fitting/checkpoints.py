@@ -3,8 +3,10 @@
 import json
 import time
 
+from probscene.inference.training import Training
+
 from ..files import write_text
-from .run import Run
+from .storage import Storage
 
 SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
 
@@ -15,7 +17,7 @@ class Keeper:
     The log is written before the checkpoint, and lines past the checkpoint are dropped when a run goes on.
     """
 
-    def __init__(self, run: Run, name: str, training):
+    def __init__(self, run: Storage, name: str, training: Training):
         self.run, self.name, self.training = run, f"{name}-checkpoint", training
         self.log = run.path / "log.jsonl"
         self.lines = self.log.read_text(encoding="utf-8").splitlines() if self.log.exists() else []

@@ -1,243 +1,174 @@
-"""``probscene fit``: from a model and a folder of unlabelled images to a run folder.
+"""The stages of a fit: from a model and unlabelled images to a learnt guide.
 
 Four stages: the feature network on prior renders, features of the target images, the guide's pretraining, and the
 learning of structure. Each goes on after an interruption to the same result. Only the images are read; labels play no
 part.
 """
 
-import dataclasses
 import json
-import os
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-import probscene
-from probscene.dataset import ImageFolder
+from probscene.dataset import ImageFolder, Images
 from probscene.errors import DataError, RunError
-from probscene.inference.divergence import Blockwise, Divergence
 from probscene.inference.features.base import FeatureNet, embed_all
-from probscene.inference.features.counting.training import CountTraining
-from probscene.inference.features.presence import PresenceNet, PresenceTraining
-from probscene.inference.features.projection import Projected, discriminant, self_share
 from probscene.inference.guides.base import Guide
 from probscene.inference.judging.two_sample import NEEDED, check_features
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
-from probscene.inference.training import batch_seed
-from probscene.model import SceneModel
-from probscene.sampling import Scenes, run_program, sample, seed_everything
+from probscene.inference.training import Training, batch_seed
+from probscene.sampling import seed_everything
+from probscene.threads import threads
 
 from ..files import write_text
-from ..loading import load_model
+from ..progress import Progress
+from .cache import NetworkCache
 from .checkpoints import Keeper
-from .observer import RENDERED_AT_ONCE, Observer, feature_net
-from .presets import COUNT_ON_PRETRAINED, TRAINED, Preset
-from .run import Run
+from .observer import RENDERED_AT_ONCE, Observer
+from .parts import inner
+from .run import RunFolder, load_state, state_of
 from .scene_features import fingerprint
 
-Progress = Callable[[str, int, int, str], None]
-"""Called with the stage, what of it is done, of how much, and a note such as the loss."""
+Say = Callable[[str], None]
+"""Told a sentence that a person should know."""
 
 
-def create(
-    model: str,
-    target: Path,
-    out: Path,
-    preset: Preset,
-    seed: int,
-    skip_bad: bool = False,
-    threads: int | None = None,
-    assets: Path | None = None,
-) -> Run:
-    """A new run folder for a fit; the model is checked first, so that a wrong one leaves no folder behind.
-
-    Args:
-        threads: of torch; all that this process may use where None. Another number rounds differently, so it is
-            recorded.
-        assets: a folder that the model is drawn with.
-
-    Raises:
-        ProbsceneError: see ``load_model`` and ``Run.create``.
-    """
-    loaded = load_model(model, assets)
-    if preset.features not in TRAINED:
-        feature_net(preset, loaded)
-    record = {
-        "version": probscene.__version__,
-        "target": str(Path(target).resolve()),
-        "skip_bad": skip_bad,
-        "seed": seed,
-        "threads": threads or len(os.sched_getaffinity(0)),
-        "preset": dataclasses.asdict(preset),
-        "guide": preset.guide_settings(),
-    }
-    return Run.create(out, model, record, assets)
-
-
-def fit(run: Run, progress: Progress, target: ImageFolder | None = None) -> Guide:
+def fit(
+    run: RunFolder,
+    progress: Progress,
+    target: Images | None = None,
+    cache_in: Path | None = None,
+    use_cache: bool = True,
+    say: Say | None = None,
+) -> Guide:
     """Finish a run: take the stages that it lacks.
 
     Args:
         target: the run's target images, where they are open already.
+        cache_in: the folder in which trained feature networks are kept; the user's cache where None.
+        use_cache: whether to look there at all.
+        say: is told where a network came from there.
 
     Raises:
-        DataError: the target folder cannot be used: see ``check_target`` and ``check_features``.
+        DataError: the target cannot be used: see ``check_target`` and ``check_features``.
         RunError: it is not the one that the run was begun with.
         ProbsceneError: something in the fit is no longer finite; the last checkpoint stays.
     """
-    if (run.path / "guide.safetensors").is_file():
-        return run.guide()
-    preset, model, threads = Preset.of(run.record["preset"]), run.model, run.record["threads"]
-    view = Observer(model, threads)
-    torch.set_num_threads(threads)
+    if run.is_finished:
+        return run.guide
     images = cache(lambda: open_target(run, progress) if target is None else target)
-    net = _feature_net(run, preset, view, progress, images)
-    real = _real_features(run, net, progress, images)
-    torch.set_num_threads(1)  # the guide's tensors are tiny: a second thread only waits
-    divergence = preset.divergence()
-    if preset.features == COUNT_ON_PRETRAINED:
-        joint = dataclasses.replace(preset, marginal_variance=None).divergence()
-        divergence = Blockwise(net.blocks, (divergence, None, joint))
-    guide = _learn(run, preset, model, view.observe(net, preset.draws_per_structure), divergence, real, progress)
+    observer = Observer(run.model, run.record["threads"])
+    with threads(run.record["threads"]):
+        net = _Network(run, observer, progress, images)
+        net.finish(cache_in, use_cache, say or (lambda text: None))
+        real = _real_features(run, net.net, progress, images)
+    with threads(1):  # the guide's tensors are tiny: a second thread only waits
+        guide = _learn(run, observer, net.net, real, progress)
     run.save("guide", guide.state_dict())
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
     return guide
 
 
-def _feature_net(
-    run: Run, preset: Preset, view: Observer, progress: Progress, target: Callable[[], ImageFolder]
-) -> FeatureNet:
-    seed_everything(batch_seed(run.record["seed"], 0))
-    net = feature_net(preset, view.model)
-    tensors = run.load("features")
-    if tensors is not None:
-        net.load_state_dict(tensors)
-    elif isinstance(net, Projected):
-        _project(run, preset, view, net, progress)
-    else:
-        _train(run, preset, view, net, progress, target)
-    return net.eval()
+class _Network:
+    """The run's feature network on its way to being trained."""
 
+    def __init__(self, run: RunFolder, observer: Observer, progress: Progress, target: Callable[[], Images]):
+        self.run, self.observer, self.progress, self.target = run, observer, progress, target
+        seed_everything(batch_seed(run.record["seed"], 0))
+        self.net = run.build_network() if run.built is None else run.built
+        run.built = None
 
-def _project(run: Run, preset: Preset, view: Observer, net: Projected, progress: Progress) -> None:
-    """Two renders of each of some structures, in a minute or so; what is interrupted begins again."""
-    seed_everything(batch_seed(run.record["seed"], 1))
-    model, observe, parts = view.model, view.observe(net.pretrained), []
-    policy = model.pretraining_policy
-    for first in range(0, preset.pairs, RENDERED_AT_ONCE):
-        progress("features", first, preset.pairs, "")
-        scenes = sample(model, policy, min(RENDERED_AT_ONCE, preset.pairs - first))
-        parts.append((observe(scenes), observe(run_program(model, scenes.derivation))))
-    one, other = (torch.cat(part) for part in zip(*parts, strict=True))
-    net.projection = discriminant(one, other, preset.directions, preset.num_scenes)
-    share = self_share(net.projection(other[: preset.num_scenes]))
-    ratio = net.ratio.tolist()
-    note = f"variance over noise {ratio[0]:.1f} to {ratio[-1]:.1f}, own kernel's share {share:.2f}"
-    progress("features", preset.pairs, preset.pairs, note)
-    line = json.dumps({"stage": "projection", "ratio": ratio, "self_share": share})
-    write_text(run.path / "log.jsonl", f"{line}\n")
-    run.save("features", net.state_dict())
+    def finish(self, folder: Path | None, use_cache: bool, say: Say) -> None:
+        """Load it from the run or from the cache, else train it."""
+        run, net = self.run, self.net
+        tensors = run.load("features")
+        if tensors is not None:
+            load_state(net, tensors)
+            self._check_taught()
+            return
+        training = run.features.training(inner(net), self.observer, self.target, run.record["seed"])
+        if training is None:
+            run.save("features", state_of(net))
+            return
+        taught = run.features.taught_by(inner(net))
+        kept = NetworkCache(run, inner(net), folder, taught) if use_cache else None
+        cached = None if kept is None else kept.load()
+        if cached is not None and kept is not None:
+            write_text(run.path / "log.jsonl", "".join(f"{line}\n" for line in cached.lines))
+            load_state(net, cached.tensors)
+            say(f"The feature network was trained before; it is in {kept.file}.")
+        else:
+            lines = self._train(training)
+            if kept is not None:
+                kept.save(state_of(net), lines)
+        run.save("features", state_of(net))
+        (run.path / "features-checkpoint.safetensors").unlink(missing_ok=True)
+        if isinstance(net, nn.Module):
+            net.eval()
 
+    def _train(self, training: Training) -> list[str]:
+        keep = Keeper(self.run, "features", training)
+        self._check_taught()
 
-def _train(
-    run: Run, preset: Preset, view: Observer, net: FeatureNet, progress: Progress, target: Callable[[], ImageFolder]
-) -> None:
-    seed = batch_seed(run.record["seed"], 1)
-    if preset.features == COUNT_ON_PRETRAINED:
-        from probscene.inference.features.counting.pretrained_training import (
-            PretrainedCountTraining,  # torchvision takes seconds
-        )
+        def each(training: Training, line: dict[str, float]) -> None:
+            if "images" in line:
+                self.progress("looking", int(line["images"]), int(line["of"]), "")
+                return
+            note = ", ".join(f"{name} {value:.3f}" for name, value in line.items())
+            if "loss" in line:
+                keep({"stage": "features", "step": training.done, **line})
+            self.progress("features", training.done, training.total, note, training.unit)
 
-        # Of the prior's few cars a head learns that there are few: in photographs it must read many.
-        draw = partial(view.draw_twice, policy=view.model.pretraining_policy)
-        photographs = None
-        if preset.photographs:
-            photographs = _photographs(target(), preset.photographs)
-            net.taught_by.copy_(fingerprint(target()))
-        training = PretrainedCountTraining(
-            net, draw, preset.pairs, preset.head_epochs, preset.num_scenes, seed=seed, photographs=photographs
-        )
-        steps = preset.head_epochs + (photographs is not None)
-    elif isinstance(net, PresenceNet):
-        training = PresenceTraining(net, view.draw, preset.presence_images, preset.presence_epochs, seed=seed)
-        steps = preset.presence_epochs
-    else:
-        seed_everything(batch_seed(run.record["seed"], 4))
-        net.fit_to(view.object_size())
-        training = CountTraining(net, view.draw, preset.count, seed=seed)
-        steps = preset.count.steps
-        torch.set_num_threads(1)  # its images are drawn on another core meanwhile
-    keep = Keeper(run, "features", training)
-    _check_taught(net, target)
-
-    def each(training, loss):
-        keep({"stage": "features", "step": training.done, "loss": loss})
-        progress("features", training.done, steps, f"loss {loss:.3f}")
-
-    if preset.features == COUNT_ON_PRETRAINED:
-        found = training.run(each, lambda done, total: progress("looking", done, total, ""))
-        seen = {name: [x if x == x else None for x in part.tolist()] for name, part in found._asdict().items()}
-        keep.lines.append(json.dumps({"stage": "counts", **seen}))
-    else:
-        progress("features", training.done, steps, "")
         training.run(each)
-    torch.set_num_threads(run.record["threads"])
-    keep.finish()
-    run.save("features", net.state_dict())
-    keep.forget()
+        summary = training.summary()
+        if summary:
+            keep.lines.append(json.dumps(summary))
+        keep.finish()
+        return keep.lines
+
+    def _check_taught(self) -> None:
+        """See that a network that taught itself on images did so on those of the run, begun anew or going on."""
+        taught_by = self.run.features.taught_by(inner(self.net))
+        if taught_by and self.target().fingerprint != taught_by:
+            raise _others(self.target())
 
 
-def _photographs(target: ImageFolder, most: int) -> Tensor:
-    """Images of the target, ``(L, C, H, W)`` uint8, evenly spread over the folder."""
-    check_target(target)
-    number = min(most, len(target))
-    return torch.stack([target.load(i * len(target) // number) for i in range(number)])
-
-
-def _real_features(run: Run, net: FeatureNet, progress: Progress, target: Callable[[], ImageFolder]) -> Tensor:
+def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: Callable[[], Images]) -> Tensor:
     """Of every image, ``(L, D)``, then of the preset's further views, kept apart: a verdict is about L images."""
-    _check_taught(net, target)
-    target = target()
+    images = target()
     cached = run.load("real")
     if cached is not None:
-        _check_same(target, cached["fingerprint"])
+        if not torch.equal(fingerprint(images), cached["fingerprint"]):
+            raise _others(images)
         return torch.cat([cached["features"], *([cached["views"]] if "views" in cached else [])])
-    views, done = Preset.of(run.record["preset"]).views, 0
+    views, done = run.preset.views, 0
 
-    def each(images):
+    def each(number: int) -> None:
         nonlocal done
-        done += images
-        progress("target", done, views * len(target), "")
+        done += number
+        progress("target", done, views * len(images), "")
 
-    check_target(target)
-    features, *others = (embed_all(net, target.batches(RENDERED_AT_ONCE, view), each) for view in range(views))
+    check_target(images)
+    features, *others = (embed_all(net, images.batches(RENDERED_AT_ONCE, view), each) for view in range(views))
     check_features(features)
-    kept = {"features": features, "fingerprint": fingerprint(target)}
+    kept = {"features": features, "fingerprint": fingerprint(images)}
     run.save("real", kept | ({"views": torch.cat(others)} if others else {}))
     return torch.cat([features, *others])
 
 
-def _check_same(target: ImageFolder, kept: Tensor) -> None:
-    if not torch.equal(fingerprint(target), kept):
-        raise RunError(
-            f"Expected the target images in {target.path} as they were when the run began, actual others; put them "
-            "back, or begin a new run."
-        )
+def _others(target: Images) -> RunError:
+    return RunError(
+        f"Expected the target images in {target.path} as they were when the run began, actual others; put them back, "
+        "or begin a new run."
+    )
 
 
-def _check_taught(net: FeatureNet, target: Callable[[], ImageFolder]) -> None:
-    """See that a network that taught itself on images did so on those of the run, begun anew or going on."""
-    taught_by = dict(net.named_buffers()).get("taught_by")
-    if taught_by is not None and taught_by.any():
-        _check_same(target(), taught_by)
-
-
-def check_target(target: ImageFolder) -> None:
+def check_target(target: Images) -> None:
     """See that a density of features can be estimated from the images.
 
     Raises:
@@ -255,15 +186,21 @@ def check_target(target: ImageFolder) -> None:
         )
 
 
-def open_target(run: Run, progress: Progress) -> ImageFolder:
+def open_target(run: RunFolder, progress: Progress) -> Images:
     """The run's target images.
 
     Raises:
+        RunError: they were in memory alone.
         DataError: see ``ImageFolder``.
     """
-    model = run.model
+    model, target = run.model, run.record["target"]
+    if target is None:
+        raise RunError(
+            f"Expected the images that the run in {run.path} was begun with, actual only their number: they were in "
+            "memory. Name them again."
+        )
     return ImageFolder(
-        run.record["target"],
+        target if isinstance(target, list) else Path(target),
         model.canvas,
         model.channels,
         run.record["skip_bad"],
@@ -271,21 +208,13 @@ def open_target(run: Run, progress: Progress) -> ImageFolder:
     )
 
 
-def _learn(
-    run: Run,
-    preset: Preset,
-    model: SceneModel,
-    observe: Callable[[Scenes], Tensor],
-    divergence: Divergence,
-    real: Tensor,
-    progress: Progress,
-) -> Guide:
-    seed = run.record["seed"]
+def _learn(run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, progress: Progress) -> Guide:
+    preset, model, seed = run.preset, run.model, run.record["seed"]
     seed_everything(batch_seed(seed, 2))
     guide = run.new_guide()
     objective = ScoreFunction(
-        observe,
-        divergence,
+        observer.observe(net, preset.draws_per_structure),
+        run.divergence(inner(net)),
         baseline=preset.baseline,
         updates=preset.updates,
         scale=preset.scale,
@@ -294,7 +223,7 @@ def _learn(
         prior=model.pretraining_policy,
         prior_kl_weight=preset.prior_kl_weight,
     )
-    learner = Trainer(
+    trainer = Trainer(
         model,
         guide,
         objective,
@@ -306,8 +235,8 @@ def _learn(
         preset.cosine,
         seed=batch_seed(seed, 3),
     )
-    keep = Keeper(run, "guide", learner)
-    if learner.done == 0:
+    keep = Keeper(run, "guide", trainer)
+    if trainer.done == 0:
         epochs = preset.pretrain_epochs
         pretrain(
             guide,
@@ -318,10 +247,10 @@ def _learn(
             progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
         )
 
-    def each(learner, diagnostics):
+    def each(trainer: Training, diagnostics: dict[str, float]) -> None:
         keep({"stage": "structure", **diagnostics})
-        progress("structure", learner.done, preset.batches, f"cost {diagnostics['cost']:.3f}")
+        progress("structure", trainer.done, preset.batches, f"cost {diagnostics['cost']:.3f}")
 
-    learner.run(each)
+    trainer.run(each)
     keep.finish()
     return guide

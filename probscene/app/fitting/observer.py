@@ -3,7 +3,6 @@
 Axis letters: N scenes, M nodes, D features, C H W.
 """
 
-import hashlib
 import math
 from collections.abc import Callable
 
@@ -14,22 +13,23 @@ from probscene.batch import RenderBatch
 from probscene.dataset import grey
 from probscene.inference.features.base import Examples, FeatureNet, class_table, examples
 from probscene.inference.features.counting.grouping import group_of
-from probscene.inference.features.counting.net import CountNet
-from probscene.inference.features.presence import PresenceNet
-from probscene.inference.features.projection import Projected
 from probscene.model import SceneModel
-from probscene.policy import Policy
 from probscene.relations import relations
 from probscene.sampling import Scenes, run_program, sample
+from probscene.threads import threads
 
 from ..loading import renderer_for
-from .presets import COUNT_ON_PRETRAINED, Preset
 
 RENDERED_AT_ONCE = 64  # images in memory
 
 
 class Observer:
-    """A model seen through its renderer: labelled prior renders to train on, and features of scenes."""
+    """A model seen through its renderer: ``Renders`` to train on, and features of scenes.
+
+    Args:
+        model: the scene model.
+        threads: of the renderer and of torch, while it observes.
+    """
 
     def __init__(self, model: SceneModel, threads: int):
         self.model, self.threads = model, threads
@@ -42,11 +42,17 @@ class Observer:
         """``num`` labelled renders of the prior."""
         return self._labelled(sample(self.model, self.model.prior, num))
 
-    def draw_twice(self, num: int, policy: Policy) -> Examples:
-        """Labelled renders of ``num`` structures, and as many more of the same structures, their parameters anew."""
-        scenes = sample(self.model, policy, num)
+    def draw_twice(self, num: int) -> Examples:
+        """Labelled renders of ``num`` structures of the policy that guides are pretrained on, and as many more of the
+        same structures, their parameters anew."""
+        scenes = sample(self.model, self.model.pretraining_policy, num)
         both = self._labelled(scenes), self._labelled(run_program(self.model, scenes.derivation))
         return Examples(*(torch.cat(parts) for parts in zip(*both, strict=True)))
+
+    def embed_twice(self, num: int, net: FeatureNet) -> tuple[Tensor, Tensor]:
+        """Features, two times ``(num, D)``, of ``num`` structures of that policy and of the same drawn anew."""
+        observe, scenes = self.observe(net), sample(self.model, self.model.pretraining_policy, num)
+        return observe(scenes), observe(run_program(self.model, scenes.derivation))
 
     def _labelled(self, scenes: Scenes) -> Examples:
         groups, grammar = self.model.groups, self.model.grammar
@@ -73,12 +79,10 @@ class Observer:
         """
 
         def features(scenes: Scenes) -> Tensor:
-            torch.set_num_threads(self.threads)
-            starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
-            images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
-            parts = [net.embed(self._as_read(some)) for some in images]
-            torch.set_num_threads(1)
-            return torch.cat(parts)
+            with threads(self.threads):
+                starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
+                images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
+                return torch.cat([net.embed(self._as_read(some)) for some in images])
 
         return features
 
@@ -103,29 +107,3 @@ class Observer:
     def _least_visible(self, batch: RenderBatch) -> Tensor:
         """``(N,)`` visible fraction of the least visible object; what can have others on it is meant to be covered."""
         return batch.visible.where(~self.covered[batch.kind], 1.0).amin(1)
-
-
-def feature_net(preset: Preset, model: SceneModel) -> FeatureNet:
-    """The feature network of a preset, untrained, or pretrained with an empty projection or head.
-
-    Raises:
-        DataError: see ``pretrained``.
-    """
-    if preset.features == "presence":
-        return PresenceNet(model.classes)
-    if preset.features == COUNT_ON_PRETRAINED:
-        from probscene.inference.features.counting.pretrained import (
-            PretrainedCountNet,  # torchvision takes seconds to import
-        )
-
-        return PretrainedCountNet(model.classes, preset.directions, model.canvas, model.stuff)
-    if preset.features != "count":
-        from probscene.inference.features.pretrained import (  # torchvision takes seconds to import
-            pretrained,
-            weights_file,
-        )
-
-        net, file = pretrained(preset.features), weights_file(preset.features)
-        digest = bytes(32) if file is None else hashlib.sha256(file.read_bytes()).digest()
-        return Projected(net, preset.directions, digest)
-    return CountNet(model.classes, model.channels, model.canvas, preset.width, preset.blocks, model.groups)

@@ -9,6 +9,7 @@ from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES
 from probscene.inference.objective import BASELINES
 
+from .parts import is_file_part
 from .presets import OBJECTIVES, TRAINED, Preset
 
 CHOICES = {
@@ -73,7 +74,7 @@ def _read(text: str, wanted: Any, key: str) -> Any:
 
 
 def _check(name: str, value: Any, key: str) -> None:
-    if isinstance(value, str) and value not in CHOICES[name]:
+    if isinstance(value, str) and value not in CHOICES[name] and not is_file_part(value):
         raise ProbsceneError(f"Expected --set {key}=... among {', '.join(CHOICES[name])}, actual {value!r}.")
     if type(value) is int and value < LEAST.get(name, 1):
         raise ProbsceneError(f"Expected --set {key}=... of at least {LEAST.get(name, 1)}, actual {value}.")

@@ -1,16 +1,20 @@
 """How long and how to learn: everything that a fit depends on beside the model, the target and the seed."""
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
+from probscene.inference.features.base import Features
 from probscene.inference.features.counting.batches import CountSchedule
+from probscene.inference.features.counting.choices import COUNT_ON_PRETRAINED, CountFeatures, PretrainedCountFeatures
 from probscene.inference.features.names import network_name
+from probscene.inference.features.presence import PresenceFeatures
+from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.guides.lstm import GUIDES
 
-COUNT_ON_PRETRAINED = "count=efficientnet"
+from .parts import CheckedDivergence, as_divergence, as_features, is_file_part, load_part
+
 TRAINED = ("count", COUNT_ON_PRETRAINED, "presence")  # on the prior's renders
 _RENAMED = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
 OBJECTIVES = ("kde", "js", "witness", "mmd")
@@ -22,8 +26,8 @@ class Preset:
 
     Args:
         features: ``"count"`` for the count network, ``"count=efficientnet"`` for counts read from a pretrained one's
-            maps (``pretrained_count``), ``"presence"`` for the paper's network; one of ``CHOICES`` for a pretrained
-            one, projected (``projection``).
+            maps, ``"presence"`` for the paper's network; one of ``names.CHOICES`` for a pretrained one, projected;
+            ``FILE.py:NAME`` for one's own.
         count: the count network's schedule.
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
@@ -37,9 +41,9 @@ class Preset:
             lies 0.6 kernels from its image, their mean 0.1. More views change nothing, a bandwidth chosen for the few
             (``projection``) does the rest. There are no flips: they did not help (-0.006 nats), and traffic keeps to a
             side.
-        guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``.
+        guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``; ``FILE.py:NAME`` for one's own.
         objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
-            value for each scene; ``"mmd"``, MMD as a reward that all scenes share.
+            value for each scene; ``"mmd"``, MMD as a reward that all scenes share; ``FILE.py:NAME`` for one's own.
         variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first one also of ``MMD``. Marginals are of
             counts alone where directions stand beside them.
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
@@ -102,40 +106,54 @@ class Preset:
         Raises:
             ProbsceneError: an unknown objective.
         """
-        if objective not in OBJECTIVES:
-            raise ProbsceneError(f"Expected an objective among {', '.join(OBJECTIVES)}, actual {objective!r}.")
+        if objective not in OBJECTIVES and not is_file_part(objective):
+            raise ProbsceneError(
+                f"Expected an objective among {', '.join(OBJECTIVES)}, or FILE.py:NAME, actual {objective!r}."
+            )
         if objective == self.objective or objective != "mmd":
             return replace(self, objective=objective)
         rate = min(self.learning_rate, 1e-3)
         return replace(self, objective=objective, baseline="moving_average", updates=1, learning_rate=rate)
 
     def with_features(self, features: str) -> "Preset":
-        """This preset with another feature network. A pretrained one takes about 20 ms an image on one core where a
-        preset's own takes 1, so that scenes are fewer and each is drawn once. So few have a noisier gradient: at twice
-        the step, lists of Aerial 2D ran beyond T_max in the third batch. Marginals, which are far sharper than the
-        joint density, say of photographs only that they are none: their log ratio's spread came to 18, without them 2.
-        Its features come in units of their bandwidth, which the kernel takes.
+        """This preset with another feature network, and what suits it (``Features.settings``).
+
+        Args:
+            features: as of ``Preset``.
 
         Raises:
             ProbsceneError: an unknown network, or no file named.
         """
-        if features in ("count", "presence"):
-            return replace(self, features=features)
-        few = {"batches": 40, "num_scenes": 150, "draws_per_structure": 1}
-        few |= {"learning_rate": min(self.learning_rate, 5e-3)}
-        few |= {"marginal_variance": None, "variance": None if self.variance is None else 1.0}
-        if features == COUNT_ON_PRETRAINED:
-            # Photographs' counts are noisy, and few: an anchor, where there is one, holds them more. Those of things
-            # do lie among the renders', and a bounded objective bears their marginals; the directions have none, where
-            # photographs often lie beyond all renders: what is nearest is not what has as many cars. After 40 batches
-            # costs still fall.
-            weight = max(self.prior_kl_weight, 0.1) if self.prior_kl_weight else 0.0
-            single = 0.25 if self.objective == "js" else None
-            few |= {"marginal_variance": single, "pairs": 1000, "prior_kl_weight": weight, "batches": 60}
-        else:
-            name, file = network_name(features, TRAINED), features.partition("=")[2]
-            features = f"{name}={Path(file).resolve()}" if file else features
-        return replace(self, features=features, **few)
+        return self.with_features_of(replace(self, features=features).make_features())
+
+    def with_features_of(self, features: Features, word: str = "") -> "Preset":
+        """This preset with features that are given.
+
+        Args:
+            word: what is recorded of them; their name where there is none.
+        """
+        return replace(self, features=word or features.name, **features.settings(self))
+
+    def make_features(self) -> Features:
+        """The features that the preset names, with its settings.
+
+        Raises:
+            ProbsceneError: an unknown word.
+            ModelError: see ``load_part``.
+        """
+        if is_file_part(self.features):
+            return as_features(load_part(self.features))
+        made = {
+            "count": lambda: CountFeatures(self.count, self.width, self.blocks),
+            "presence": lambda: PresenceFeatures(self.presence_images, self.presence_epochs),
+            COUNT_ON_PRETRAINED: lambda: PretrainedCountFeatures(
+                self.pairs, self.head_epochs, self.photographs, self.directions, self.num_scenes
+            ),
+        }
+        if self.features not in made:
+            network_name(self.features, TRAINED)
+            return ProjectedFeatures(self.features, self.pairs, self.directions, self.num_scenes)
+        return made[self.features]()
 
     def with_guide(self, kind: str) -> "Preset":
         """This preset with another guide. A PCFG's weights, one a rule, are many small steps of Adam away from any
@@ -144,8 +162,10 @@ class Preset:
         Raises:
             ProbsceneError: an unknown guide.
         """
+        if is_file_part(kind):
+            return replace(self, guide=kind)
         if kind not in GUIDES:
-            raise ProbsceneError(f"Expected a guide among {', '.join(GUIDES)}, actual {kind!r}.")
+            raise ProbsceneError(f"Expected a guide among {', '.join(GUIDES)}, or FILE.py:NAME, actual {kind!r}.")
         if kind == "pcfg":
             return replace(self, guide=kind, pretrain_rate=3e-2)
         if kind == "grammar-vae":
@@ -155,10 +175,16 @@ class Preset:
     def guide_settings(self) -> dict[str, Any]:
         """The arguments of ``make_guide`` that a run keeps."""
         of_kind = {"lstm": ("hidden", "num_latents", "index"), "pcfg": (), "grammar-vae": ("hidden", "num_latents")}
-        return {"kind": self.guide} | {name: getattr(self, name) for name in of_kind[self.guide]}
+        return {"kind": self.guide} | {name: getattr(self, name) for name in of_kind.get(self.guide, ())}
 
     def divergence(self) -> Divergence:
-        """The objective's divergence."""
+        """The objective's divergence.
+
+        Raises:
+            ModelError: see ``load_part``.
+        """
+        if is_file_part(self.objective):
+            return CheckedDivergence(as_divergence(load_part(self.objective)))
         if self.objective in ("mmd", "witness"):
             return MMD(self.variance, shared=self.objective == "mmd")
         ratio = JensenShannon if self.objective == "js" else KDELogRatio

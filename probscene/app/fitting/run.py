@@ -1,136 +1,127 @@
-"""The run folder: what ``fit`` writes and every other command reads.
+"""A run: its folder, and what it is made of: model, features, divergence, guide."""
 
-    run.json               the configuration, the model, the target, the version that wrote it
-    model.py               a copy of the model's file, where it is not a built-in one
-    guide.safetensors      the learnt guide; there once the fit is finished
-    features.safetensors   the feature network
-    real.safetensors       features of the target images
-    log.jsonl              one line an update
-    checkpoint.safetensors what ``--resume`` goes on from
-
-All are written aside and renamed.
-"""
-
-import hashlib
-import json
 import os
 import shutil
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import safetensors
-import safetensors.torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from probscene.errors import DataError, ModelError, RunError
+from probscene.errors import RunError
+from probscene.inference.divergence import Divergence
+from probscene.inference.features.base import FeatureNet, Features
 from probscene.inference.guides.base import Guide
 from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.model import SceneModel
 
 from ..files import make_folder, write_json, write_whole
-from ..loading import BUILT_IN, lasting_reference, load_model, split_reference
+from ..loading import BUILT_IN, lasting_reference, load_model, same_assets, split_reference
+from ..modules import file_digest
+from .parts import (
+    IN_MEMORY,
+    CheckedDivergence,
+    CheckedNet,
+    Parts,
+    as_guide_maker,
+    check_guide,
+    inner,
+    is_file_part,
+    load_part,
+    part_file,
+)
+from .presets import Preset
+from .storage import FORMAT, Storage, check_free, read_record
 
-FORMAT = 3  # of the run folder; another number is not read
-KEYS = {"model", "model_sha256", "assets"}  # that create adds to every run.json
 
-
-class Run:
+class RunFolder(Storage):
     """A run folder.
+
+    Args:
+        model: the scene model, where it is in memory; else it is loaded once, when it is asked for.
+        parts: what the user brought as objects.
 
     Attributes:
         path: the folder.
         record: the contents of ``run.json``.
+        built: the feature network, untrained, where the fit is to begin with one that was built before.
     """
 
-    def __init__(self, path: Path, record: dict[str, Any]):
-        self.path, self.record = Path(path), record
-        self._model: SceneModel | None = None
+    def __init__(self, path: Path, record: dict[str, Any], model: SceneModel | None = None, parts: Parts | None = None):
+        super().__init__(path, record)
+        self.parts, self._model = parts or Parts(), model
+        self.built: FeatureNet | None = None
+        self._network: FeatureNet | None = None
 
-    @staticmethod
-    def create(path: Path, model: str, record: dict[str, Any], assets: Path | None = None) -> "Run":
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        model: str | SceneModel,
+        record: dict[str, Any],
+        assets: Path | None = None,
+        loaded: SceneModel | None = None,
+        parts: Parts | None = None,
+    ) -> "RunFolder":
         """A new run folder; ``record`` is kept in ``run.json``.
 
         Args:
+            model: a reference; or a model that is in memory alone, which the folder then cannot give back.
             assets: a folder that the model is drawn with, from now on whenever the run is opened.
+            loaded: the model of a reference, where it is loaded already.
+            parts: what the user brought as objects.
 
         Raises:
             RunError: the folder holds a run or other files already.
             MachineError: it cannot be written.
         """
         path = Path(path)
-        Run.check_free(path)
-        words = load_model(model, assets).assets
+        check_free(path)
+        if isinstance(model, SceneModel):
+            reference, file, digest, loaded = f"{IN_MEMORY}{model.name}", None, None, model
+        else:
+            loaded = loaded or load_model(model, assets)
+            reference, name = lasting_reference(model), split_reference(model)[0]
+            file = None if name in BUILT_IN else Path(name)
+            digest = None if file is None else file_digest(file)
         make_folder(path)
-        reference, file = lasting_reference(model), split_reference(model)[0]
-        digest = None if file in BUILT_IN else _sha256(Path(file))
-        about = {"format": FORMAT, "model": reference, "model_sha256": digest, "assets": words}
+        about = {"format": FORMAT, "model": reference, "model_sha256": digest, "assets": loaded.assets}
         if assets is not None:
             about["assets_folder"] = os.path.abspath(assets)
-        run = Run(path, record | about)
+        run = cls(path, record | about, loaded, parts)
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
-        if digest is not None:
+        if file is not None:
             write_whole(path / "model.py", lambda temporary: shutil.copyfile(file, temporary))
         return run
 
-    @staticmethod
-    def check_free(path: Path) -> None:
-        """See that a folder can become a run's; nothing is written.
-
-        Raises:
-            RunError: it holds a run or other files already.
-            DataError: a file is in the way.
-        """
-        path = Path(path)
-        if (path / "run.json").exists():
-            raise RunError(f"Expected a new folder for the run, actual {path} holds one; add --resume or name another.")
-        if path.exists() and not path.is_dir():
-            raise DataError(f"Expected a folder for the run, actual {path} is a file; name another.")
-        if path.is_dir() and any(not entry.name.startswith(".") for entry in path.iterdir()):
-            raise RunError(f"Expected a new or empty folder for the run, actual {path} holds other files.")
-
-    @staticmethod
-    def open(path: Path) -> "Run":
+    @classmethod
+    def at(cls, path: Path, model: SceneModel | None = None, parts: Parts | None = None) -> "RunFolder":
         """An existing run folder.
+
+        Args:
+            model, parts: see ``RunFolder``; for a run that was begun with what was in memory alone.
 
         Raises:
             RunError: there is none, it is damaged, or another version wrote it.
         """
-        path = Path(path)
-        file = path / "run.json"
-        if not file.is_file():
-            raise RunError(f"Expected a run folder with a run.json, actual {path}; make one with 'probscene fit'.")
-        try:
-            record = json.loads(file.read_text(encoding="utf-8"))
-            written = record["format"]
-            if written == FORMAT and not KEYS <= record.keys():
-                raise KeyError(*(KEYS - record.keys()))
-        except (ValueError, KeyError, TypeError) as error:
-            raise RunError(f"Expected JSON of a run in {file}, actual something else; fit again.") from error
-        if written != FORMAT:
-            raise RunError(
-                f"Expected a run of format {FORMAT}, actual format {written} in {path}: another version of probscene "
-                f"({record.get('version', 'unknown')}) wrote it. Use that version, or fit again."
-            )
-        return Run(path, record)
+        return cls(path, read_record(Path(path)), model, parts)
 
     @property
     def model(self) -> SceneModel:
         """The scene model, loaded once.
 
         Raises:
-            RunError: the model's file is gone or has changed since the fit, or it draws with other assets.
+            RunError: the model's file is gone or has changed since the fit, or it draws with other assets; it was in
+                memory alone.
         """
         if self._model is None:
-            reference, digest = self.record["model"], self.record["model_sha256"]
-            file = Path(split_reference(reference)[0])
-            if digest is not None and (not file.is_file() or _sha256(file) != digest):
-                raise RunError(
-                    f"Expected the model file {file} as it was when {self.path} was fitted, actual a missing or "
-                    f"changed file. A copy is in {self.path / 'model.py'}: put it back, or fit again."
-                )
+            reference = self.record["model"]
+            if reference.startswith(IN_MEMORY):
+                raise self._only_in_memory("model", reference)
+            self._unchanged(Path(split_reference(reference)[0]), self.record["model_sha256"], "model")
             model = load_model(reference, self.record.get("assets_folder"))
-            if model.assets != self.record["assets"]:
+            if not same_assets(model.assets, self.record["assets"]):
                 raise RunError(
                     f"Expected model {model.name} to draw with {self.record['assets'] or 'no assets'}, as when the run "
                     f"{self.path} was begun, actual {model.assets or 'no assets'}; put them back, or fit again."
@@ -138,12 +129,111 @@ class Run:
             self._model = model
         return self._model
 
-    def new_guide(self) -> Guide:
-        """An untrained guide of the kind and size that the run was begun with; one that names no kind has an LSTM."""
-        settings = {"kind": "lstm", **self.record["guide"]}
-        made = ScenarioGuide if self.model.scenarios else make_guide
-        return made(grammar=self.model.grammar, max_steps=self.model.max_steps, **settings)
+    @property
+    def in_memory(self) -> str:
+        """Which of model, features, divergence and guide are objects that the folder cannot give back; in words."""
+        record = self.record
+        words = {"model": record["model"], "guide": record.get("guide", {}).get("kind", "")}
+        preset = record.get("preset", {})
+        words |= {"features": preset.get("features", ""), "divergence": preset.get("objective", "")}
+        return ", ".join(name for name, word in words.items() if word.startswith(IN_MEMORY))
 
+    @property
+    def target(self) -> Path:
+        """The folder of its target's images; of others what they are called."""
+        named = self.record["target"]
+        if named is None:
+            return Path("images in memory")
+        return Path(named) if isinstance(named, str) else Path(os.path.commonpath([Path(f).parent for f in named]))
+
+    @cached_property
+    def preset(self) -> Preset:
+        """What the run was begun with."""
+        return Preset.of(self.record["preset"])
+
+    @cached_property
+    def features(self) -> Features:
+        """The run's choice of features.
+
+        Raises:
+            RunError: they were in memory alone, or their file is gone or has changed.
+        """
+        word = self.preset.features
+        if self.parts.features is not None:
+            return self.parts.features
+        if word.startswith(IN_MEMORY):
+            raise self._only_in_memory("features", word)
+        self._unchanged_part(word)
+        return self.preset.make_features()
+
+    def build_network(self) -> FeatureNet:
+        """The feature network as it is before any training.
+
+        Raises:
+            DataError: see ``pretrained``.
+            ModelError: a user's own that cannot be built, or that is no network.
+        """
+        net = self.features.build(self.model)
+        return net if type(net).__module__.startswith("probscene.inference.") else CheckedNet(net)
+
+    def network(self) -> FeatureNet | None:
+        """The feature network with its state, once it is trained; None before. Loaded once.
+
+        Raises:
+            RunError: the file does not hold this network's state.
+        """
+        tensors = self.load("features") if self._network is None else None
+        if tensors is not None:
+            net = self.build_network()
+            load_state(net, tensors)
+            self._network = net
+        return self._network
+
+    @cached_property
+    def feature_names(self) -> tuple[str, ...]:
+        """One name a feature."""
+        return tuple((self._network or self.build_network()).names)
+
+    def divergence(self, net: FeatureNet) -> Divergence:
+        """What the fit descends, as it suits the network.
+
+        Raises:
+            RunError: it was in memory alone, or its file is gone or has changed.
+        """
+        word = self.preset.objective
+        if self.parts.divergence is not None:
+            chosen: Divergence = CheckedDivergence(self.parts.divergence)
+        elif word.startswith(IN_MEMORY):
+            raise self._only_in_memory("divergence", word)
+        else:
+            self._unchanged_part(word)
+            chosen = self.preset.divergence()
+        return self.features.divergence(net, chosen)
+
+    def new_guide(self) -> Guide:
+        """An untrained guide of the kind and size that the run was begun with; one that names no kind has an LSTM.
+
+        Raises:
+            RunError: its class was in memory alone, or its file is gone or has changed.
+            ModelError: see ``check_guide``.
+        """
+        model = self.model
+        settings = {"kind": "lstm", **self.record["guide"]}
+        make, kind = self.parts.guide, settings["kind"]
+        if make is None and kind.startswith(IN_MEMORY):
+            raise self._only_in_memory("guide", kind)
+        if make is None and is_file_part(kind):
+            self._unchanged_part(kind)
+            make = as_guide_maker(load_part(kind))
+        if model.scenarios:
+            made = ScenarioGuide(model.grammar, model.max_steps, make=make, **settings)
+        elif make is not None:
+            made = make(model.grammar, model.max_steps)
+        else:
+            return make_guide(grammar=model.grammar, max_steps=model.max_steps, **settings)
+        return made if make is None else check_guide(made, model.max_steps)
+
+    @cached_property
     def guide(self) -> Guide:
         """The learnt guide.
 
@@ -160,38 +250,59 @@ class Run:
             raise RunError(f"Expected a guide for model {self.model.name} in {self.path}, actual another.") from error
         return guide.eval()
 
-    def guide_hash(self) -> str:
-        """SHA-256 of the learnt guide's file, hexadecimal; provenance names it."""
-        return _sha256(self.path / "guide.safetensors")
-
-    def load(self, name: str) -> dict[str, Tensor] | None:
-        """The tensors of ``name.safetensors``, or None where there is no such file.
+    def check_finished(self) -> None:
+        """See that there is a learnt guide.
 
         Raises:
-            RunError: the file is damaged.
+            RunError: see ``guide``.
         """
-        file = self.path / f"{name}.safetensors"
-        if not file.is_file():
-            return None
-        try:
-            return safetensors.torch.load_file(file)
-        except (safetensors.SafetensorError, OSError) as error:
-            raise RunError(f"Expected tensors in {file}, actual a damaged file ({error}); delete it.") from error
+        _ = self.guide
 
-    def save(self, name: str, tensors: dict[str, Tensor]) -> None:
-        """Write ``name.safetensors``, whole or not at all."""
-        # As bytes: safetensors' own writing says neither OSError nor why where the disk is full.
-        whole = safetensors.torch.save({key: value.detach().contiguous() for key, value in tensors.items()})
-        write_whole(self.path / f"{name}.safetensors", lambda temporary: temporary.write_bytes(whole))
+    def _only_in_memory(self, what: str, word: str) -> RunError:
+        return RunError(
+            f"Expected the {what} that the run in {self.path} was begun with, actual only its name, "
+            f"{word.removeprefix(IN_MEMORY)}: it was an object in memory. Open the run from Python: "
+            f"Run.open({str(self.path)!r}, {what}=...)."
+        )
+
+    def _unchanged_part(self, word: str) -> None:
+        if is_file_part(word):
+            self._unchanged(part_file(word), self.record.get("parts", {}).get(str(part_file(word))), "part's")
+
+    def _unchanged(self, file: Path, digest: str | None, what: str) -> None:
+        if digest is not None and (not file.is_file() or file_digest(file) != digest):
+            kept = f"A copy is in {self.path / 'model.py'}: put it back, or fit again." if what == "model" else ""
+            raise RunError(
+                f"Expected the {what} file {file} as it was when {self.path} was fitted, actual a missing or changed "
+                f"file. {kept or 'Put it back, or fit again.'}"
+            )
+
+
+def state_of(net: FeatureNet) -> dict[str, Tensor]:
+    """What a run keeps of a feature network: a module's state, of anything else nothing."""
+    module = inner(net)
+    return module.state_dict() if isinstance(module, nn.Module) else {}
+
+
+def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
+    """The reverse of ``state_of``; the network is then ready for use.
+
+    Raises:
+        RunError: the state is another network's.
+    """
+    module = inner(net)
+    if not isinstance(module, nn.Module):
+        return
+    try:
+        module.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise RunError(
+            f"Expected the state of a {type(module).__name__}, actual another network's; put the features back as they "
+            "were when the run was begun, or fit again."
+        ) from error
+    module.eval()
 
 
 def is_run(path: str) -> bool:
     """Whether a command's MODEL_OR_RUN names a run folder."""
     return path not in BUILT_IN and (Path(path) / "run.json").is_file()
-
-
-def _sha256(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise ModelError(f"Could not read {path}: {error.strerror}.") from error

@@ -5,34 +5,33 @@ Axis letters: N scenes, L images, D features, C H W.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
 
-from probscene.dataset import ImageFolder
+from probscene.dataset import Images
 from probscene.errors import RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.threads import threads
 
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..loading import renderer_for
-from .observer import RENDERED_AT_ONCE, feature_net
-from .presets import Preset
-from .run import Run
+from .observer import RENDERED_AT_ONCE
+from .run import RunFolder
 
 Each = Callable[[int], None]
 """Told how many more images are done."""
 
 
-def fingerprint(target: ImageFolder) -> Tensor:
+def fingerprint(target: Images) -> Tensor:
     """Of the images, ``(32,)`` uint8: as a run's tensors keep what says which images they are of."""
     return torch.tensor(list(bytes.fromhex(target.fingerprint)), dtype=torch.uint8)
 
 
-def kept_features(run: Run, target: ImageFolder | None) -> Tensor | None:
+def kept_features(run: RunFolder, target: Images | None) -> Tensor | None:
     """The features ``(L, D)`` of its images that the fit kept, in the network's units; None where there are none, or
     where the target's images are others. Without a target they are the fit's."""
     kept = run.load("real")
@@ -50,11 +49,13 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
         yield as_written(model, render(scenes.drawing[: num - first]).image)
 
 
-def features_of(run: Run, policy: Policy, num: int, net: FeatureNet, seed: int = 0, each: Each | None = None) -> Tensor:
+def features_of(
+    run: RunFolder, policy: Policy, num: int, net: FeatureNet, seed: int = 0, each: Each | None = None
+) -> Tensor:
     """Features ``(num, D)`` of rendered scenes with structures from ``policy``; the same for the same seed.
 
     Args:
-        policy: ``run.model.prior``, ``run.guide()`` or any other over the model's grammar.
+        policy: ``run.model.prior``, ``run.guide`` or any other over the model's grammar.
         net: such as ``network`` gives.
 
     Raises:
@@ -64,7 +65,7 @@ def features_of(run: Run, policy: Policy, num: int, net: FeatureNet, seed: int =
         return embed_all(net, images_of(run.model, policy, num, seed), each)
 
 
-def features_in(run: Run, images: ImageFolder, net: FeatureNet, each: Each | None = None) -> Tensor:
+def features_in(run: RunFolder, images: Images, net: FeatureNet, each: Each | None = None) -> Tensor:
     """Features ``(L, D)`` of real images.
 
     Raises:
@@ -74,21 +75,19 @@ def features_in(run: Run, images: ImageFolder, net: FeatureNet, each: Each | Non
         return embed_all(net, images.batches(RENDERED_AT_ONCE), each)
 
 
-def own_net(run: Run) -> FeatureNet:
+def own_net(run: RunFolder) -> FeatureNet:
     """The feature network that the run has trained.
 
     Raises:
         RunError: it is not trained yet.
     """
-    tensors = run.load("features")
-    if tensors is None:
+    net = run.network()
+    if net is None:
         raise RunError(f"Expected the feature network in {run.path}, actual none; go on with --resume.")
-    net = feature_net(Preset.of(run.record["preset"]), run.model)
-    net.load_state_dict(tensors)
-    return net.eval()
+    return net
 
 
-def network(choice: str, run: Run) -> tuple[str, FeatureNet]:
+def network(choice: str, run: RunFolder) -> tuple[str, FeatureNet]:
     """A feature network and its name, from ``run`` or one of ``names.CHOICES``.
 
     Raises:
@@ -102,14 +101,3 @@ def network(choice: str, run: Run) -> tuple[str, FeatureNet]:
     from probscene.inference.features.pretrained import pretrained  # torchvision takes seconds to import
 
     return name, pretrained(choice)
-
-
-@contextmanager
-def threads(number: int) -> Iterator[None]:
-    """So many of torch's threads inside."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

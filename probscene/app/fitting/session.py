@@ -1,4 +1,4 @@
-"""A fit as a person runs it: begun or taken up again, shown, and timed.
+"""A fit from its beginning to its end: begun or taken up again, and timed.
 
 ``timing.json`` in the run folder holds the seconds that each stage has taken, over all sittings that were not killed.
 """
@@ -6,41 +6,54 @@
 import dataclasses
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import probscene
 from probscene.checks import check
-from probscene.dataset import ImageFolder
+from probscene.dataset import ImageFolder, Images
 from probscene.errors import ModelError, RunError
+from probscene.image_array import ImageArray
+from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
+from probscene.sampling import seed_everything
+from probscene.threads import cores
 
 from ..files import write_json
 from ..loading import lasting_reference, load_model
+from ..modules import file_digest
 from ..progress import Display
-from . import fit
-from .presets import TRAINED, Preset
-from .run import Run
+from .fit import check_target, fit, open_target
+from .parts import Parts, is_file_part, part_file
+from .presets import Preset
+from .run import RunFolder
+from .storage import check_free
 
 TIMING = "timing.json"
 STAGES = ("reading", "features", "target", "pretraining", "structure")
 
+Target = Path | str | Sequence[Path | str] | Any
+"""A folder, a list of files, an array or a dataset of images, see ``open_images``."""
 
-def checked_model(reference: str, assets: Path | None = None) -> SceneModel:
+
+def checked_model(model: str | SceneModel, assets: Path | None = None) -> SceneModel:
     """A model without faults, drawn with a folder of assets where one is named.
 
     Raises:
         ModelError: it does not load, or ``check`` finds faults.
     """
-    model = load_model(reference, assets)
-    faults = check(model).faults
+    loaded = model if isinstance(model, SceneModel) else load_model(model, assets)
+    faults = check(loaded).faults
     if faults:
-        raise ModelError(f"Expected a model without faults, actual {reference}: {' '.join(faults)}")
-    return model
+        name = loaded.name if isinstance(model, SceneModel) else model
+        raise ModelError(f"Expected a model without faults, actual {name}: {' '.join(faults)}")
+    return loaded
 
 
 def begin(
-    model: str,
-    target: Path,
+    model: str | SceneModel,
+    target: Target,
     out: Path,
     preset: Preset,
     seed: int,
@@ -48,17 +61,46 @@ def begin(
     threads: int | None,
     show: Display,
     assets: Path | None = None,
-) -> tuple[Run, ImageFolder]:
-    """A new run; nothing is written before the model, the folder and every image in it are found to be good.
+    parts: Parts | None = None,
+    make: type[RunFolder] = RunFolder,
+) -> tuple[RunFolder, Images]:
+    """A new run; nothing is written before the model, the target and every image in it are found to be good.
+
+    Args:
+        threads: of torch; all that this process may use where None. Another number rounds differently, so it is
+            recorded.
+        assets: a folder that the model is drawn with.
+        parts: what the user brought as objects.
+        make: the class of the run.
 
     Raises:
-        ProbsceneError: see ``checked_model``, ``ImageFolder`` and ``Run.create``.
+        ProbsceneError: see ``checked_model``, ``open_images``, ``check_target`` and ``RunFolder.create``.
     """
-    Run.check_free(out)
+    check_free(out)
     loaded = checked_model(model, assets)
     images = open_images(target, loaded, skip_bad, show)
-    fit.check_target(images)
-    return fit.create(model, target, out, preset, seed, skip_bad, threads, assets), images
+    check_target(images)
+    files = {part_file(word) for word in (preset.features, preset.objective, preset.guide) if is_file_part(word)}
+    record = {
+        "version": probscene.__version__,
+        "target": _lasting_target(target),
+        "skip_bad": skip_bad,
+        "seed": seed,
+        "threads": threads or cores(),
+        "preset": dataclasses.asdict(preset),
+        "guide": preset.guide_settings(),
+    }
+    if files:
+        record["parts"] = {str(file): file_digest(file) for file in sorted(files)}
+    # Built before the folder is, so that a wrong one leaves none behind.
+    run = make(out, record, loaded, parts)
+    seed_everything(batch_seed(seed, 0))
+    net = run.build_network()
+    if is_file_part(preset.guide) or (parts is not None and parts.guide is not None):
+        run.new_guide()
+    run = make.create(out, model, record, assets, loaded, parts)
+    run.built = net
+    return run, images
 
 
 def resume(
@@ -68,22 +110,24 @@ def resume(
     target: Path | None = None,
     preset: Preset | None = None,
     assets: Path | None = None,
+    make: type[RunFolder] = RunFolder,
     **settings: Any,
-) -> tuple[Run, ImageFolder | None]:
+) -> tuple[RunFolder, Images | None]:
     """A run that was begun, and its images; no images where the fit is finished.
 
     Args:
         model, target, preset, assets, settings: what the run must have been begun with, where it is not None; the
             settings are ``seed``, ``skip_bad`` and ``threads``.
+        make: the class of the run.
 
     Raises:
         RunError: there is no run, or it was begun with something else.
         DataError: see ``ImageFolder``.
     """
-    run = Run.open(out)
+    run = make.at(out)
     given = {
         "model": None if model is None else lasting_reference(model),
-        "target": None if target is None else str(target.resolve()),
+        "target": None if target is None else str(Path(target).resolve()),
         "assets_folder": None if assets is None else os.path.abspath(assets),
         **settings,
     }
@@ -91,41 +135,40 @@ def resume(
     before = {key: run.record.get(key) for key in given}
     if preset is not None:  # field by field, so that the message names the one that differs
         given |= dataclasses.asdict(preset)
-        before |= dataclasses.asdict(Preset.of(run.record["preset"]))
+        before |= dataclasses.asdict(run.preset)
     for key, value in given.items():
         if value != before[key]:
             raise RunError(
                 f"Expected the {key} that the run in {out} was begun with ({before[key]}), actual {value}; leave it "
                 "out with --resume, or begin another run."
             )
-    if is_finished(run):
+    if run.is_finished:
         return run, None
-    return run, open_images(Path(run.record["target"]), run.model, run.record["skip_bad"], show)
+    images = open_target(run, show)
+    _say_notes(images, show)
+    return run, images
 
 
-def carry_out(run: Run, target: ImageFolder | None, show: Display) -> None:
+def carry_out(
+    run: RunFolder, target: Images | None, show: Display, cache: Path | None = None, use_cache: bool = True
+) -> None:
     """Finish the fit; the time is kept even where it is interrupted.
+
+    Args:
+        cache, use_cache: see ``fit.fit``.
 
     Raises:
         ProbsceneError: see ``fit.fit``.
     """
     before = timing(run)
-    features = run.record["preset"]["features"]
-    if features != "count":
-        show.units["features"] = "epochs" if features in TRAINED else "structures"
     try:
-        fit.fit(run, show, target)
+        fit(run, show, target, cache, use_cache, show.say)
     finally:
         spent = {stage: before.get(stage, 0.0) + show.seconds.get(stage, 0.0) for stage in STAGES}
         write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
 
 
-def is_finished(run: Run) -> bool:
-    """Whether the guide is learnt."""
-    return (run.path / "guide.safetensors").is_file()
-
-
-def timing(run: Run) -> dict[str, float]:
+def timing(run: RunFolder) -> dict[str, float]:
     """Seconds by stage, as far as they are known."""
     try:
         return json.loads((run.path / TIMING).read_text(encoding="utf-8"))
@@ -133,13 +176,42 @@ def timing(run: Run) -> dict[str, float]:
         return {}
 
 
-def open_images(path: Path, model: SceneModel, skip_bad: bool, show: Display) -> ImageFolder:
-    """A folder of images as a model reads them; what a person should know about it is said.
+def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display) -> Images:
+    """Images as a model reads them; what a person should know about them is said.
+
+    Args:
+        target: a folder, a list of files, or images in memory, see ``ImageArray``; images that are open already.
 
     Raises:
-        DataError: see ``ImageFolder``.
+        DataError: see ``ImageFolder`` and ``ImageArray``.
     """
-    images = ImageFolder(path, model.canvas, model.channels, skip_bad, show.stage("reading"))
+    if isinstance(target, Images):
+        return target
+    if _is_folder(target) or _is_list_of_files(target):
+        images: Images = ImageFolder(target, model.canvas, model.channels, skip_bad, show.stage("reading"))
+    else:
+        images = ImageArray(target, model.canvas, model.channels)
+    _say_notes(images, show)
+    return images
+
+
+def _say_notes(images: Images, show: Display) -> None:
     for note in images.notes:
         show.say(f"Note: {note}")
-    return images
+
+
+def _is_folder(target: Target) -> bool:
+    return isinstance(target, str | os.PathLike)
+
+
+def _is_list_of_files(target: Target) -> bool:
+    return isinstance(target, list | tuple) and all(isinstance(file, str | os.PathLike) for file in target)
+
+
+def _lasting_target(target: Target) -> str | list[str] | None:
+    """What a run records of its target: paths that mean the same from every folder; None for images in memory."""
+    if isinstance(target, ImageFolder):
+        target = target.paths if target.listed else target.path
+    if _is_folder(target):
+        return str(Path(target).resolve())
+    return [str(Path(file).resolve()) for file in target] if _is_list_of_files(target) else None

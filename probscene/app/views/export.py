@@ -20,7 +20,7 @@ def view(model_or_run: str, out: Path, num: int = 1, seed: int = 0, assets: Path
         assets: see ``preview.opened``.
 
     Raises:
-        ProbsceneError: a number that is not positive, several scenes in a .glb; see ``load_model`` and ``Run.guide``.
+        ProbsceneError: a number that is not positive, several scenes in a .glb; see ``load_model`` and ``RunFolder``.
         DataError: another suffix, or a .glb of a model in 2D.
         MachineError: the file cannot be written, or Rerun is not installed.
     """

@@ -13,7 +13,7 @@ from probscene.sampling import sample
 
 from ..chunks import chunk_randomness
 from ..files import make_folder
-from ..fitting.run import Run, is_run
+from ..fitting.run import RunFolder, is_run
 from ..loading import load_model, renderer_for
 from ..pictures import Pixels, colour_of, grid, pixels, write_picture
 
@@ -27,7 +27,7 @@ def preview(
         assets: see ``opened``.
 
     Raises:
-        ProbsceneError: a number that is not positive; see ``load_model`` and ``Run.guide``.
+        ProbsceneError: a number that is not positive; see ``load_model`` and ``RunFolder.guide``.
         DataError: ``out`` is a folder.
         MachineError: it cannot be written.
     """
@@ -52,7 +52,7 @@ def opened(model_or_run: str, assets: Path | None = None) -> tuple[SceneModel, P
         assets: a folder that a model is drawn with.
 
     Raises:
-        ProbsceneError: assets of a run, which has its own; see ``load_model`` and ``Run.guide``.
+        ProbsceneError: assets of a run, which has its own; see ``load_model`` and ``RunFolder.guide``.
     """
     if is_run(model_or_run):
         if assets is not None:
@@ -60,8 +60,8 @@ def opened(model_or_run: str, assets: Path | None = None) -> tuple[SceneModel, P
                 f"Expected a model with --assets, actual the run {model_or_run}, which is drawn with what it was "
                 "fitted with; leave --assets out."
             )
-        run = Run.open(Path(model_or_run))
-        return run.model, run.guide()
+        run = RunFolder.at(Path(model_or_run))
+        return run.model, run.guide
     model = load_model(model_or_run, assets)
     return model, model.prior
 

@@ -11,15 +11,16 @@ from typing import Any
 
 from PIL import Image
 
-from probscene.dataset import ImageFolder
-from probscene.errors import DataError
+from probscene.dataset import Images
+from probscene.errors import DataError, RunError
 
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.judge import SCENES, Judged, judge
 from ..evaluation.labels import read_labels
 from ..files import make_folder, write_text
 from ..fitting import session
-from ..fitting.run import Run
+from ..fitting.fit import open_target
+from ..fitting.run import RunFolder
 from ..pictures import Pixels, grid, pixels, shrunk
 from ..progress import STAGES, Display
 from . import charts, tables, verdict_text
@@ -35,7 +36,7 @@ LEGEND = {
 
 
 def report(
-    run: Run,
+    run: RunFolder,
     show: Display,
     out: Path | None = None,
     labels: Path | None = None,
@@ -58,11 +59,11 @@ def report(
         DataError: labels that do not fit the target. Without labels, a target that is gone only leaves a gap.
         MachineError: the page cannot be written.
     """
-    run.guide()
+    run.check_finished()
     images, absent = None, ""
     try:
-        images = session.open_images(Path(run.record["target"]), run.model, run.record["skip_bad"], show)
-    except DataError as error:
+        images = open_target(run, show)
+    except (DataError, RunError) as error:
         if labels is not None:
             raise
         absent = str(error)
@@ -73,9 +74,9 @@ def report(
 
 
 def write(
-    run: Run,
+    run: RunFolder,
     evaluation: Evaluation,
-    images: ImageFolder | None,
+    images: Images | None,
     out: Path | None = None,
     absent: str = "",
     judged: Judged | None = None,
@@ -84,8 +85,8 @@ def write(
     out = Path(out) if out is not None else run.path / "report.html"
     make_folder(out.parent)
     record, model = run.record, run.model
-    target = f"{len(images)} target images in {images.path}" if images else f"target {record['target']}"
-    page = Template(resources.files("probscene.app").joinpath("report.html").read_text(encoding="utf-8"))
+    target = f"{len(images)} target images in {images.path}" if images else f"target {run.target}"
+    page = Template(resources.files("probscene.app.views").joinpath("report.html").read_text(encoding="utf-8"))
     write_text(
         out,
         page.substitute(
@@ -114,7 +115,7 @@ def write(
     return out
 
 
-def _trust(judged: Judged | None, images: ImageFolder | None) -> str:
+def _trust(judged: Judged | None, images: Images | None) -> str:
     if judged is None or images is None:
         return "<p>There is no verdict: no scenes were rendered to compare with target images.</p>"
     if judged.trust is None:
@@ -140,7 +141,7 @@ def _headline(evaluation: Evaluation) -> str:
     return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>'
 
 
-def _samples(run: Run, images: ImageFolder | None, absent: str) -> str:
+def _samples(run: RunFolder, images: Images | None, absent: str) -> str:
     model, parts = run.model, []
     if images is None:
         parts.append(f"<p>{html.escape(absent or 'The target images were not read.')}</p>")
@@ -148,7 +149,7 @@ def _samples(run: Run, images: ImageFolder | None, absent: str) -> str:
         step = max(1, len(images) // SAMPLES)
         some = [images.load(i) for i in range(0, len(images), step)][:SAMPLES]
         parts.append(_picture([pixels(image[None])[0] for image in some], "Target: some of the images"))
-    for policy, caption in ((model.prior, "Prior: before learning"), (run.guide(), "Learnt: structures of the target")):
+    for policy, caption in ((model.prior, "Prior: before learning"), (run.guide, "Learnt: structures of the target")):
         parts.append(_picture(pixels(scenes(model, policy, SAMPLES, 0).image), caption))
     return "".join(parts)
 
@@ -190,12 +191,12 @@ def _figures(evaluation: Evaluation) -> str:
     return "".join(parts)
 
 
-def _log(run: Run) -> list[dict[str, Any]]:
+def _log(run: RunFolder) -> list[dict[str, Any]]:
     path = run.path / "log.jsonl"
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
-def _timing(run: Run) -> str:
+def _timing(run: RunFolder) -> str:
     spent = session.timing(run)
     if not spent:
         return "<p>No times were recorded.</p>"

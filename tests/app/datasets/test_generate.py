@@ -22,7 +22,7 @@ import probscene
 from probscene.app.datasets import coco
 from probscene.app.datasets.generate import generate, generate_scenes, png
 from probscene.app.datasets.provenance import remake
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, MachineError, ProbsceneError, SamplingError
@@ -48,9 +48,9 @@ def rng_states() -> str:
     return repr([states["torch"].tolist(), states["random"], states["numpy"][1].tolist(), states["numpy"][2:]])
 
 
-def a_run(path: Path, plates: float) -> Run:
+def a_run(path: Path, plates: float) -> RunFolder:
     """A run with a guide that nothing has taught; ``plates`` is a bias towards more of them."""
-    run = Run.create(path, str(PLATES), {"guide": GUIDE})
+    run = RunFolder.create(path, str(PLATES), {"guide": GUIDE})
     guide = LSTMGuide(run.model.grammar, run.model.max_steps, **GUIDE)
     guide.out.bias.data[run.model.grammar.rules.index(Rule("Plates", "Plate", "Plates"))] += plates
     run.save("guide", guide.state_dict())
@@ -58,7 +58,7 @@ def a_run(path: Path, plates: float) -> Run:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Run:
+def run(tmp_path_factory) -> RunFolder:
     torch.manual_seed(0)
     return a_run(tmp_path_factory.mktemp("run") / "run", 0.5)
 
@@ -306,7 +306,7 @@ PROGRAM = """
 import multiprocessing, sys, time
 from pathlib import Path
 from probscene.app.datasets.generate import generate
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 
 def progress(done, num):
     if 0 < done < num:
@@ -314,7 +314,7 @@ def progress(done, num):
         time.sleep(300)
 
 if __name__ == "__main__":
-    generate(Run.open(Path(sys.argv[1])), 130, Path(sys.argv[2]), seed=3, workers=2, progress=progress)
+    generate(RunFolder.at(Path(sys.argv[1])), 130, Path(sys.argv[2]), seed=3, workers=2, progress=progress)
 """
 
 

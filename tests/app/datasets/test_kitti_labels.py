@@ -19,7 +19,7 @@ from probscene.app.datasets.kitti_labels import read_kitti, read_objects
 from probscene.app.evaluation.labels import SEEN, Labels, read_labels
 from probscene.app.evaluation.structure_counts import StructureCounts, sampled
 from probscene.app.evaluation.visible import SHOWN, counted, shown
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
@@ -204,7 +204,7 @@ def test_the_commands_take_the_folder(call, fitted, target, labelled, tmp_path):
         assert done.code == 0, done.err
         record = json.loads((tmp_path / "e.json").read_text())
         assert record["sources"]["truth"]["mean_number"] == target.counts.sum() / 40
-        model = Run.open(fitted).model
+        model = RunFolder.at(fitted).model
         assert record["sources"]["prior"]["mean_number"] == shown(model, model.prior, 100, 0, 0.0).sum() / 100
         assert SEEN in record["notes"] and SEEN in done.out
         assert "40 DontCare" in record["notes"][-1] and "40 DontCare" in done.out

@@ -20,7 +20,7 @@ from torchvision.models.detection import ssdlite320_mobilenet_v3_large
 from probscene.app.datasets import scene_dataset
 from probscene.app.datasets.generate import generate, generate_scenes
 from probscene.app.datasets.scene_dataset import SceneDataset
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.errors import ModelError, ProbsceneError, RunError
 
@@ -90,13 +90,13 @@ def test_samples_are_what_generate_writes(model, samples, tmp_path):
 
 
 def test_samples_of_a_run_are_what_it_generates(fitted, tmp_path):
-    run = Run.open(fitted)
+    run = RunFolder.at(fitted)
     generate(run, 10, tmp_path / "out", seed=2)
     dataset = SceneDataset(fitted, 10, seed=2)
     assert dataset.classes == ("red", "blue") and dataset.model.name == "discs"
     agrees(list(dataset), tmp_path / "out")
     assert same(list(SceneDataset(run, 10, seed=2)), list(dataset))
-    assert same(list(SceneDataset(run.model, 10, seed=2, policy=run.guide())), list(dataset))
+    assert same(list(SceneDataset(run.model, 10, seed=2, policy=run.guide)), list(dataset))
 
 
 def test_grey_images_have_three_equal_channels(model, tmp_path):
@@ -259,6 +259,6 @@ def test_wrong_arguments(wrong, message):
 
 
 def test_an_unfinished_run_is_refused(tmp_path):
-    run = Run.create(tmp_path / "run", str(PLATES), {"guide": {"hidden": 8}})
+    run = RunFolder.create(tmp_path / "run", str(PLATES), {"guide": {"hidden": 8}})
     with pytest.raises(RunError, match="unfinished"):
         SceneDataset(run.path)

@@ -16,7 +16,7 @@ from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.likelihood import likelihood
 from probscene.app.evaluation.structure_counts import label
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.views.report import report, write
 from probscene.dataset import ImageFolder
@@ -45,7 +45,8 @@ def plates(call, discs, tmp_path_factory) -> SimpleNamespace:
     done = call("fit", PLATES, "--target", images, "--out", folder / "run", *discs.settings)
     assert done.code == 0, done.err
     opened = ImageFolder(images, model.canvas, model.channels)
-    return SimpleNamespace(run=Run.open(folder / "run"), images=images, lines=lines, opened=opened, structure=structure)
+    run = RunFolder.at(folder / "run")
+    return SimpleNamespace(run=run, images=images, lines=lines, opened=opened, structure=structure)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,7 @@ def test_labels_that_are_structures_tell_what_a_policy_makes_of_them(plates, fou
     model = plates.run.model
     rules = [json.loads(line)["rules"] for line in plates.lines.read_text(encoding="utf-8").splitlines()]
     each = [Derivation.of(model.grammar, torch.tensor([row])) for row in rules]
-    for name, policy in (("prior", model.prior), ("learnt", plates.run.guide())):
+    for name, policy in (("prior", model.prior), ("learnt", plates.run.guide)):
         with torch.no_grad():
             logp = np.array([policy.log_prob(one).item() for one in each])
         possible = np.isfinite(logp)

@@ -16,7 +16,7 @@ from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import Labels
 from probscene.app.evaluation.structure_counts import StructureCounts, count, sampled
 from probscene.app.fitting.presets import QUICK
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.views.comparison import picture, shown
 from probscene.dataset import ImageFolder
 from probscene.derivation import Derivation
@@ -43,7 +43,7 @@ def two(call, discs, fitted, target, tmp_path_factory) -> list[Path]:
 def untrained(folder: Path, model: str, seed: int, target: str = "images") -> Path:
     """A run whose guide learnt nothing, and which has seen no image."""
     record = {"guide": QUICK.guide_settings(), "preset": dataclasses.asdict(QUICK), "target": target, "seed": seed}
-    run = Run.create(folder, model, record)
+    run = RunFolder.create(folder, model, record)
     torch.manual_seed(seed)
     guide = run.new_guide()
     guide.out.bias.data[[k for k, rule in enumerate(run.model.grammar.rules) if not rule.rhs]] += 2.0  # short lists
@@ -52,12 +52,12 @@ def untrained(folder: Path, model: str, seed: int, target: str = "images") -> Pa
 
 
 @pytest.fixture(scope="module")
-def nested(tmp_path_factory) -> dict[str, Run]:
+def nested(tmp_path_factory) -> dict[str, RunFolder]:
     folder = tmp_path_factory.mktemp("nested")
     return open_runs([untrained(folder / name, str(PLATES), seed) for seed, name in enumerate("ab")])
 
 
-def truth_of(run: Run, num: int = 300) -> Labels:
+def truth_of(run: RunFolder, num: int = 300) -> Labels:
     torch.manual_seed(9)
     derivation, _ = derive_complete(run.model.grammar, run.model.prior, num, run.model.max_steps)
     return Labels(count(run.model, derivation), derivation)

@@ -15,7 +15,7 @@ from probscene.app.evaluation.evaluate import evaluate, network_counts
 from probscene.app.evaluation.labels import Labels, counts_of_dataset, read_counts, write_counts
 from probscene.app.evaluation.sources import Source
 from probscene.app.evaluation.structure_counts import StructureCounts, sampled
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
@@ -62,11 +62,11 @@ def test_structures_are_counted_as_their_distribution_says(discs):
 
 
 def test_distances_are_those_between_the_counts(fitted, target):
-    run = Run.open(fitted)
+    run = RunFolder.at(fitted)
     found = evaluate(run, opened(target.images), labels(target.counts), quiet, num=600)
     assert list(found.sources) == ["prior", "learnt", "truth", "estimate"]
     assert np.array_equal(found.sources["prior"].counts, structure_counts(run.model, run.model.prior, 600, 0))
-    assert np.array_equal(found.sources["learnt"].counts, structure_counts(run.model, run.guide(), 600, 0))
+    assert np.array_equal(found.sources["learnt"].counts, structure_counts(run.model, run.guide, 600, 0))
     assert found.sources["truth"].counts is target.counts
     measured = found.distances()
     for b in ("truth", "estimate"):
@@ -82,13 +82,13 @@ def test_distances_are_those_between_the_counts(fitted, target):
 
 
 def test_shares_of_no_objects_are_not_compared(fitted, target):
-    found = evaluate(Run.open(fitted), opened(target.images), labels(np.zeros((40, 2), np.int64)), quiet, num=50)
+    found = evaluate(RunFolder.at(fitted), opened(target.images), labels(np.zeros((40, 2), np.int64)), quiet, num=50)
     assert found.distance("prior", "truth")["classes"] is None
     json.dumps(found.record(), allow_nan=False)
 
 
 def test_the_estimate_is_what_the_network_counts(fitted, target, tmp_path):
-    run = Run.open(fitted)
+    run = RunFolder.at(fitted)
     kept = network_counts(run, opened(target.images), quiet)
     features = run.load("real")["features"]
     assert np.array_equal(kept.counts, np.rint(features[:, :2].numpy()).astype(int))
@@ -104,8 +104,8 @@ def test_the_estimate_is_what_the_network_counts(fitted, target, tmp_path):
 
 
 def test_a_network_that_does_not_count_gives_no_estimate(fitted, target):
-    run = Run.open(fitted)
-    paper = Run(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
+    run = RunFolder.at(fitted)
+    paper = RunFolder(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
     assert network_counts(paper, opened(target.images), quiet) is None
     assert list(evaluate(paper, None, None, quiet, num=20).sources) == ["prior", "learnt"]
 
@@ -115,7 +115,7 @@ def test_the_command_prints_and_writes_the_same(call, fitted, target, tmp_path):
     labelled = call(*words, "--labels", target.labels, "--json", tmp_path / "new" / "e.json")
     assert labelled.code == 0, labelled.err
     record = json.loads((tmp_path / "new" / "e.json").read_text())
-    expected = evaluate(Run.open(fitted), opened(target.images), labels(target.counts), quiet, num=500).record()
+    expected = evaluate(RunFolder.at(fitted), opened(target.images), labels(target.counts), quiet, num=500).record()
     assert record == json.loads(json.dumps(expected))
     measured = record["distances"]["truth"]
     for key in ("number", "classes", "number_wasserstein"):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from probscene.app.evaluation.image_distances import image_distances
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import features_in, features_of, own_net
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
@@ -15,8 +15,8 @@ from probscene.inference.judging.image_metrics import fid, kid
 
 
 @pytest.fixture(scope="module")
-def run(fitted) -> Run:
-    return Run.open(fitted)
+def run(fitted) -> RunFolder:
+    return RunFolder.at(fitted)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_figures_are_those_of_the_features(run, images):
     real = features_in(run, images, net)[torch.randperm(40, generator=torch.Generator().manual_seed(2))]
     sides = {
         "prior": features_of(run, run.model.prior, 15, net, 2),
-        "learnt": features_of(run, run.guide(), 15, net, 2),
+        "learnt": features_of(run, run.guide, 15, net, 2),
         "floor": real[15:30],
     }
     for source, side in sides.items():

@@ -13,7 +13,7 @@ from probscene.app.evaluation.judge import judge
 from probscene.app.evaluation.label_agreement import agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels, write_counts
 from probscene.app.evaluation.sources import Source
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
@@ -34,7 +34,7 @@ def fewer_looks():
         yield
 
 
-class Guided(Run):
+class Guided(RunFolder):
     """A run whose guide is any policy."""
 
     policy = None
@@ -111,7 +111,7 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
 
 
 def test_the_same_run_has_the_same_verdict(seeing, drawn):
-    run = Run.open(seeing)
+    run = RunFolder.at(seeing)
     one, other = (judge(run, drawn.target, quiet, 100) for _ in range(2))
     assert one.record() == other.record()
     assert all(np.array_equal(a, b) for a, b in zip(one.generated_unmatched, other.generated_unmatched, strict=True))
@@ -121,7 +121,7 @@ def test_the_same_run_has_the_same_verdict(seeing, drawn):
 def test_labels_say_whether_the_verdict_was_right(some, close, seeing, drawn, tmp_path):
     lines = drawn.labels.read_text().splitlines()
     (tmp_path / "c.csv").write_text("\n".join(lines[:61] if some else lines))
-    model = load_model(Run.open(seeing).record["model"])
+    model = load_model(RunFolder.at(seeing).record["model"])
     labels = read_labels(tmp_path / "c.csv", model, drawn.target, some)
     assert len(labels.structures) == (60 if some else IMAGES)
     run = guided(seeing, lambda m: m.target(0).prior if close else m.prior)
@@ -178,16 +178,16 @@ def test_too_few_images_have_no_verdict_and_are_still_compared(call, seeing, dra
 def test_images_that_are_all_the_same_have_no_verdict(seeing, drawn, tmp_path):
     for i in range(40):
         (tmp_path / f"{i}.png").write_bytes(drawn.target.paths[0].read_bytes())
-    found = judge(Run.open(seeing), ImageFolder(tmp_path, (64, 64), 3), quiet, 64)
+    found = judge(RunFolder.at(seeing), ImageFolder(tmp_path, (64, 64), 3), quiet, 64)
     assert found.trust is None and "identical" in found.absent
 
 
 def test_wrong_numbers_and_no_labels_at_all(call, seeing, drawn, tmp_path):
     with pytest.raises(ProbsceneError, match="at least 40 scenes to judge by, actual 39"):
-        judge(Run.open(seeing), drawn.target, quiet, 39)
+        judge(RunFolder.at(seeing), drawn.target, quiet, 39)
     (tmp_path / "c.csv").write_text("image,red,blue\n")
     with pytest.raises(DataError, match="a row for every image"):
-        read_labels(tmp_path / "c.csv", load_model(Run.open(seeing).record["model"]), drawn.target, some=True)
+        read_labels(tmp_path / "c.csv", load_model(RunFolder.at(seeing).record["model"]), drawn.target, some=True)
     short = "\n".join(drawn.labels.read_text().splitlines()[:20])
     (tmp_path / "c.csv").write_text(short)
     words = ["evaluate", seeing, "--target", drawn.target.path, "--num", 100, "--scenes", 0]

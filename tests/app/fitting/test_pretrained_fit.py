@@ -8,9 +8,8 @@ import safetensors.torch
 import torch
 from torchvision.models import inception_v3
 
-from probscene.app.fitting.observer import feature_net
 from probscene.app.fitting.presets import QUICK, preset
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import own_net
 from probscene.dataset import ImageFolder
 from probscene.errors import RunError
@@ -27,7 +26,7 @@ def run(call, discs, target, tmp_path_factory):
     words = ["fit", discs.file, "--target", target.images, "--out", out, "--features", "efficientnet", *WORDS]
     done = call(*words)
     assert done.code == 0, done.err
-    return Run.open(out), words
+    return RunFolder.at(out), words
 
 
 def test_the_network_is_recorded_and_only_its_projection_kept(run, target):
@@ -89,7 +88,7 @@ def test_further_views_of_the_target_are_learnt_from_and_not_judged(run, call, t
     run, words = run
     again = tmp_path / "again"
     assert call(*[again if word == run.path else word for word in words], "--set", "views=3").code == 0
-    one, other = run.load("real"), Run.open(again).load("real")
+    one, other = run.load("real"), RunFolder.at(again).load("real")
     assert torch.equal(one["features"], other["features"]) and other["views"].shape == (80, 3) and "views" not in one
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     assert torch.allclose(embed_all(net, images.batches(64, 2)), other["views"][40:], atol=1e-4)
@@ -128,11 +127,11 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
         torch.manual_seed(seed)
         weights = inception_v3(weights=None, aux_logits=False, init_weights=False).state_dict()
         safetensors.torch.save_file(weights, tmp_path / "w.safetensors")
-        net = feature_net(chosen, model)
+        net = chosen.make_features().build(model)
         if seed == 0:
             assert net.embed(torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).shape == (2, 8)
             state = net.state_dict()
-            feature_net(chosen, model).load_state_dict(state)
+            chosen.make_features().build(model).load_state_dict(state)
     with pytest.raises(RunError, match="put that file back"):
         net.load_state_dict(state)
 
@@ -141,7 +140,7 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
     words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=2"]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
     assert done.code == 0 and "Looking at images" in done.err and "epochs" in done.err, done.err
-    run = Run.open(tmp_path / "run")
+    run = RunFolder.at(tmp_path / "run")
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
     assert len(net.names) == len(run.model.classes) + 3

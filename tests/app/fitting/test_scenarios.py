@@ -10,7 +10,7 @@ import torch
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.evaluation.labels import counts_of_dataset, write_counts
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.errors import ModelError
 from probscene.inference.guides.scenario import ScenarioGuide
@@ -54,8 +54,8 @@ def test_a_reference_names_all_scenarios_some_or_one():
 
 
 def test_one_guide_a_scenario_is_learnt(joint_run):
-    run = Run.open(joint_run)
-    guide = run.guide()
+    run = RunFolder.at(joint_run)
+    guide = run.guide
     assert isinstance(guide, ScenarioGuide) and len(guide.guides) == 2
     assert run.record["model"] == f"{STREETS.resolve()}:row,yard"
 
@@ -66,7 +66,7 @@ def test_a_run_goes_on_to_the_same_bits(tmp_path, call, discs, joint_target, joi
     assert call(*words).code == 0
     wrong = call(*words[:-1], words[-1], "--resume", "--seed", "3")
     assert wrong.code == 2
-    one, other = (Run.open(path).guide().state_dict() for path in (joint_run, tmp_path / "run"))
+    one, other = (RunFolder.at(path).guide().state_dict() for path in (joint_run, tmp_path / "run"))
     assert all(torch.equal(one[key], other[key]) for key in one)
     another = call("fit", STREETS, "--scenarios", "row", "--out", tmp_path / "run", "--resume")
     assert another.code == 2 and "streets.py:row,yard), actual" in another.err
@@ -75,7 +75,7 @@ def test_a_run_goes_on_to_the_same_bits(tmp_path, call, discs, joint_target, joi
 def test_datasets_hold_scenes_of_every_scenario(tmp_path, call, joint_run):
     done = call("generate", joint_run, "--num", 40, "--out", tmp_path / "data")
     assert done.code == 0, done.err
-    model = Run.open(joint_run).model
+    model = RunFolder.at(joint_run).model
     lines = [json.loads(line) for line in (tmp_path / "data" / "provenance.jsonl").read_text().splitlines()]
     first = [line["derivation"].split(";")[0] for line in lines]
     assert set(first) == {"Scenario -> Scene-row", "Scenario -> Scene-yard"}

@@ -7,22 +7,22 @@ import torch
 
 from probscene.app.datasets.generate import generate
 from probscene.app.fitting import scene_features as seen
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.inference.features.base import embed_all
 
 
 @pytest.fixture(scope="module")
-def run(fitted) -> Run:
-    return Run.open(fitted)
+def run(fitted) -> RunFolder:
+    return RunFolder.at(fitted)
 
 
 def test_scenes_are_those_that_generate_writes(run, tmp_path):
     generate(run, 70, tmp_path / "data", seed=3, format="images")
     files = sorted((tmp_path / "data" / "images").iterdir())
     written = np.stack([cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in files])
-    batches = list(seen.images_of(run.model, run.guide(), 70, seed=3))
+    batches = list(seen.images_of(run.model, run.guide, 70, seed=3))
     drawn = torch.cat(batches)
     assert drawn.dtype == torch.uint8 and max(map(len, batches)) <= 64
     assert np.array_equal(drawn.permute(0, 2, 3, 1).numpy(), written)
@@ -56,4 +56,4 @@ def test_networks_by_their_words(run, tmp_path):
     with pytest.raises(DataError, match="Expected a file of weights"):
         seen.network(f"inception={tmp_path / 'none.pth'}", run)
     with pytest.raises(RunError, match="--resume"):
-        seen.network("run", Run(tmp_path, run.record))
+        seen.network("run", RunFolder(tmp_path, run.record))

@@ -7,7 +7,7 @@ import pytest
 
 from probscene.app.evaluation.labels import read_labels
 from probscene.app.evaluation.structure_counts import sampled
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
 from probscene.inference.judging.metrics import histogram, total_variation
@@ -30,10 +30,10 @@ def test_only_what_is_labelled_is_compared(labels, call, fitted, target, tmp_pat
     done = call("evaluate", fitted, "--target", target.images, "--labels", file, "--num", 500, "--scenes", 0, *more)
     assert done.code == 0, done.err
     found = json.loads((tmp_path / "e.json").read_text())
-    run, name = Run.open(fitted), ("red", "blue")[which]
+    run, name = RunFolder.at(fitted), ("red", "blue")[which]
     assert found["classes"] == [name]
     assert found["sources"]["truth"]["mean_number"] == target.counts[:, which].mean()
-    for source, policy in (("prior", run.model.prior), ("learnt", run.guide())):
+    for source, policy in (("prior", run.model.prior), ("learnt", run.guide)):
         counts = sampled(run.model, policy, 500, 0).counts[:, which]
         assert found["sources"][source]["mean_number"] == counts.mean()
         expected = total_variation(histogram(counts), histogram(target.counts[:, which]))
@@ -52,7 +52,7 @@ def test_runs_are_compared_by_what_is_labelled(labels, call, fitted, target, tmp
 
 def test_columns_that_are_no_classes_are_refused(labels, fitted, target):
     file, _ = labels
-    model = Run.open(fitted).model
+    model = RunFolder.at(fitted).model
     images = ImageFolder(target.images, model.canvas, model.channels)
     assert np.array_equal(read_labels(file, model, images).structures.counts[:, 0], target.counts[:, labels[1]])
     header, *rows = file.read_text().split()

@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from probscene.app.chunks import chunk_randomness
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model, renderer_for
 from probscene.app.views.scene_parts import camera_matrix, intrinsics, pieces
 from probscene.sampling import sample
@@ -140,6 +140,6 @@ def test_a_folder_is_made(tmp_path, call, lots):
 
 
 def test_a_fit_that_is_not_finished_cannot_be_seen(tmp_path, call):
-    Run.create(tmp_path / "run", str(LOTS), {"guide": {"hidden": 8}})
+    RunFolder.create(tmp_path / "run", str(LOTS), {"guide": {"hidden": 8}})
     done = call("view", tmp_path / "run", "--out", tmp_path / "scene.rrd")
     assert done.code == 2 and "Expected a finished fit" in done.err and not (tmp_path / "scene.rrd").exists()

@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 import pytest
 from PIL import Image
 
-from probscene.app.fitting.run import Run
+from probscene.app.fitting.run import RunFolder
 from probscene.app.progress import Display
 from probscene.app.views import charts
 from probscene.app.views.report import report
@@ -71,7 +71,7 @@ def test_the_page_shows_target_prior_and_learnt(text):
 
 
 def test_the_page_shows_figures_curves_grammar_time_and_configuration(text, fitted):
-    run = Run.open(fitted)
+    run = RunFolder.at(fitted)
     words = Page(text).text
     assert str(run.model.grammar) in words
     assert text.count("<svg") == 2 + 4
@@ -109,22 +109,22 @@ def test_names_are_escaped_and_a_target_that_is_gone_leaves_a_gap(fitted, target
     shutil.copytree(fitted, folder)
     record = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(record | {"target": str(tmp_path / "<i>gone")}))
-    path = report(Run.open(folder), Display(), num=100, judged_by=0)
+    path = report(RunFolder.at(folder), Display(), num=100, judged_by=0)
     page = Page(path.read_text(encoding="utf-8"))
     assert "<i>gone, which is not there" in page.text and "<b>&amp;" in page.text
     assert page.text.count("before learning") == 1 and "Target: some" not in page.text
     with pytest.raises(DataError, match="not there"):
-        report(Run.open(folder), Display(), labels=target.labels, num=100, judged_by=0)
+        report(RunFolder.at(folder), Display(), labels=target.labels, num=100, judged_by=0)
 
 
 def test_a_run_without_log_and_times_has_a_report_and_an_unfinished_one_has_none(fitted, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
     for name in ("log.jsonl", "timing.json"):
         (tmp_path / "run" / name).unlink()
-    text = report(Run.open(tmp_path / "run"), Display(), num=100, judged_by=0).read_text(encoding="utf-8")
+    text = report(RunFolder.at(tmp_path / "run"), Display(), num=100, judged_by=0).read_text(encoding="utf-8")
     assert "No times were recorded." in text and text.count("<svg") == 2
     (tmp_path / "run" / "report.html").unlink()
     (tmp_path / "run" / "guide.safetensors").unlink()
     with pytest.raises(RunError, match="finished"):
-        report(Run.open(tmp_path / "run"), Display())
+        report(RunFolder.at(tmp_path / "run"), Display())
     assert not (tmp_path / "run" / "report.html").exists()

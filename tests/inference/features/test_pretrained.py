@@ -19,7 +19,7 @@ from torchvision.transforms.functional import normalize
 
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.features.base import pretrained
+from probscene.inference.features import pretrained
 from probscene.inference.features.pretrained import EfficientNetLite, Inception, ResNet50
 
 

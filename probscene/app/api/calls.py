@@ -1,0 +1,190 @@
+"""What is done with a run or a model: images, datasets, evaluations, reports."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from probscene.batch import RenderBatch
+from probscene.dataset import Images
+from probscene.errors import ProbsceneError
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import Scenes
+
+from ..datasets.generate import Dataset, generate_scenes
+from ..datasets.generate import generate as generate_run
+from ..evaluation import compare as comparing
+from ..evaluation import evaluate as evaluating
+from ..evaluation.compare import Comparison
+from ..evaluation.evaluate import Evaluation
+from ..evaluation.labels import Labels, read_labels
+from ..fitting import session
+from ..fitting.fit import open_target
+from ..fitting.run import RunFolder, is_run
+from ..fitting.session import Target
+from ..loading import load_model, renderer_for
+from ..progress import Display
+from ..views import comparison as comparison_picture
+from ..views import report as reporting
+
+
+def render(model: SceneModel, scenes: Scenes, threads: int | None = None) -> RenderBatch:
+    """Images and labels of scenes.
+
+    Args:
+        scenes: from ``sample``.
+        threads: of the renderer; one a core where None.
+
+    Raises:
+        ModelError: a renderer of the user's own returns something wrong.
+    """
+    return renderer_for(model, threads)(scenes.drawing)
+
+
+def generate(
+    source: RunFolder | SceneModel | Path | str,
+    num: int,
+    out: Path | str,
+    format: str | Iterable[str] = "coco",
+    seed: int = 0,
+    workers: int = 1,
+    progress: bool = True,
+    policy: Policy | None = None,
+) -> Dataset:
+    """Write a labelled dataset; the same call goes on after an interruption.
+
+    Args:
+        source: a run or its folder, for the learnt structures; or a model, for the prior's.
+        num: how many images.
+        out: the folder to write.
+        format: ``"coco"``, ``"yolo"``, ``"kitti"``, ``"webdataset"``, several of them, or ``"images"`` for no labels.
+        workers: processes of a run's generation; the bytes do not depend on their number. More than one are spawned: a
+            script calls this under ``if __name__ == "__main__":``.
+        policy: other structures for a model.
+
+    Raises:
+        ProbsceneError: see ``generate_run``.
+    """
+    with display(progress) as show:
+        said, out = show.stage("generating"), Path(out)
+        if not isinstance(source, RunFolder | SceneModel) and not is_run(str(source)):
+            source = load_model(str(source))
+        if isinstance(source, SceneModel):
+            if workers != 1:
+                raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
+            return generate_scenes(source, policy or source.prior, num, out, seed, format, said)
+        run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
+        return generate_run(run, num, out, seed, workers, format, said)
+
+
+def evaluate(
+    run: RunFolder | Path | str,
+    target: Target | None = None,
+    labels: Path | str | Labels | None = None,
+    num: int = 10000,
+    features: Sequence[str] = (),
+    images: int = 1000,
+    some_labels: bool = False,
+    min_height: float = 0.0,
+    progress: bool = True,
+) -> Evaluation:
+    """Count what the prior and the guide derive, beside the labels and what the run's network sees in the target.
+
+    Args:
+        target: the images to judge by; the run's own where None.
+        labels: ``counts.csv``, ``provenance.jsonl`` or KITTI's folder ``label_2``.
+        num: structures a source.
+        features: networks for FID and KID, such as ``["efficientnet"]``.
+        images: at most so many a side for them.
+        some_labels: labels need not cover all images.
+        min_height: of objects that KITTI's labels count, pixels.
+
+    Raises:
+        ProbsceneError: see ``evaluation.evaluate`` and ``read_labels``.
+    """
+    opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
+    opened.check_finished()
+    with display(progress) as show:
+        seen = _images(opened, target, show)
+        truth = _truth(labels, opened.model, seen, some_labels, min_height)
+        return evaluating.evaluate(opened, seen, truth, show, num, features=features, images=images)
+
+
+def compare(
+    runs: Sequence[Path | str],
+    target: Target | None = None,
+    labels: Path | str | Labels | None = None,
+    out: Path | str | None = None,
+    num: int = 10000,
+    min_height: float = 0.0,
+    progress: bool = True,
+) -> Comparison:
+    """The prior, several runs of one model and the truth side by side.
+
+    Args:
+        runs: their folders.
+        target: the images to judge by; the runs' own where None.
+        labels: see ``evaluate``.
+        out: the picture to write, a PNG; none where None.
+        num: structures a source.
+
+    Raises:
+        ProbsceneError: see ``evaluation.compare``.
+    """
+    opened = comparing.open_runs([Path(path) for path in runs])
+    if out is not None:
+        comparison_picture.make_place(Path(out))
+    first = next(iter(opened.values()))
+    with display(progress) as show:
+        images = None if target is None and labels is None else _images(first, target, show)
+        truth = _truth(labels, first.model, images, False, min_height)
+        found = comparing.compare(opened, images, truth, show, num)
+        if out is not None:
+            comparison_picture.draw(found, Path(out))
+    return found
+
+
+def report(
+    run: RunFolder | Path | str,
+    out: Path | str | None = None,
+    labels: Path | str | None = None,
+    num: int = 10000,
+    scenes: int = reporting.SCENES,
+    progress: bool = True,
+) -> Path:
+    """Write one self-contained HTML page about a run; returns where it is.
+
+    Args:
+        out: the file; ``report.html`` in the run's folder where None.
+        labels: of the run's target, see ``evaluate``.
+        num: structures a source.
+        scenes: rendered of prior and guide for the verdict; 0 for none.
+
+    Raises:
+        ProbsceneError: see ``views.report``.
+    """
+    opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
+    with display(progress) as show:
+        where, truth = None if out is None else Path(out), None if labels is None else Path(labels)
+        return reporting.report(opened, show, where, truth, num, scenes)
+
+
+def display(progress: bool) -> Display:
+    """Shows progress on stderr, or nothing."""
+    return Display() if progress else Display(Console(quiet=True))
+
+
+def _images(run: RunFolder, target: Target | None, show: Display) -> Images:
+    if target is not None:
+        return session.open_images(target, run.model, run.record["skip_bad"], show)
+    return open_target(run, show)
+
+
+def _truth(
+    labels: Path | str | Labels | None, model: SceneModel, images: Images | None, some: bool, min_height: float
+) -> Labels | None:
+    if labels is None or isinstance(labels, Labels):
+        return labels
+    assert images is not None
+    return read_labels(Path(labels), model, images, some, min_height)

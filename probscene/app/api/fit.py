@@ -1,0 +1,153 @@
+"""``probscene.fit``."""
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from probscene.inference.divergence import Divergence
+from probscene.inference.features.base import FeatureNet, Features
+from probscene.model import SceneModel
+
+from ..fitting import session
+from ..fitting.overrides import override
+from ..fitting.parts import IN_MEMORY, GuideMaker, Parts, lasting_word
+from ..fitting.presets import Preset
+from ..fitting.presets import preset as preset_of
+from ..fitting.session import Target
+from ..loading import load_model
+from .calls import display
+from .run import Run, checked_seed, parts_of
+
+
+def fit(
+    model: SceneModel | Path | str,
+    target: Target,
+    preset: str | Preset = "default",
+    seed: int = 0,
+    *,
+    features: str | Features | FeatureNet | None = None,
+    divergence: str | Divergence | None = None,
+    guide: str | GuideMaker | None = None,
+    renderer: Any = None,
+    out: Path | str | None = None,
+    settings: Mapping[str, Any] | Sequence[str] = (),
+    skip_bad: bool = False,
+    threads: int | None = None,
+    assets: Path | str | None = None,
+    cache: Path | str | bool = True,
+    resume: bool = False,
+    progress: bool = True,
+) -> Run:
+    """Learn which structures occur in unlabelled images.
+
+    Args:
+        model: a scene model, the name of a built-in one, or a Python file.
+        target: a folder of PNG or JPEG files, a list of files, an array ``(L, H, W)`` or ``(L, H, W, 1 or 3)`` uint8,
+            or a torch dataset of images; see ``ImageFolder`` and ``ImageArray``.
+        preset: how long and how to learn: ``"quick"``, ``"default"``, ``"street"``, ``"paper"``, or a ``Preset``.
+        seed: of everything random.
+        features: another feature network: a word as on the command line, ``FILE.py:NAME``, or an object, see
+            ``Features`` and ``FeatureNet``.
+        divergence: what is descended: ``"kde"``, ``"js"``, ``"witness"``, ``"mmd"``, ``FILE.py:NAME``, or a
+            ``Divergence``.
+        guide: what learns: ``"lstm"``, ``"pcfg"``, ``"grammar-vae"``, ``FILE.py:NAME``, or what makes a guide of a
+            grammar and T_max, such as a class.
+        renderer: instead of the model's, see ``SceneModel.renderer``.
+        out: the folder of the run; a temporary one where None, which ``Run.save`` copies.
+        settings: other values of the preset's fields, ``{"batches": 20, "count.steps": 300}``.
+        skip_bad: leave out files that do not decode.
+        threads: of torch; all cores where None. Another number rounds differently.
+        assets: a folder that the model is drawn with.
+        cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
+            folder.
+        resume: go on with the run in ``out`` where there is one.
+        progress: show it, on stderr.
+
+    Raises:
+        ProbsceneError: an input is at fault; the message says which and how to mend it. What was finished of the run
+            stays, and ``resume=True`` goes on with it.
+    """
+    chosen, parts = chosen_preset(preset, features, divergence, guide, settings)
+    loaded = load_model(str(model), assets) if renderer is not None and not isinstance(model, SceneModel) else model
+    if renderer is not None:
+        loaded = replace(loaded, renderer=renderer)
+    given = loaded if isinstance(loaded, SceneModel) else str(loaded)
+    folder, temporary = Path(out) if out is not None else None, None
+    if folder is None:
+        temporary = tempfile.mkdtemp(prefix="probscene-")
+        folder = Path(temporary) / "run"
+    with display(progress) as show:
+        try:
+            if resume and (folder / "run.json").exists():
+                run = Run.at(folder, given if isinstance(given, SceneModel) else None, parts)
+                images = session.open_images(target, run.model, skip_bad, show)
+            else:
+                assets_folder = None if assets is None else Path(assets)
+                run, images = session.begin(
+                    given,
+                    target,
+                    folder,
+                    chosen,
+                    checked_seed(seed),
+                    skip_bad,
+                    threads,
+                    show,
+                    assets_folder,
+                    parts,
+                    Run,
+                )
+            if not run.is_finished:
+                session.carry_out(run, images, show, *_cache(cache))
+        except BaseException:
+            if temporary is not None:
+                shutil.rmtree(temporary, ignore_errors=True)
+            raise
+    if temporary is not None:
+        weakref.finalize(run, shutil.rmtree, temporary, True)
+    return run
+
+
+def chosen_preset(
+    preset: str | Preset,
+    features: str | Features | FeatureNet | None,
+    divergence: str | Divergence | None,
+    guide: str | GuideMaker | None,
+    settings: Mapping[str, Any] | Sequence[str],
+) -> tuple[Preset, Parts]:
+    """The preset with all that was chosen beside it, and what of that are objects; arguments as of ``fit``."""
+    chosen = preset if isinstance(preset, Preset) else preset_of(preset)
+    own = parts_of(
+        None if isinstance(features, str) else features,
+        None if isinstance(divergence, str) else divergence,
+        None if isinstance(guide, str) else guide,
+    )
+    if isinstance(divergence, str):
+        chosen = chosen.with_objective(lasting_word(divergence))
+    if isinstance(guide, str):
+        chosen = chosen.with_guide(lasting_word(guide))
+    if isinstance(features, str):
+        chosen = chosen.with_features(lasting_word(features))
+    if own.features is not None:
+        chosen = chosen.with_features_of(own.features, f"{IN_MEMORY}{own.features.name}")
+    if own.divergence is not None:
+        chosen = replace(chosen, objective=f"{IN_MEMORY}{_name(own.divergence)}")
+    if own.guide is not None:
+        chosen = replace(chosen, guide=f"{IN_MEMORY}{_name(own.guide)}")
+    words = [f"{key}={_word(value)}" for key, value in settings.items()] if isinstance(settings, Mapping) else settings
+    return override(chosen, list(words)), own
+
+
+def _name(part: Any) -> str:
+    return getattr(part, "__name__", type(part).__name__)
+
+
+def _word(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+
+
+def _cache(cache: Path | str | bool) -> tuple[Path | None, bool]:
+    return (None, cache) if isinstance(cache, bool) else (Path(cache), True)

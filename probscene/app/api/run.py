@@ -1,0 +1,134 @@
+"""A fit as a Python object."""
+
+import shutil
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from probscene.batch import RenderBatch
+from probscene.errors import ProbsceneError
+from probscene.inference.divergence import Divergence
+from probscene.inference.features.base import FeatureNet, Features
+from probscene.model import SceneModel
+from probscene.sampling import Scenes, sample
+
+from ..chunks import chunk_randomness
+from ..datasets.generate import Dataset
+from ..evaluation.evaluate import Evaluation
+from ..evaluation.labels import Labels
+from ..files import make_folder
+from ..fitting.parts import GuideMaker, Parts, as_divergence, as_features, as_guide_maker
+from ..fitting.run import RunFolder
+from ..fitting.session import Target
+from ..fitting.storage import check_free
+from . import calls
+
+
+class Run(RunFolder):
+    """A fit: what was learnt, and what can be done with it. ``probscene.fit`` and ``Run.open`` give one.
+
+    Attributes:
+        path: its folder; a temporary one, which goes with the object, where the fit was given none.
+        record: the contents of its ``run.json``.
+        model: the scene model.
+        guide: what was learnt, a policy and a Pyro program.
+    """
+
+    @classmethod
+    def open(
+        cls,
+        path: Path | str,
+        model: SceneModel | None = None,
+        features: Features | FeatureNet | None = None,
+        divergence: Divergence | None = None,
+        guide: GuideMaker | None = None,
+    ) -> "Run":
+        """A run that was saved.
+
+        Args:
+            model, features, divergence, guide: what the run was begun with, where that were objects in memory.
+
+        Raises:
+            RunError: there is none, it is damaged, or another version wrote it.
+        """
+        return cls.at(Path(path), model, parts_of(features, divergence, guide))
+
+    def sample(self, num: int, seed: int = 0) -> Scenes:
+        """Scenes with learnt structures; the same for the same seed."""
+        with chunk_randomness(checked_seed(seed), 0):
+            return sample(self.model, self.guide, _positive(num, "scenes"))
+
+    def render(self, num: int, seed: int = 0) -> RenderBatch:
+        """``sample``, rendered and labelled."""
+        return calls.render(self.model, self.sample(num, seed))
+
+    def generate(
+        self,
+        num: int,
+        out: Path | str,
+        format: str | Iterable[str] = "coco",
+        seed: int = 0,
+        workers: int = 1,
+        progress: bool = True,
+    ) -> Dataset:
+        """Write a labelled dataset of the learnt structures, see ``generate``."""
+        return calls.generate(self, num, out, format, seed, workers, progress)
+
+    def evaluate(
+        self, target: Target | None = None, labels: Path | str | Labels | None = None, **options: Any
+    ) -> Evaluation:
+        """Compare what was learnt with the target, see ``evaluate``."""
+        return calls.evaluate(self, target, labels, **options)
+
+    def report(self, out: Path | str | None = None, **options: Any) -> Path:
+        """Write an HTML page about the run, see ``report``."""
+        return calls.report(self, out, **options)
+
+    def save(self, path: Path | str) -> "Run":
+        """Copy the run to a folder of its own, and open it there.
+
+        Raises:
+            RunError: the folder holds a run or other files already.
+            MachineError: it cannot be written.
+        """
+        path = Path(path)
+        check_free(path)
+        make_folder(path.parent)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as aside:
+            shutil.copytree(self.path, Path(aside) / "run")
+            if path.is_dir():
+                shutil.copytree(Path(aside) / "run", path, dirs_exist_ok=True)
+            else:
+                (Path(aside) / "run").rename(path)
+        return type(self)(path, self.record, self._model, self.parts)
+
+
+def parts_of(features: Any, divergence: Any, guide: Any) -> Parts:
+    """The parts of a fit that are objects; None for what is not.
+
+    Raises:
+        ModelError: one that is no such part.
+    """
+    return Parts(
+        None if features is None else as_features(features),
+        None if divergence is None else as_divergence(divergence),
+        None if guide is None else as_guide_maker(guide),
+    )
+
+
+def _positive(number: int, what: str) -> int:
+    if number < 1:
+        raise ProbsceneError(f"Expected a positive number of {what}, actual {number}.")
+    return number
+
+
+def checked_seed(seed: int) -> int:
+    """A seed of 0 or more.
+
+    Raises:
+        ProbsceneError: it is negative.
+    """
+    if seed < 0:
+        raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
+    return seed

@@ -1,0 +1,121 @@
+"""A run's files: what ``fit`` writes and every other command reads.
+
+    run.json               the configuration, the model, the target, the version that wrote it
+    model.py               a copy of the model's file, where it is not a built-in one
+    guide.safetensors      the learnt guide; there once the fit is finished
+    features.safetensors   the feature network
+    real.safetensors       features of the target images
+    log.jsonl              one line an update
+    checkpoint.safetensors what ``--resume`` goes on from
+
+All are written aside and renamed.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+from torch import Tensor
+
+from probscene.errors import DataError, RunError
+
+from ..files import write_whole
+from ..modules import file_digest
+
+FORMAT = 3  # of the run folder; another number is not read
+KEYS = {"model", "model_sha256", "assets"}  # that every run.json has
+
+
+class Storage:
+    """The files of a run.
+
+    Attributes:
+        path: the folder.
+        record: the contents of ``run.json``.
+    """
+
+    def __init__(self, path: Path, record: dict[str, Any]):
+        self.path, self.record = Path(path), record
+
+    def guide_hash(self) -> str:
+        """SHA-256 of the learnt guide's file, hexadecimal; provenance names it."""
+        return file_digest(self.path / "guide.safetensors")
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the guide is learnt."""
+        return (self.path / "guide.safetensors").is_file()
+
+    def load(self, name: str) -> dict[str, Tensor] | None:
+        """The tensors of ``name.safetensors``, or None where there is no such file.
+
+        Raises:
+            RunError: the file is damaged.
+        """
+        file = self.path / f"{name}.safetensors"
+        return load_tensors(file) if file.is_file() else None
+
+    def save(self, name: str, tensors: dict[str, Tensor]) -> None:
+        """Write ``name.safetensors``, whole or not at all."""
+        save_tensors(self.path / f"{name}.safetensors", tensors)
+
+
+def check_free(path: Path) -> None:
+    """See that a folder can become a run's; nothing is written.
+
+    Raises:
+        RunError: it holds a run or other files already.
+        DataError: a file is in the way.
+    """
+    path = Path(path)
+    if (path / "run.json").exists():
+        raise RunError(f"Expected a new folder for the run, actual {path} holds one; add --resume or name another.")
+    if path.exists() and not path.is_dir():
+        raise DataError(f"Expected a folder for the run, actual {path} is a file; name another.")
+    if path.is_dir() and any(not entry.name.startswith(".") for entry in path.iterdir()):
+        raise RunError(f"Expected a new or empty folder for the run, actual {path} holds other files.")
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The contents of a run folder's ``run.json``.
+
+    Raises:
+        RunError: there is none, it is damaged, or another version wrote it.
+    """
+    file = path / "run.json"
+    if not file.is_file():
+        raise RunError(f"Expected a run folder with a run.json, actual {path}; make one with 'probscene fit'.")
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        written = record["format"]
+        if written == FORMAT and not KEYS <= record.keys():
+            raise KeyError(*(KEYS - record.keys()))
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunError(f"Expected JSON of a run in {file}, actual something else; fit again.") from error
+    if written != FORMAT:
+        raise RunError(
+            f"Expected a run of format {FORMAT}, actual format {written} in {path}: another version of probscene "
+            f"({record.get('version', 'unknown')}) wrote it. Use that version, or fit again."
+        )
+    return record
+
+
+def load_tensors(file: Path) -> dict[str, Tensor]:
+    """The tensors of a file.
+
+    Raises:
+        RunError: it is damaged.
+    """
+    try:
+        return safetensors.torch.load_file(file)
+    except (safetensors.SafetensorError, OSError) as error:
+        raise RunError(f"Expected tensors in {file}, actual a damaged file ({error}); delete it.") from error
+
+
+def save_tensors(file: Path, tensors: dict[str, Tensor]) -> None:
+    """Write a file of tensors, whole or not at all."""
+    # As bytes: safetensors' own writing says neither OSError nor why where the disk is full.
+    whole = safetensors.torch.save({key: value.detach().contiguous() for key, value in tensors.items()})
+    write_whole(file, lambda temporary: temporary.write_bytes(whole))

@@ -1,0 +1,49 @@
+"""Python files of the user's, imported by path: models, and parts of a fit such as features or a guide."""
+
+import hashlib
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+from types import ModuleType
+
+from probscene.errors import ModelError, ProbsceneError
+
+
+def import_file(path: Path) -> ModuleType:
+    """The module of a Python file; its name depends on the path alone.
+
+    Raises:
+        ModelError: no such file, or one that does not import: with its own error and line.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ModelError(f"Expected a model file, actual {str(path)!r}, which is not there.")
+    name = "probscene_model_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except ProbsceneError:
+        raise
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        raise ModelError(
+            f"Model file {path} does not import: {type(error).__name__}: {error} "
+            f"({Path(where.filename).name}, line {where.lineno}). Try 'python {path}'."
+        ) from error
+    return module
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal.
+
+    Raises:
+        ModelError: it cannot be read.
+    """
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError as error:
+        raise ModelError(f"Could not read {path}: {error.strerror}.") from error
