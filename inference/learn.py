@@ -63,6 +63,7 @@ class Trainer:
         Raises:
             ProbsceneError: a cost or a parameter is no longer finite; the guide is then as it was before that batch.
         """
+        self.guide.zero_grad()  # SVI adds to the gradients that it finds
         with pyro.get_param_store().scope():  # another guide's parameters have the same names
             while self.done < self.total:
                 before = {key: value.clone() for key, value in self.guide.state_dict().items()}

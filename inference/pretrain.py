@@ -51,6 +51,7 @@ def pretrain(
         check_finite(loss, guide.parameters(), "the guide in pretraining", f"in epoch {epoch + 1}", remedy)
         if progress is not None:
             progress(epoch, loss)
+    optimiser.zero_grad()  # SVI adds to the gradients that it finds
     return loss
 
 
