@@ -55,6 +55,7 @@ def main() -> int:
     args = parser.parse_args()
     path, before = args.page.resolve(), args.page.read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        os.environ["PROBSCENE_CACHE"] = f"{folder}/cache"
         after = run(before)
         pictures = [Path(name) for name in re.findall(r"\(pictures/([\w-]+\.png)\)", before) if Path(name).is_file()]
         if not args.check:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
+import probscene
 from probscene.app.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,6 +42,11 @@ def test_every_option_of_a_command_is_listed(name):
     listed = set(re.findall(r"^\| `(--[\w-]+)", section, re.MULTILINE)) - {"--objective", "--guide"}
     there = {option for parameter in COMMANDS[name].params for option in parameter.opts if option.startswith("--")}
     assert listed == there - {"--help", "--objective", "--guide"}
+
+
+def test_the_face_is_listed_whole():
+    tables = re.findall(r"^\|.*\|$", text("api/face.md"), re.MULTILINE)
+    assert set(re.findall(r"`(\w+)`", " ".join(tables))) == set(probscene.__all__)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -21,6 +21,7 @@ def test_python_runs(tmp_path, monkeypatch, capsys):
     generate_scenes(MODEL, MODEL.prior, 60, tmp_path / "drawn", format="images")
     (tmp_path / "drawn" / "images").rename(tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PROBSCENE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(ps, "fit", functools.partial(ps.fit, settings=TINY))
     (block,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names = {}
