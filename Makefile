@@ -29,6 +29,10 @@ demo: install
 
 lint: install
 	@$(BIN)/ruff check --quiet
+	@rm -rf build/types
+	@$(BIN)/python -c 'import setuptools; setuptools.setup()' --quiet build_py --build-lib build/types
+	@cp -R examples build/types
+	@$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 docs: install
 	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --doctree-dir build/doctrees docs build/docs

@@ -32,6 +32,7 @@ from probscene.grammar import Grammar
 from probscene.models import aerial2d, multi_mnist
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior
+from probscene.threads import use_threads
 
 BATCH = 500
 LOW, HIGH = 20.0, 236.0  # pixels
@@ -228,7 +229,7 @@ def main() -> None:
     parser.add_argument("--scenic-python", metavar="PATH", help="an interpreter that has Scenic 3.1")
     parser.add_argument("--seconds", type=float, default=5.0, help="CPU seconds for each row")
     given = parser.parse_args()
-    torch.set_num_threads(1)
+    use_threads(1)
     pyro.set_rng_seed(0)
     drawn = random.Random(0)
     roads = [[drawn.randrange(9) for _ in range(1 + i % 4)] for i in range(48)]

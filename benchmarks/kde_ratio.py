@@ -23,6 +23,7 @@ from scipy.stats import gaussian_kde as scipy_kde
 from sklearn.neighbors import KernelDensity
 
 from probscene.inference.divergence import KDELogRatio
+from probscene.threads import use_threads
 
 SIZES = (2, 10, 64, 512, 2048)
 
@@ -102,7 +103,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=500, help="generated scenes, and as many real ones")
     parser.add_argument("--seconds", type=float, default=0.5, help="CPU seconds for each cell")
     given = parser.parse_args()
-    torch.set_num_threads(1)
+    use_threads(1)
     torch.manual_seed(0)
     print(f"{'D':>5} {'cdist':>8} {'ours':>8} {'/ cdist':>8} {'scipy':>8} {'sklearn':>8} {'apart':>9} ", end="")
     print(f"{'marginals':>12} {'a feature':>10} {'a loop':>8}")

@@ -19,6 +19,7 @@ from probscene.derive import derive_complete
 from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.sampling import run_program, seed_everything
+from probscene.threads import use_threads
 
 
 class Clock:
@@ -62,7 +63,7 @@ def main():
     parser.add_argument("--features", nargs="+", default=["count", "efficientnet"])
     parser.add_argument("--steps", type=int, default=3)
     args = parser.parse_args()
-    torch.set_num_threads(1)
+    use_threads(1)
     model = load_model(args.model)
     renderer_for(model, 1)
     columns = {}

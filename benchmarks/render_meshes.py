@@ -21,6 +21,7 @@ from opengl_peer import Peer
 
 from probscene.mesh import Mesh, Surface
 from probscene.renderers.meshes import MeshRenderer
+from probscene.threads import use_threads
 from probscene.world import Camera, Ground, Light, Meshes, Photo, World, resolve_ground, resolve_meshes, resolve_scene
 
 OBJECTS = 30
@@ -115,7 +116,7 @@ def main() -> None:
     parser.add_argument("--pictures", help="a folder for the first scene as both draw it")
     arguments = parser.parse_args()
     os.environ["LP_NUM_THREADS"] = str(arguments.threads if arguments.threads > 1 else 0)
-    torch.set_num_threads(arguments.threads)
+    use_threads(arguments.threads)
     scenes = arguments.scenes
     print(f"CPU ms an image, {scenes} scenes of {OBJECTS} objects, {arguments.threads} threads")
     heads = ("probscene", "4 samples", "OpenGL", "fill", "OpenGL /", "/ fill", "ids")

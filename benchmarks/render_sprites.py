@@ -24,6 +24,7 @@ from probscene.drawing import Atlas, Drawing, Layer
 from probscene.models.aerial2d import MODEL
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
+from probscene.threads import use_threads
 
 SIZE = 256
 
@@ -158,7 +159,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     cv2.setNumThreads(arguments.threads)
-    torch.set_num_threads(arguments.threads)
+    use_threads(arguments.threads)
     written = np.empty((arguments.scenes, SIZE, SIZE, 5), np.uint8)
     print(f"CPU ms an image, {arguments.scenes} images of {SIZE}x{SIZE}, {arguments.threads} threads")
     heads = ("sprites", "probscene", "OpenCV", "fill", "refill", "OpenCV /", "/ fill", "/ refill")

@@ -16,7 +16,6 @@ and to judge; a fit sees images alone.
 """
 
 import argparse
-import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -114,7 +113,8 @@ def write(folder: Path, parts: list[tuple[str, list[Path]]], stride: int) -> Non
 
 
 def _key(frame: Path) -> tuple[tuple[int, int], str, int, Path]:
-    prefix, digits = re.fullmatch(r"(.*?)(\d*)", frame.stem).groups()
+    prefix = frame.stem.rstrip("0123456789")
+    digits = frame.stem.removeprefix(prefix)
     height, width = _pixels(frame).shape[:2]
     return (height, width), prefix, int(digits or 0), frame
 
@@ -127,7 +127,7 @@ def _pixels(frame: Path) -> np.ndarray:
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("data", type=Path, help="folder of frames and their YOLO files")
     parser.add_argument("--out", type=Path, required=True, help="folder for fit/ and held_out/")
     parser.add_argument("--stride", type=int, default=64, help="pixels between crops")

@@ -13,7 +13,8 @@ import math
 import pyro
 import torch
 from pyro.infer import SVI
-from pyro.optim import LambdaLR
+from pyro.optim.lr_scheduler import PyroLRScheduler
+from torch.optim.lr_scheduler import LambdaLR
 
 from probscene.derive import derive_complete
 from probscene.inference.divergence import KDELogRatio
@@ -24,7 +25,7 @@ from probscene.inference.features.counting.training import CountTraining
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
-from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL
+from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL, target
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample
 
@@ -64,7 +65,7 @@ def histograms(policy, num=10_000):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--oracle", action="store_true", help="true counts as features")
     parser.add_argument("--seed", type=int, default=0, help="of the target and of everything random")
     parser.add_argument("--steps", type=int, default=2000, help="of the count network")
@@ -74,17 +75,17 @@ def main():
     args = parser.parse_args()
     pyro.set_rng_seed(args.seed)
 
-    target = MODEL.target(args.seed)
+    truth = target(args.seed)
     observe = true_counts if args.oracle else seen_counts(args.steps)
     chunks = [min(500, args.num_real - done) for done in range(0, args.num_real, 500)]
-    real = torch.cat([observe(sample(target, target.prior, size)) for size in chunks])
+    real = torch.cat([observe(sample(truth, truth.prior, size)) for size in chunks])
 
     guide = LSTMGuide(GRAMMAR, MODEL.max_steps)
     pretrain(guide, MODEL.prior)
 
     updates = 3
     cosine = {"lr_lambda": lambda step: 0.5 * (1 + math.cos(math.pi * step / (updates * args.batches)))}
-    adam = LambdaLR({"optimizer": torch.optim.Adam, "optim_args": {"lr": 1e-2}, **cosine})
+    adam = PyroLRScheduler(LambdaLR, {"optimizer": torch.optim.Adam, "optim_args": {"lr": 1e-2}, **cosine})
     loss = ScoreFunction(observe, KDELogRatio(), updates=updates)
     svi = SVI(MODEL, guide, adam, loss=loss)
     for step in range(updates * args.batches):
@@ -93,9 +94,9 @@ def main():
         if step % (10 * updates) == 0:
             print(f"structure batch {step // updates:4d}  cost {cost:.3f}")
 
-    truth = histograms(target.prior)
+    wanted = histograms(truth.prior)
     for name, policy in (("prior", MODEL.prior), ("learnt", guide)):
-        distance = [0.5 * (a - b).abs().sum().item() for a, b in zip(histograms(policy), truth, strict=True)]
+        distance = [0.5 * (a - b).abs().sum().item() for a, b in zip(histograms(policy), wanted, strict=True)]
         print(f"total variation, {name}: number of digits {distance[0]:.3f}, classes {distance[1]:.3f}")
 
 

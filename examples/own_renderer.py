@@ -52,9 +52,10 @@ class NightRenderer:
     def __call__(self, drawing: Drawing) -> RenderBatch:
         """Render every scene, one after the other."""
         each = [self._scene(drawing, scene) for scene in range(len(drawing))]
-        fields = [torch.from_numpy(np.stack(field)) for field in zip(*each, strict=True)]
-        image, *labels = fields
-        return RenderBatch(image.permute(0, 3, 1, 2), *labels)
+        image, instance, kind, box, amodal_box, pixels, visible = (
+            torch.from_numpy(np.stack(field)) for field in zip(*each, strict=True)
+        )
+        return RenderBatch(image.permute(0, 3, 1, 2), instance, kind, box, amodal_box, pixels, visible)
 
     def _scene(self, drawing: Drawing, scene: int) -> tuple[np.ndarray, ...]:
         """Image ``(H, W, 3)`` and the labels of one scene, in the order of a ``RenderBatch``."""

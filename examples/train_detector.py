@@ -18,7 +18,7 @@ from probscene.app.datasets.scene_dataset import SceneDataset
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("source", nargs="?", default="multi_mnist", metavar="RUN", help="a run, or a model's prior")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--batch-size", type=int, default=4)
@@ -46,7 +46,7 @@ def main():
     sgd = torch.optim.SGD(detector.parameters(), lr=0.005, momentum=0.9, weight_decay=1e-4)
     for step, (images, targets) in enumerate(islice(loader, args.steps)):
         losses = detector(images, targets)
-        loss = sum(losses.values())
+        loss = torch.stack([*losses.values()]).sum()
         sgd.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(detector.parameters(), 10.0)

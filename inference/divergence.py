@@ -74,10 +74,8 @@ class KDELogRatio:
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         cost = self.of_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
         if self.marginal_variance is not None and generated.shape[1] > 1:
-            single = (
-                features.T.contiguous().unsqueeze(-1) for features in (generated, real)
-            )  # (D, N, 1) and (D, L, 1)
-            cost = cost + self.of_ratio(self._log_ratios(*single, self.marginal_variance)).sum(0)
+            one, other = (features.T.contiguous().unsqueeze(-1) for features in (generated, real))  # (D, N or L, 1)
+            cost = cost + self.of_ratio(self._log_ratios(one, other, self.marginal_variance)).sum(0)
         return cost
 
     def of_ratio(self, log_ratio: Tensor) -> Tensor:
@@ -150,7 +148,8 @@ class Blockwise:
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
         _check(generated, real)
         blocks = zip(self.divergences, generated.split(self.sizes, 1), real.split(self.sizes, 1), strict=True)
-        return sum(divergence(*block) for divergence, *block in blocks if divergence is not None)
+        costs = [divergence(*block) for divergence, *block in blocks if divergence is not None]
+        return sum(costs, torch.zeros(len(generated)))
 
 
 def _centred(points: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,11 +2,12 @@
 loop that was interrupted goes on to the same result."""
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import pyro
 import torch
 from pyro.infer import SVI
+from pyro.optim import PyroOptim
 from torch import Tensor
 
 from probscene.errors import ProbsceneError
@@ -117,7 +118,7 @@ class Trainer:
         for update in range(updates):
             progress = (self.done * updates + update) / (self.total * updates)
             self.adam.rate = self.learning_rate * (0.5 * (1 + math.cos(math.pi * progress)) if self.cosine else 1.0)
-            loss = self.svi.step(self.num_scenes, real=real)
+            loss = cast(float, self.svi.step(self.num_scenes, real=real))
         remedy = (
             f"begin again with a lower rate, such as learning_rate={self.learning_rate / 4:g}, or a larger variance; "
             "the guide is as it was before the batch"
@@ -125,8 +126,10 @@ class Trainer:
         check_finite(loss, self.guide.parameters(), "the guide", "in this batch", remedy)
 
 
-class _Adam(pyro.optim.PyroOptim):
+class _Adam(PyroOptim):
     """Adam whose rate is the same for all parameters and can be set between two steps."""
+
+    pt_optim_args: dict[str, Any]
 
     def __init__(self, rate: float):
         super().__init__(torch.optim.Adam, {"lr": rate})

@@ -3,17 +3,17 @@
 from collections.abc import Callable
 
 import torch
-from torch import nn
 
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.policy import Policy
 
+from .guides.base import Guide
 from .training import check_finite
 
 
 def pretrain(
-    guide: nn.Module,
+    guide: Guide,
     prior: Policy,
     num_derivations: int = 5000,
     epochs: int = 10,

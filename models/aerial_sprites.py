@@ -69,6 +69,7 @@ def _pictures(path: Path, size: float) -> tuple[np.ndarray, ...]:
         if picture is None or picture.ndim != 3 or picture.shape[2] != 4 or picture.dtype != np.uint8:
             raise DataError(f"Expected an RGBA picture of 8 bits, actual {file}; add an alpha channel.")
         scale = size / max(picture.shape[:2])
+        picture = picture.astype(np.float64)
         alpha = picture[..., 3:] / 255.0
         premultiplied = np.concatenate([picture[..., 2::-1] * alpha, picture[..., 3:]], 2)
         small = cv2.resize(premultiplied, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -63,7 +63,11 @@ class Digits(NamedTuple):
             raise DataError(f"Expected images of all digits 0..9 and of nothing else, actual labels {there}.")
         sprites = np.full((*images.shape, 4), 255, np.uint8)
         sprites[..., 3] = images[np.argsort(labels, kind="stable")]
-        return Digits(Atlas(tuple(sprites)), torch.from_numpy(count.cumsum() - count), torch.from_numpy(count))
+        return Digits(
+            Atlas(tuple(np.asarray(sprite) for sprite in sprites)),
+            torch.from_numpy(count.cumsum() - count),
+            torch.from_numpy(count),
+        )
 
     def sprite(self, digit: Tensor, exemplar: Tensor) -> Tensor:
         """The sprite of ``digit`` in 0..9 that ``exemplar`` in [0, 1) picks: ``first + floor(exemplar * count)``."""

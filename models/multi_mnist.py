@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 import pyro
 import pyro.distributions as dist
+from torch import Tensor
 
 from probscene.derive import derive
 from probscene.drawing import Drawing, Sprites
@@ -63,7 +64,7 @@ def row(num_scenes: int, structure: Policy, digits: Source) -> Drawing:
     return draw(scene, digits(True), exemplar, x, CANVAS // 2)
 
 
-def draw(scene: SceneGraph, digits: Digits, exemplar, x, y, angle=0.0) -> Drawing:
+def draw(scene: SceneGraph, digits: Digits, exemplar, x, y, angle: Tensor | float = 0.0) -> Drawing:
     """Each digit's own glyph."""
     digit = (scene.kind - GRAMMAR.kind("0")).clamp(min=0)
     return scene.draw(Sprites(CLASSES, digits.atlas, digits.sprite(digit, exemplar), x, y, angle))

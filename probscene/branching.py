@@ -62,7 +62,7 @@ class Branching:
                         index[kind] = len(index)
                         todo.append(kind)
                     left.append(index[kind])
-                productions.append((index[v, repeat, around], k, row[k] / row.sum(), left))
+                productions.append((index[Type(v, repeat, around)], k, row[k] / row.sum(), left))
         self.types = todo
         self.owner = np.array([p[0] for p in productions])
         self.rule = np.array([p[1] for p in productions])

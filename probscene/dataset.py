@@ -19,6 +19,7 @@ from torch import Tensor
 from .ahead import ahead
 from .decoding import Fault, Part, Window, decoded, read, window
 from .errors import DataError
+from .threads import cores
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 LEAST_PART = 0.75  # of either side of an image, in its further views
@@ -35,6 +36,7 @@ class Images:
         sizes: of each of them, the height and width that it had.
         windows: of each of them, what is seen of it, see ``window``; None where that is all.
         distinct: how many of them are left without those that equal another one in every pixel.
+        bad: the files left out, each with the fault.
         notes: what a person should know, one sentence each.
         fingerprint: SHA-256, hexadecimal: equal fingerprints mean equal tensors.
     """
@@ -46,6 +48,7 @@ class Images:
     sizes: list[tuple[int, int]]
     windows: list[Window | None]
     distinct: int
+    bad: dict[Path, str]
     notes: tuple[str, ...]
     fingerprint: str
 
@@ -140,16 +143,16 @@ class ImageFolder(Images):
         self.listed = bool(isinstance(path, list | tuple))
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths, self.sizes, self.windows = [], [], []
-        self.bad: dict[Path, str] = {}
+        self.bad = {}
         pictures = set()
-        with _quiet(), closing(ahead(self._checked, files, len(os.sched_getaffinity(0)))) as checked:
+        with _quiet(), closing(ahead(self._checked, files, cores())) as checked:
             for i, (file, found) in enumerate(zip(files, checked, strict=True)):
                 if isinstance(found, Fault):
                     self.bad[file] = str(found)
                 else:
                     self.paths.append(file)
                     digest.update(hashlib.sha256(os.fsencode(file.name)).digest() + found.data)
-                    self.sizes.append(tuple(found.size))
+                    self.sizes.append(found.size)
                     pictures.add(found.picture)
                     seen = window(found.size, self.canvas)
                     self.windows.append(seen)
@@ -161,7 +164,7 @@ class ImageFolder(Images):
         self.fingerprint = digest.hexdigest()
         self.distinct = len(pictures)
         sizes = Counter(self.sizes)
-        cut = Counter(size for size, seen in zip(self.sizes, self.windows, strict=True) if seen is not None)
+        cut = Counter((size, seen) for size, seen in zip(self.sizes, self.windows, strict=True) if seen is not None)
         sizes.pop(self.canvas, None)
         self.resized, self.cropped = sizes.total(), cut.total()
         self.notes = self._notes(sizes, cut, others)
@@ -189,7 +192,7 @@ class ImageFolder(Images):
             picture, size = decoded(data, self.canvas, self.channels)
         except Fault as fault:
             return fault
-        return _Checked(size, hashlib.sha256(data).digest(), hashlib.blake2b(picture, digest_size=16).digest())
+        return _Checked(size, hashlib.sha256(data).digest(), hashlib.blake2b(picture.data, digest_size=16).digest())
 
     def _judge(self, skip_bad: bool) -> None:
         if self.bad and not (skip_bad and self.paths):
@@ -210,8 +213,7 @@ class ImageFolder(Images):
                 f"they are resized to {self.canvas[1]}x{self.canvas[0]}."
             )
         if self.cropped:
-            height, width = size = cut.most_common(1)[0][0]
-            _, _, rows, columns = window(size, self.canvas)
+            (height, width), (_, _, rows, columns) = cut.most_common(1)[0][0]
             notes.append(
                 f"{self.cropped} of {len(self)} images in {self.path} have another shape, of which only the middle is "
                 f"seen, mostly {columns}x{rows} of {width}x{height}; cut them before where it should be another part."
@@ -259,9 +261,10 @@ def _listed(folder: Path) -> tuple[list[Path], list[str]]:
     if not folder.is_dir():
         raise DataError(f"Expected a folder of PNG or JPEG images, actual {folder}, which is a file; name its folder.")
     try:
-        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise DataError(f"Expected a folder that can be read, actual {folder}: {error.strerror}.") from error
+    entries.sort(key=lambda entry: entry.name)  # paths of Windows would be sorted without regard to case
     folders = [entry.name + "/" for entry in entries if entry.is_dir()]
     files = [entry for entry in entries if not entry.is_dir()]
     images = [entry for entry in files if entry.suffix.lower() in SUFFIXES]

@@ -82,7 +82,8 @@ def decoded(
                 with Image.open(io.BytesIO(data)) as again:
                     again.verify()  # decoding alone does not compare the checksums
             turned = image.getexif().get(_ORIENTATION, 1) >= 5
-            size = image.size if turned else image.size[::-1]
+            w, h = image.size
+            size = (w, h) if turned else (h, w)
             image.draft(None, (max(canvas), max(canvas)))  # a large JPEG is decoded at a half, a fourth, an eighth
             pixels = np.array(_eight_bit(ImageOps.exif_transpose(image)).convert("L" if channels == 1 else "RGB"))
     except Fault:

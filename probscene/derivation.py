@@ -88,11 +88,14 @@ class Derivation:
         nodes = max(part.kind.shape[1] for _, part in parts)
         order = torch.cat([places for places, _ in parts]).argsort()
         wide = [part.padded(grammar, steps, nodes) for _, part in parts]
+        rules, complete, kind, parent = (
+            torch.cat([getattr(part, key) for part in wide])[order] for key in ("rules", "complete", "kind", "parent")
+        )
         return Derivation(
-            *(
-                torch.cat([getattr(part, key) for part in wide])[order]
-                for key in ("rules", "complete", "kind", "parent")
-            ),
+            rules,
+            complete,
+            kind,
+            parent,
             Frontier(*(torch.cat(each)[order] for each in zip(*(part.frontier for part in wide), strict=True))),
         )
 

@@ -84,8 +84,8 @@ class Sprites:
     kinds: str | tuple[str, ...]
     atlas: Atlas
     sprite: Tensor | int
-    x: Tensor
-    y: Tensor
+    x: Tensor | float
+    y: Tensor | float
     angle: Tensor | float = 0.0
     scale: Tensor | float = 1.0
     scale_y: Tensor | float | None = None

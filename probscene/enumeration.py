@@ -31,7 +31,7 @@ def enumerate_derivations(grammar: Grammar, max_steps: int, limit: int = 100_000
     of = [grammar.rules_of(name) for name in grammar.nonterminals]
     found: list[tuple[int, ...]] = []
     # An entry is (rules so far, nonterminals to expand with the next one last, the fewest rules these need).
-    todo = [((), (0,), shortest[0])]
+    todo: list[tuple[tuple[int, ...], tuple[int, ...], int]] = [((), (0,), shortest[0])]
     while todo:
         rules, stack, needed = todo.pop()
         if not stack:

@@ -277,7 +277,8 @@ def _alternatives(lhs: str, right: str, number: int) -> list[Rule]:
             if len(levels) == 1:
                 raise fault("a ')' without its '('")
             inner = tuple(levels.pop())
-            levels[-1][-1] = Node(levels[-1][-1], inner) if inner else levels[-1][-1]
+            if inner and isinstance(levels[-1][-1], str):
+                levels[-1][-1] = Node(levels[-1][-1], inner)
         elif token == "|":
             if len(levels) > 1:
                 raise fault("a '(' without its ')'; alternatives cannot stand inside brackets")

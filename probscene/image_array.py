@@ -36,7 +36,7 @@ class ImageArray(Images):
         self.sizes = [(image.shape[0], image.shape[1]) for image in each]
         self.windows = [window(size, self.canvas) for size in self.sizes]
         self.paths = [Path(f"image {i}") for i in range(len(each))]
-        self._whole = each
+        self._whole, self.bad = each, {}
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         pictures = set()
         for image in each:

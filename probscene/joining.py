@@ -4,6 +4,7 @@ Axis letters: N scenes, M nodes, S strips of ground.
 """
 
 from dataclasses import fields, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -11,7 +12,9 @@ from torch.nn.functional import pad
 
 from .drawing import Drawing, Layer
 from .errors import ModelError
-from .world import Ground, MeshLayer, World
+from .world import Ground, MeshLayer, Part, World
+
+AnyLayer = TypeVar("AnyLayer", Layer, MeshLayer)
 
 
 def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor, Drawing | World]]) -> Drawing | World:
@@ -24,27 +27,36 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
     Raises:
         ModelError: drawings in 2D and worlds in 3D, or backgrounds that differ.
     """
-    if all(isinstance(drawing, Drawing) for _, drawing in drawn):
-        backgrounds = {tuple(drawing.background) for _, drawing in drawn}
+    drawings = [(own, drawing) for own, drawing in drawn if isinstance(drawing, Drawing)]
+    worlds = [(own, world) for own, world in drawn if isinstance(world, World)]
+    if len(drawings) == len(drawn):
+        backgrounds = {(red, green, blue) for _, drawing in drawings for red, green, blue in [drawing.background]}
         if len(backgrounds) > 1:
             raise ModelError(
                 f"Expected scenarios with one background, actual {sorted(backgrounds)}; draw it as a layer."
             )
-        return Drawing(kind, kinds, _layers(kind, drawn), backgrounds.pop())
-    if not all(isinstance(drawing, World) for _, drawing in drawn):
+        layers = _layers(kind, [(own, drawing.kind.shape[1], drawing.layers) for own, drawing in drawings])
+        return Drawing(kind, kinds, layers, backgrounds.pop())
+    if len(worlds) != len(drawn):
         raise ModelError(
             "Expected scenarios that all draw sprites, or all build worlds, actual both; join those alike."
         )
-    parts = {name: _chosen([(own, getattr(w, name)) for own, w in drawn]) for name in ("camera", "light", "photo")}
-    return World(kind, kinds, _layers(kind, drawn), ground=_ground([(own, w.ground) for own, w in drawn]), **parts)
+    return World(
+        kind,
+        kinds,
+        _layers(kind, [(own, world.kind.shape[1], world.layers) for own, world in worlds]),
+        _chosen([(own, world.camera) for own, world in worlds]),
+        _chosen([(own, world.light) for own, world in worlds]),
+        _ground([(own, world.ground) for own, world in worlds]),
+        _chosen([(own, world.photo) for own, world in worlds]),
+    )
 
 
-def _layers(kind: Tensor, drawn: list[tuple[Tensor, Drawing | World]]) -> tuple[Layer | MeshLayer, ...]:
-    """All layers, each present only in its own scenes; those of nodes as wide as the joint nodes."""
+def _layers(kind: Tensor, drawn: list[tuple[Tensor, int, tuple[AnyLayer, ...]]]) -> tuple[AnyLayer, ...]:
+    """All layers, each present only in its own scenes; those of M own nodes as wide as the joint nodes."""
     found = []
-    for own, drawing in drawn:
-        M = drawing.kind.shape[1]
-        for layer in drawing.layers:
+    for own, M, layers in drawn:
+        for layer in layers:
             present = layer.present & own.unsqueeze(1)
             of_nodes = layer.labelled or layer.present.shape[1] == M
             values = {key: value for key, value in vars(layer).items() if isinstance(value, Tensor)}
@@ -61,7 +73,7 @@ def _as_wide(value: Tensor, M: int) -> Tensor:
     return pad(value, (0, 0) * (value.ndim - 2) + (0, M - value.shape[1])).contiguous()
 
 
-def _chosen(parts: list[tuple[Tensor, object]]):
+def _chosen(parts: list[tuple[Tensor, Part]]) -> Part:
     """Every tensor of a dataclass, scene by scene from the part that owns it."""
     names = [field.name for field in fields(parts[0][1])]
     return type(parts[0][1])(**{name: _rows([(own, getattr(part, name)) for own, part in parts]) for name in names})
@@ -69,13 +81,14 @@ def _chosen(parts: list[tuple[Tensor, object]]):
 
 def _ground(parts: list[tuple[Tensor, Ground | None]]) -> Ground | None:
     """Grounds with as many strips as the one that has most; strips are added that have no width."""
-    if all(ground is None for _, ground in parts):
+    grounds = [(own, ground) for own, ground in parts if ground is not None]
+    if not grounds:
         return None
-    if any(ground is None for _, ground in parts):
+    if len(grounds) < len(parts):
         raise ModelError("Expected scenarios that all have a ground, or none, actual both; give every scenario one.")
-    strips = max(ground.surface.shape[1] for _, ground in parts)
+    strips = max(ground.surface.shape[1] for _, ground in grounds)
     surfaces, wide = (), []
-    for own, ground in parts:
+    for own, ground in grounds:
         more = strips - ground.surface.shape[1]
         surface = torch.cat([ground.surface, ground.surface[:, -1:].expand(-1, more)], 1) + len(surfaces)
         last = ground.edges[:, -1:] if ground.edges.shape[1] else torch.zeros(len(own), 1)

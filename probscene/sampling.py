@@ -6,6 +6,7 @@ Axis letters: N scenes, M nodes.
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from typing import Any, cast
 
 import pyro
 import torch
@@ -85,7 +86,7 @@ def run_program(
     with torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
-    drawing = trace.nodes["_RETURN"]["value"]
+    drawing = trace.nodes["_RETURN"].get("value")
     if not isinstance(drawing, Drawing | World) or len(drawing) != N:
         raise ModelError(
             f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
@@ -94,7 +95,7 @@ def run_program(
     check_nodes(name, drawing, derivation.trimmed())
     values, site_mask = {}, {}
     log_prob = torch.zeros(N)
-    for key, site in trace.nodes.items():
+    for key, site in cast(dict[str, Any], trace.nodes).items():
         if site["type"] != "sample" or key in sites or site_is_subsample(site):
             continue
         value, mask = site["value"], site["mask"]

@@ -7,14 +7,15 @@ draw; a scene of another scenario counts nowhere in it. Whatever works on a mode
 features, datasets, provenance, reports. Axis letters: N scenes, T steps, K rules, S scenarios.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
+from typing import cast
 
 import pyro
 import torch
 from pyro import poutine
 from pyro.poutine.messenger import Messenger
-from torch import Tensor
+from torch import BoolTensor, Tensor
 
 from .derivation import Derivation, Frontier, expand
 from .derive import Given, derive
@@ -125,7 +126,9 @@ class Mixture(Policy):
         weights: of the scenarios; equal if None.
     """
 
-    def __init__(self, grammar: JointGrammar, policies: list[Policy], weights: list[float] | None = None):
+    grammar: JointGrammar
+
+    def __init__(self, grammar: JointGrammar, policies: Sequence[Policy], weights: list[float] | None = None):
         self.grammar, self.policies = grammar, policies
         share = torch.tensor([1.0] * len(policies) if weights is None else weights)
         self.log_weights = (share / share.sum()).log()
@@ -194,11 +197,15 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
 
     def target(seed: int) -> SceneModel:
         """The scenarios' own targets, joined."""
-        return join(f"{name}_target", {key: model.target(seed) for key, model in models.items()}, weights)
+        return join(
+            f"{name}_target", {key: model.target(seed) for key, model in models.items() if model.target}, weights
+        )
 
     def with_assets(folder: str) -> SceneModel:
         """All scenarios drawn with one folder."""
-        return join(name, {key: model.with_assets(folder) for key, model in models.items()}, weights)
+        return join(
+            name, {key: model.with_assets(folder) for key, model in models.items() if model.with_assets}, weights
+        )
 
     return SceneModel(
         name,
@@ -223,8 +230,9 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
 
 def mixture(grammar: JointGrammar, policies: list[Policy], weights: list[float] | None = None) -> Policy:
     """``Mixture``; of tables it is one table, about which more can be proved."""
-    if all(type(policy) is StructurePrior for policy in policies):
-        return StructurePrior.joined(grammar, policies, [1.0] * len(policies) if weights is None else weights)
+    tables = [policy for policy in policies if type(policy) is StructurePrior]
+    if len(tables) == len(policies):
+        return StructurePrior.joined(grammar, tables, [1.0] * len(policies) if weights is None else weights)
     return Mixture(grammar, policies, weights)
 
 
@@ -241,7 +249,8 @@ def _program(
         sites = grammar.sites(derivation, number)
         part = grammar.part(derivation, number)
         known = Given(model.grammar, part, any_length=True)  # the joint model's T_max may be larger than the part's own
-        with Within(name), poutine.mask(mask=own.unsqueeze(1)), poutine.block(hide=list(sites)), known:
+        counted = cast(BoolTensor, own.unsqueeze(1))
+        with Within(name), poutine.mask(mask=counted), poutine.block(hide=list(sites)), known:
             drawing = poutine.condition(model, data=sites)(num_scenes)
         if isinstance(drawing, Drawing | World):
             check_nodes(model.name, drawing, part)

@@ -6,16 +6,20 @@ Axis letters: N scenes, M nodes.
 from collections.abc import Callable, Iterable
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import TypeVar, cast
 
 import pyro
 import torch
-from torch import Tensor
+from torch import BoolTensor, Tensor
 
 from .derivation import Derivation
 from .drawing import Drawing, Layer, Sprites, resolve
 from .errors import ModelError
 from .grammar import Grammar
 from .world import Camera, Ground, Light, Meshes, MeshLayer, Photo, World, resolve_ground, resolve_meshes, resolve_scene
+
+Given = TypeVar("Given", Sprites, Meshes)
+Found = TypeVar("Found", Layer, MeshLayer)
 
 
 class SceneGraph:
@@ -47,10 +51,10 @@ class SceneGraph:
         Raises:
             GrammarError: the grammar has no such object.
         """
-        with self._plate, pyro.poutine.mask(mask=self.mask(*kinds)):
+        with self._plate, pyro.poutine.mask(mask=cast(BoolTensor, self.mask(*kinds))):
             yield
 
-    def of_parent(self, value: Tensor, default: float = 0.0) -> Tensor:
+    def of_parent(self, value: Tensor | float, default: float = 0.0) -> Tensor:
         """Each node's parent's entry of ``value (N, M)``; ``default`` where there is no parent."""
         value = torch.as_tensor(value).expand(self.kind.shape)
         return value.gather(1, self.parent.clamp(min=0)).where(self.parent >= 0, default)
@@ -80,10 +84,11 @@ class SceneGraph:
         Raises:
             ModelError: values of a wrong shape, out of range or not finite.
         """
-        parts = {"camera": camera, "light": light or Light(), "photo": photo or Photo()}
-        parts = {name: resolve_scene(part, len(self.kind)) for name, part in parts.items()}
-        ground = None if ground is None else resolve_ground(ground, len(self.kind))
-        return World(self.kind, self.grammar.kinds, self._resolved(layers, resolve_meshes), ground=ground, **parts)
+        N = len(self.kind)
+        camera, light = resolve_scene(camera, N), resolve_scene(light or Light(), N)
+        photo, ground = resolve_scene(photo or Photo(), N), None if ground is None else resolve_ground(ground, N)
+        found = self._resolved(layers, resolve_meshes)
+        return World(self.kind, self.grammar.kinds, found, camera, light, ground, photo)
 
     def draw(self, *layers: Sprites, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drawing:
         """What to render: layers from the back to the front.
@@ -93,7 +98,7 @@ class SceneGraph:
         """
         return Drawing(self.kind, self.grammar.kinds, self._resolved(layers, resolve), background)
 
-    def _resolved(self, layers: Iterable[Sprites | Meshes], resolve: Callable) -> tuple[Layer | MeshLayer, ...]:
+    def _resolved(self, layers: Iterable[Given], resolve: Callable[[Given, Tensor], Found]) -> tuple[Found, ...]:
         found = []
         for layer in layers:
             kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds

@@ -5,7 +5,9 @@ P(n = c) instead: the frontier carries how often the list has repeated, and the 
 hazard h(c) = P(n = c) / P(n >= c).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,6 +16,9 @@ from .derivation import Frontier
 from .errors import GrammarError
 from .grammar import Grammar
 from .policy import Policy
+
+if TYPE_CHECKING:
+    from .scenarios import JointGrammar
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,7 @@ class StructurePrior(Policy):
         self.table = table.log().float()
 
     @staticmethod
-    def joined(grammar: Grammar, priors: list["StructurePrior"], weights: list[float]) -> "StructurePrior":
+    def joined(grammar: "JointGrammar", priors: Sequence["StructurePrior"], weights: list[float]) -> "StructurePrior":
         """The prior of a ``JointGrammar``: a scenario by its weight, then that scenario's own table."""
         V, K = len(grammar.nonterminals), len(grammar.rules)
         P, C = (max(prior.table.shape[i] for prior in priors) for i in (1, 2))

@@ -7,6 +7,7 @@ projects to u lies at u + 0.5 in a box. Colours are sRGB in 0..1. Axis letters: 
 """
 
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -223,7 +224,10 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
     return MeshLayer(layer.meshes, present, index, labelled=layer.labelled, **numbers)
 
 
-def resolve_scene(part: Camera | Light | Photo, num_scenes: int) -> Camera | Light | Photo:
+Part = TypeVar("Part", Camera, Light, Photo)
+
+
+def resolve_scene(part: Part, num_scenes: int) -> Part:
     """Every field as one value a scene, ``(N,)`` float32, colours ``(N, 3)``; seeds int64.
 
     Raises:

@@ -10,9 +10,11 @@ import io
 import os
 import tempfile
 import warnings
-from pathlib import Path
+from typing import Any
 
+from probscene.cache import cache_folder
 from probscene.errors import ModelError, ProbsceneError
+from probscene.threads import cores
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # otherwise the import asks a server for the latest version
@@ -20,17 +22,11 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # otherwise the import ask
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # deprecations inside Taichi must not fail a run under -W error
     import taichi as ti
+    from taichi.lang.impl import get_runtime
 
-__all__ = ["available_threads", "check_canvas", "started", "start", "ti"]
+__all__ = ["check_canvas", "started", "start", "ti"]
 
 _forked_after_start = False
-
-
-def available_threads() -> int:
-    """The number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def check_canvas(canvas: tuple[int, int], threads: int | None, most: int) -> tuple[tuple[int, int], int]:
@@ -44,12 +40,12 @@ def check_canvas(canvas: tuple[int, int], threads: int | None, most: int) -> tup
         raise ModelError(f"Expected a canvas of 1 to {most} pixels, actual {height} by {width}; choose another size.")
     if threads is not None and threads < 1:
         raise ModelError(f"Expected at least one thread, actual {threads}; leave it out to use every core.")
-    return (int(height), int(width)), threads or available_threads()
+    return (int(height), int(width)), threads or cores()
 
 
 def started() -> bool:
     """Whether Taichi runs in this process, by ``start`` or by the user's own ``ti.init``."""
-    return ti.lang.impl.get_runtime().prog is not None
+    return get_runtime().prog is not None
 
 
 def start() -> None:
@@ -70,7 +66,7 @@ def start() -> None:
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints a banner
         ti.init(
             arch=ti.cpu,
-            cpu_max_num_threads=available_threads(),
+            cpu_max_num_threads=cores(),
             fast_math=False,
             cfg_optimization=False,  # takes longer than all other passes where arrays are local; LLVM does as well
             log_level=ti.ERROR,
@@ -78,9 +74,9 @@ def start() -> None:
         )
 
 
-def _cache() -> dict[str, object]:
+def _cache() -> dict[str, Any]:
     """Where compiled kernels are kept between runs, safe with several processes; nowhere if nothing can be written."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "probscene" / "taichi"
+    folder = cache_folder() / "taichi"
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     if os.access(folder, os.W_OK | os.X_OK):

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from probscene.batch import RenderBatch, Space
+from probscene.drawing import Drawing
 from probscene.errors import ModelError
 from probscene.world import World
 
@@ -62,17 +63,20 @@ class MeshRenderer:
         self._atlas = MeshAtlas()
         self._scratch: dict[str, np.ndarray] = {}
 
-    def __call__(self, world: World) -> RenderBatch:
+    def __call__(self, drawing: Drawing | World) -> RenderBatch:
         """Render every scene of a world.
 
         Where several labelled layers draw a node, its labels are those of all of them together; its 3D box is turned
         as the first layer's mesh is and holds the boxes of the others.
 
         Raises:
-            ModelError: the world holds what cannot be rendered, see ``instances``, or more than 2**22 triangles in
-                sight of one scene.
+            ModelError: it is a drawing in 2D; the world holds what cannot be rendered, see ``instances``, or more than
+                2**22 triangles in sight of one scene.
             ProbsceneError: in a process forked from one in which Taichi ran.
         """
+        if not isinstance(drawing, World):
+            raise ModelError(f"Expected a World of meshes, actual a {type(drawing).__name__}; take SpriteRenderer.")
+        world = drawing
         engine.start()
         self._atlas.trim()
         (N, M), (height, width) = world.kind.shape, self.canvas
@@ -138,14 +142,16 @@ class MeshRenderer:
                 self._scratch[name] = _zeros(max(1, workers * size), dtype)
         self._scratch["opened"][:] = 0
         atlas = self._atlas
+        buffers = [self._scratch[name] for name in each]
+        buffers += [image, instance, semantic, depth, self._scratch["seen"].reshape(-1, LANES)]
+        buffers += [_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)]
+        buffers += [result, extent]
         kernel.render(
             self.samples == 4, workers, N, height, width, max(1, world.kind.shape[1]), strips, self.map_size,
             most_vertices, most_records, np.zeros(1, np.int32), table.first, table.whole, table.real, table.scenes,
-            world.photo.seed.cpu().numpy().astype(np.int64), table.edges, table.strips, table.tiles,
+            torch.as_tensor(world.photo.seed).cpu().numpy().astype(np.int64), table.edges, table.strips, table.tiles,
             atlas.positions, atlas.corners, atlas.faces, atlas.textures.table, atlas.textures.texels,
-            *(self._scratch[name] for name in each), image, instance, semantic, depth,
-            self._scratch["seen"].reshape(-1, LANES),
-            *(_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)), result, extent,
+            *buffers,
         )  # fmt: skip
 
 

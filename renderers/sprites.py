@@ -12,6 +12,8 @@ import torch
 
 from probscene.batch import RenderBatch
 from probscene.drawing import Drawing
+from probscene.errors import ModelError
+from probscene.world import World
 
 from . import engine
 from .sprite import kernel
@@ -40,15 +42,17 @@ class SpriteRenderer:
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
         self._sheet = Sheet()
 
-    def __call__(self, drawing: Drawing) -> RenderBatch:
+    def __call__(self, drawing: Drawing | World) -> RenderBatch:
         """Render every scene of a drawing.
 
         Where several labelled layers draw a node, its silhouette's pixels are the sum over these layers.
 
         Raises:
-            ModelError: the drawing holds what cannot be drawn, see ``instances``.
+            ModelError: it is a world; the drawing holds what cannot be drawn, see ``instances``.
             ProbsceneError: in a process forked from one in which Taichi ran.
         """
+        if not isinstance(drawing, Drawing):
+            raise ModelError(f"Expected a Drawing of sprites, actual a {type(drawing).__name__}; take MeshRenderer.")
         engine.start()
         height, width = self.canvas
         scenes, nodes = drawing.kind.shape

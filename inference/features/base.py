@@ -204,7 +204,9 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
         rows = x[..., ::reduce, :].to(torch.int16)
         for i in range(1, reduce):
             rows += x[..., i::reduce, :]
-        x = sum(rows[..., i::reduce] for i in range(reduce))
+        x = rows[..., ::reduce]
+        for i in range(1, reduce):
+            x = x + rows[..., i::reduce]
     return x.float() * (1 / (255 * reduce * reduce))
 
 

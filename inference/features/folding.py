@@ -27,6 +27,6 @@ def fold(net: EfficientNet) -> None:
 
 
 def _pad_alone(convolution: nn.Conv2d) -> None:
-    sides = getattr(convolution.static_padding, "padding", ())
+    sides: list[int] = list(getattr(convolution.static_padding, "padding", ()))
     if len(set(sides)) == 1:  # those that halve pad one side only, which a convolution cannot
         convolution.padding, convolution.static_padding = (sides[0], sides[0]), nn.Identity()

@@ -132,10 +132,10 @@ class PresenceTraining:
         """
         seed_everything(batch_seed(self.seed, 0))
         classes = self.net.out.out_features
-        image, present = None, torch.zeros(self.images, classes)
+        image, present = torch.empty(0), torch.zeros(self.images, classes)
         for start in range(0, self.images, 250):  # kept as bytes: 5,000 images of 256 x 256 are 1 GB
             part = self.draw(min(250, self.images - start))
-            if image is None:
+            if start == 0:
                 image = torch.empty(self.images, *part.image.shape[1:], dtype=torch.uint8)
             image[start : start + 250] = part.image
             present[start : start + 250] = _present(part, classes)

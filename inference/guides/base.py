@@ -7,6 +7,7 @@ score function nor maximum likelihood needs a bound (Meta-Sim2, section 3.3).
 import math
 
 import pyro
+import pyro.distributions as dist
 import torch
 from torch import Tensor, nn
 
@@ -49,7 +50,7 @@ class LatentGuide(Guide):
         Z = len(self.latents)
         if Z == 1:
             return torch.zeros(num_scenes, dtype=torch.int64)
-        uniform = pyro.distributions.Categorical(logits=torch.zeros(num_scenes, 1, Z))
+        uniform = dist.Categorical(logits=torch.zeros(num_scenes, 1, Z))
         return pyro.sample("z", uniform).squeeze(-1)
 
     def logits(self, derivation: Derivation, latent: int = 0) -> Tensor:

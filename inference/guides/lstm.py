@@ -8,6 +8,8 @@ tables of logits. Without them an LSTM of 50 units has to learn to count, which 
 ``q(T) = 1/|Z| sum_z q(T|z)`` (section 3.3).
 """
 
+from typing import Any, cast
+
 import torch
 from torch import Tensor, nn
 
@@ -58,7 +60,7 @@ class LSTMGuide(LatentGuide):
             self.embed_index = nn.ModuleList(nn.Embedding(max_index + 1, hidden) for _ in range(2))
             self.index_logits = nn.ModuleList(nn.Embedding(max_index + 1, K) for _ in range(2))
             for table in (*self.embed_index, *self.index_logits):
-                nn.init.zeros_(table.weight)
+                nn.init.zeros_(cast(nn.Embedding, table).weight)
 
     def start(self, num_scenes: int) -> tuple[Tensor, Tensor]:
         """First hidden and cell state, ``(N, hidden)`` each."""
@@ -67,7 +69,7 @@ class LSTMGuide(LatentGuide):
     def step(self, memory, frontier: Frontier, previous_rule: Tensor):
         """One step of the cell."""
         x = self._input(frontier, previous_rule)
-        w = self.cell
+        w: Any = self.cell  # torch names its weights as it makes them
         h, c = torch.lstm_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
         return self._output(h, frontier), (h, c)
 

@@ -25,6 +25,8 @@ class ScenarioGuide(Guide):
         make: makes each scenario's guide instead, from its grammar and T_max.
     """
 
+    grammar: JointGrammar
+
     def __init__(
         self,
         grammar: JointGrammar,
@@ -36,8 +38,9 @@ class ScenarioGuide(Guide):
     ):
         super().__init__(grammar, max_steps)
         make = partial(make_guide, kind, **settings) if make is None else make
-        self.guides = nn.ModuleList(make(part, max_steps - 1) for part in grammar.parts.values())
-        self.mixture = Mixture(grammar, list(self.guides), weights)
+        guides = [make(part, max_steps - 1) for part in grammar.parts.values()]
+        self.guides = nn.ModuleList(guides)
+        self.mixture = Mixture(grammar, guides, weights)
 
     def start(self, num_scenes: int) -> list:
         """The memories of all guides."""

@@ -63,7 +63,7 @@ class Trust:
                     "real": float(modes.real[k]),
                     "generated": float(modes.generated[k]),
                     "prior": None if np.isnan(modes.prior[k]) else float(modes.prior[k]),
-                    "ratio": [_finite(modes.low[k]), _finite(modes.high[k])],
+                    "ratio": [_finite(float(modes.low[k])), _finite(float(modes.high[k]))],
                     "lost": bool(modes.lost[k]),
                     "missing": bool(modes.missing[k]),
                 }
@@ -133,6 +133,7 @@ def trust(
     else:
         strangers = foreign(*(np.asarray(side, np.float64) for side in looks))
     size = min(len(generated), len(some))
+    one, other = np.array_split(read_some, 2)
     figures = Figures(
         joint=joint,
         single=single,
@@ -146,7 +147,7 @@ def trust(
         foreign=float(strangers.mean()),
         by_appearance=looks is not None,
         effective=effective_share(read_generated, read_some, seed=seed),
-        effective_floor=effective_share(*np.array_split(read_some, 2), seed=seed),
+        effective_floor=effective_share(one, other, seed=seed),
         fidelity=fidelity(generated[:size], some[:size]),
         fidelity_floor=fidelity(first, second),
         numbers=(len(generated), len(whole), 0 if before is None else len(before)),

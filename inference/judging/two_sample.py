@@ -173,7 +173,7 @@ def _some(rows: Features, most: int, rng: np.random.Generator) -> Features:
     return rows if len(rows) <= most else rows[rng.permutation(len(rows))[:most]]
 
 
-def _mean(distances: Features, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> float:
+def _mean(distances: NDArray[np.floating], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> float:
     return float(distances[np.ix_(rows, columns)].mean())
 
 

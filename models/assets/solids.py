@@ -6,6 +6,7 @@ F triangles, S rings, R points of a ring.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,9 @@ from probscene.mesh import Mesh
 
 ROUND = math.radians(66)  # crease of what is round, down to six sides
 SHARP = math.radians(20)
+
+
+Tinted = bool | Sequence[bool] | np.ndarray
 
 
 class Solid(NamedTuple):
@@ -28,7 +32,7 @@ class Solid(NamedTuple):
     uv: np.ndarray
 
 
-def solid(positions, triangles, colour, tinted=False, crease: float = SHARP) -> Solid:
+def solid(positions, triangles, colour, tinted: Tinted = False, crease: float = SHARP) -> Solid:
     """A closed surface turned outward, without what has no area.
 
     Args:
@@ -80,7 +84,7 @@ def corner_normals(positions: np.ndarray, triangles: np.ndarray, crease: float) 
     return normals.reshape(-1, 3, 3)
 
 
-def loft(rings, colour, tinted=False, crease: float = SHARP, ends=None) -> Solid:
+def loft(rings, colour, tinted: Tinted = False, crease: float = SHARP, ends=None) -> Solid:
     """Rings joined one to the next, the first and last, which are convex, filled.
 
     Args:
@@ -118,13 +122,20 @@ def _zigzag(R: int) -> np.ndarray:
     return np.array(faces)
 
 
-def box(size, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinted=False) -> Solid:
+def box(size, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinted: Tinted = False) -> Solid:
     """Length, width and height; ``at`` is the middle of its underside."""
     x, y, z = size
     return prism([(-x / 2, -y / 2), (x / 2, -y / 2), (x / 2, y / 2), (-x / 2, y / 2)], z, at, colour, tinted)
 
 
-def prism(outline, height, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinted=False, crease: float = SHARP) -> Solid:
+def prism(
+    outline,
+    height,
+    at=(0.0, 0.0, 0.0),
+    colour=(200, 200, 200),
+    tinted: Tinted = False,
+    crease: float = SHARP,
+) -> Solid:
     """A convex outline ``(R, 2)`` in x and y, raised from ``at``."""
     flat = np.asarray(outline, float)
     rings = [np.column_stack([flat, np.full(len(flat), z)]) for z in (0.0, height)]
@@ -137,7 +148,7 @@ def circle(radius: float, sides: int, turn: float = 0.0) -> np.ndarray:
     return radius * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
-def lathe(profile, sides: int, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinted=False) -> Solid:
+def lathe(profile, sides: int, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinted: Tinted = False) -> Solid:
     """Turned about z: ``profile`` is a list of (radius, z) from below; ``colour`` may be one for each step of it."""
     unit = circle(1.0, sides)
     rings = [np.column_stack([r * unit, np.full(sides, z)]) for r, z in profile]
@@ -147,7 +158,7 @@ def lathe(profile, sides: int, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinte
     return place(loft(rings, colour, tinted, ROUND), at)
 
 
-def tube(path, radius, sides: int = 5, colour=(200, 200, 200), tinted=False) -> Solid:
+def tube(path, radius, sides: int = 5, colour=(200, 200, 200), tinted: Tinted = False) -> Solid:
     """Along a path ``(S, 3)``, with one radius or one for each point; one colour, or one for each step."""
     path = np.asarray(path, float)
     radii = np.broadcast_to(np.asarray(radius, float), len(path))
@@ -177,7 +188,14 @@ def hoop(radius: float, thick: float, sides: int, colour, around: int = 3) -> So
     return solid(points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), colour, False, math.pi * 0.7)
 
 
-def ball(radii, at=(0.0, 0.0, 0.0), colour=(200, 200, 200), tinted=False, rows: int = 4, sides: int = 7) -> Solid:
+def ball(
+    radii,
+    at=(0.0, 0.0, 0.0),
+    colour=(200, 200, 200),
+    tinted: Tinted = False,
+    rows: int = 4,
+    sides: int = 7,
+) -> Solid:
     """An ellipsoid about ``at``, ``radii`` along x, y and z."""
     angle = math.pi * np.arange(rows + 1) / rows
     made = lathe([(math.sin(a), -math.cos(a)) for a in angle], sides, colour=colour, tinted=tinted)

@@ -11,11 +11,13 @@ lanes with equal probability (two to four where the paper's rural street has no 
 0.5. The simple prior has 0 to 2 everywhere; the tuned numbers are ours, the paper prints none.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import cache, reduce
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import poisson
 
 from probscene.grammar import Grammar
@@ -110,7 +112,7 @@ def target(scenario: str, seed: int, vehicles: tuple[str, ...] = VEHICLES) -> St
             return _policy(scenario, vehicles, lists, kinds, streets)
 
 
-def vehicle_numbers(scenario: str, lengths: Sequence[float], streets: Sequence[float]) -> np.ndarray:
+def vehicle_numbers(scenario: str, lengths: ArrayLike, streets: ArrayLike) -> np.ndarray:
     """``(49,)``, how probable each number of vehicles in a scene is.
 
     Args:
@@ -129,7 +131,7 @@ def bounds(scenario: str, name: str) -> dict[str, tuple[int, int]]:
     return {key: SIMPLE if name == "simple" else limits for key, limits in BOUNDS[scenario].items()}
 
 
-def _policy(scenario, vehicles, lists, kinds=MappingProxyType({}), streets=None) -> StructurePrior:
+def _policy(scenario, vehicles, lists, kinds: Mapping[str, Any] = MappingProxyType({}), streets=None) -> StructurePrior:
     """``lists``: probabilities of lengths; ``kinds``: of what stands in a list; ``streets``: of the productions."""
     streets = _lane_weights(scenario) if streets is None else streets
     kinds = {"Cars": [SHARES[name] for name in vehicles], **kinds}

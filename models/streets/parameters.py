@@ -5,6 +5,7 @@ Shares (0 to 1) choose: ``make`` a mesh, ``colour`` a tint, ``place`` where alon
 """
 
 import math
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import torch
@@ -95,4 +96,4 @@ TINTS = MappingProxyType({
 def gap(scenario: str, kind: str) -> float:
     """Metres along the road that are free around a thing."""
     free = GAPS.get(kind, GAP)
-    return free if isinstance(free, float) else free.get(scenario, GAP)
+    return free.get(scenario, GAP) if isinstance(free, Mapping) else free

@@ -50,7 +50,8 @@ def things(nodes: Nodes, meshes: Mapping[str, tuple[Mesh, ...]]) -> tuple[Street
     scale = nodes.each("scale").minimum(room / size.amax(-1).clamp(min=1e-3)).unsqueeze(-1).repeat(1, 1, 3)
     yaw = facing(nodes) + nodes.each("turn").where(standing, 0.0)
     length, breadth = (each * standing for each in extent(size * scale[..., :2], yaw))
-    length = length + sum(gap(nodes.scenario, kind) * graph.mask(kind) for kind in nodes.things)
+    free = [gap(nodes.scenario, kind) * graph.mask(kind) for kind in nodes.things]
+    length = length + sum(free, torch.zeros(()))
     road, strip = strips(nodes, length, breadth)
     near, width, start, stop, height, side, lines = (graph.of_parent(value) for value in strip)
     lines, place = lines.clamp(min=1), nodes.each("place")

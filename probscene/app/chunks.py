@@ -6,14 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import pyro
 import torch
+from pyro.util import get_rng_state, set_rng_state
 from torch import Tensor
 
 from probscene.dataset import grey
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import Scenes, sample, seed_everything
+from probscene.threads import threads
 
 CHUNK = 64
 
@@ -21,14 +22,14 @@ CHUNK = 64
 @contextmanager
 def chunk_randomness(seed: int, chunk: int) -> Iterator[None]:
     """The random numbers of one chunk; the generators' state from before is put back afterwards."""
-    before = pyro.util.get_rng_state()
+    before = get_rng_state()
     words = [int(word) for word in np.random.SeedSequence(seed, spawn_key=(chunk,)).generate_state(3)]
     seed_everything(words[0])
     torch.manual_seed(words[1] << 32 | words[2])  # numpy's seed has 32 bits, in which many chunks would collide
     try:
         yield
     finally:
-        pyro.util.set_rng_state(before)
+        set_rng_state(before)
 
 
 def draw_chunk(model: SceneModel, policy: Policy, seed: int, chunk: int) -> Scenes:
@@ -37,13 +38,8 @@ def draw_chunk(model: SceneModel, policy: Policy, seed: int, chunk: int) -> Scen
     Raises:
         SamplingError, ModelError: see ``sample``.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums of floats depend on how many threads share them
-    try:
-        with chunk_randomness(seed, chunk):
-            return sample(model, policy, CHUNK)
-    finally:
-        torch.set_num_threads(threads)
+    with threads(1), chunk_randomness(seed, chunk):
+        return sample(model, policy, CHUNK)
 
 
 def as_written(model: SceneModel, image: Tensor) -> Tensor:

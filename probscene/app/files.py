@@ -36,8 +36,8 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """``write_whole`` for text."""
-    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    """``write_whole`` for text: UTF-8, the same bytes on every platform."""
+    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8", newline="\n"))
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -66,10 +66,11 @@ def make_folder(path: Path) -> Path:
 
 def machine_error(error: OSError, path: Path) -> MachineError:
     """The message for an ``OSError`` while writing ``path``."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in _FULL:
         return MachineError(f"The disk is full: could not write {path}. Free some space and run the command again.")
     return MachineError(f"Could not write {path}: {error.strerror or error}.")
 
 
+_FULL = {getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name)}
 _UMASK = os.umask(0)
 os.umask(_UMASK)

@@ -59,7 +59,7 @@ def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
 def _with_environment(model: SceneModel) -> SceneModel:
     """The model with the assets that an environment variable names, if it has one that is set."""
     folder = os.environ.get(model.assets_variable, "") if model.assets_variable else ""
-    if not folder:
+    if not folder or model.with_assets is None:
         return model
     try:
         drawn = model.with_assets(os.path.abspath(folder))

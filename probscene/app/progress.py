@@ -13,6 +13,7 @@ from rich.progress import (
     MofNCompleteColumn,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
 )
 from rich.progress import (
@@ -61,7 +62,7 @@ class _Stage:
     began: float
     first: int  # what was done at the first report
     first_at: float
-    bar: int
+    bar: TaskID
     done: int = 0
     total: int = 0
     note: str = ""

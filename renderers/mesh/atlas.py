@@ -60,8 +60,8 @@ class MeshAtlas:
         self._covers += len(surfaces)
         if not meshes:
             return
-        textured = [mesh for mesh in meshes if mesh.texture is not None]
-        texture = dict(zip(textured, self.textures.add([mesh.texture for mesh in textured]), strict=True))
+        textured = {mesh: mesh.texture for mesh in meshes if mesh.texture is not None}
+        texture = dict(zip(textured, self.textures.add([*textured.values()]), strict=True))
         vertices = np.array([0, *(len(mesh.positions) for mesh in meshes)])
         triangles = np.array([0, *(len(mesh.triangles) for mesh in meshes)])
         if self.faces.size // FACE + triangles.sum() > _MOST:

@@ -41,7 +41,8 @@ def numbers(part: object, *names: str) -> list[np.ndarray]:
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Of matrices or a matrix and a vector, ``(..., i, 3)`` by ``(..., 3, j)``, added up in one order always."""
-    return sum(a[..., :, k, None] * b[..., k, None, :] for k in range(3))
+    one, two, three = (a[..., :, k, None] * b[..., k, None, :] for k in range(3))
+    return 0 + one + two + three  # from 0, so that no zero is negative
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

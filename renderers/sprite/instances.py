@@ -168,7 +168,7 @@ def _fill(whole, real, values, layer, drawing, sheet, canvas) -> None:
     np.divide(1.0, steps, out=per_position, where=steps != 0)
 
 
-def _variants(sprite, level, magnified, layer, drawing, sheet) -> tuple[Variant, np.ndarray]:
+def _variants(sprite, level, magnified, layer, drawing, sheet) -> tuple[Variant[np.ndarray], np.ndarray]:
     """Every instance's variant, as arrays ``(I,)``, and its sprite's width and height ``(I, 2)``."""
     found = np.zeros((len(layer), len(Variant._fields)), np.int64)
     size = np.zeros((len(layer), 2), np.float64)

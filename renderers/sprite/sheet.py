@@ -1,6 +1,6 @@
 """Sprites as the kernel reads them: premultiplied, box-filtered, framed, one word a texel."""
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -14,17 +14,20 @@ _MOST = (1 << 31) - 1  # the kernel's indices are 32-bit
 _LANES = np.array([0, 16, 32, 48], np.uint64)
 
 
-class Variant(NamedTuple):
+Whole = TypeVar("Whole", int, np.ndarray)
+
+
+class Variant(NamedTuple, Generic[Whole]):
     """A sprite at a level for x and y, or an array of each field."""
 
-    offset: int  # of the frame's first texel
-    width: int  # without the frame
-    height: int
-    left: int  # texels trimmed from the level
-    top: int
-    inset: int  # margin within which every texel is opaque
-    even: int  # 1 if these are all of one colour
-    touches: int  # 1 if an outermost texel of the level is not clear
+    offset: Whole  # of the frame's first texel
+    width: Whole  # without the frame
+    height: Whole
+    left: Whole  # texels trimmed from the level
+    top: Whole
+    inset: Whole  # margin within which every texel is opaque
+    even: Whole  # 1 if these are all of one colour
+    touches: Whole  # 1 if an outermost texel of the level is not clear
 
 
 class Sheet:
@@ -41,7 +44,7 @@ class Sheet:
     def _clear(self) -> None:
         self._rows: WeakKeyDictionary[Atlas, dict[int, int]] = WeakKeyDictionary()
         self._sizes: WeakKeyDictionary[Atlas, np.ndarray] = WeakKeyDictionary()
-        self._variants: list[Variant] = []
+        self._variants: list[Variant[int]] = []
         self._used = 0
         self.texels = np.zeros(1 << 16, np.uint64)
         self.colours = np.zeros(1 << 16, np.uint32)
@@ -77,7 +80,7 @@ class Sheet:
                 self._variants.append(self._make(atlas.sprites[index], level_x, level_y, bool(magnified)))
         return rows[key]
 
-    def _make(self, sprite: np.ndarray, level_x: int, level_y: int, hard: bool) -> Variant:
+    def _make(self, sprite: np.ndarray, level_x: int, level_y: int, hard: bool) -> Variant[int]:
         texels = shrink(sprite, level_x, level_y)
         alpha = texels[..., 3]
         touches, left, top = any(side.any() for side in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1])), 0, 0

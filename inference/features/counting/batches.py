@@ -6,7 +6,7 @@ letters: N images, M nodes, K crops.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -111,7 +111,7 @@ class CountBatches:
         area = math.prod(self.net.canvas) / self.net.reduce**2
         return min(self.schedule.images, max(FEWEST, round(self.schedule.images * FULL / area)))
 
-    def after(self, done: int) -> Iterator[list[CountBatch]]:
+    def after(self, done: int) -> Generator[list[CountBatch]]:
         """The batches that are left after ``done`` steps, a draw at a time, while another thread makes the next."""
         return ahead(self._draw, range(done, self.schedule.steps, STEPS_A_DRAW))
 
@@ -170,7 +170,7 @@ class CountBatches:
         at = which[:, None, None], y.clamp(0, h - 1)[:, :, None], x.clamp(0, w - 1)[:, None, :]
         shown = seen[at] & inside
         middle = batch.middle[which].gather(1, node[at].clamp(min=0).flatten(1)).view(shown.shape)
-        here = x[:, None, :] if groups.along == "x" else y[:, :, None]
+        here = x[:, None, :] if groups is not None and groups.along == "x" else y[:, :, None]
         return shown.float(), (middle / r - here).where(shown, 0.0) / STRIDE, cells_each
 
     def _places(self, centre: Tensor, label: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

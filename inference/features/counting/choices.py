@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
@@ -13,6 +13,9 @@ from ..base import FeatureNet, Features, Photographs, Renders
 from .batches import CountSchedule
 from .net import CountNet
 from .training import CountTraining
+
+if TYPE_CHECKING:
+    from .pretrained import PretrainedCountNet
 
 COUNT_ON_PRETRAINED = "count=efficientnet"
 
@@ -79,24 +82,24 @@ class PretrainedCountFeatures(Features):
         and in photographs it must read many."""
         from .pretrained_training import PretrainedCountTraining
 
-        some = None
+        some, heads = None, cast("PretrainedCountNet", net)
         if self.photographs:
             some = photographs().some(self.photographs)
-            net.learn_from(photographs().fingerprint)
+            heads.learn_from(photographs().fingerprint)
         seed = batch_seed(seed, 1)
         return PretrainedCountTraining(
-            net, renders.draw_twice, self.pairs, self.epochs, self.scenes, seed=seed, photographs=some
+            heads, renders.draw_twice, self.pairs, self.epochs, self.scenes, seed=seed, photographs=some
         )
 
     def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
         """Of things as chosen, of stuff none, of directions without marginals: photographs often lie beyond all renders
         in one, where what is nearest is not what has as many cars."""
-        joint = replace(chosen, marginal_variance=None) if hasattr(chosen, "marginal_variance") else chosen
-        return Blockwise(net.blocks, (chosen, None, joint))
+        joint = replace(cast(Any, chosen), marginal_variance=None) if hasattr(chosen, "marginal_variance") else chosen
+        return Blockwise(cast("PretrainedCountNet", net).blocks, (chosen, None, joint))
 
     def taught_by(self, net: FeatureNet) -> str:
         """The images that the heads taught themselves on."""
-        return net.taught_by_fingerprint
+        return cast("PretrainedCountNet", net).taught_by_fingerprint
 
     def settings(self, preset: Any) -> dict[str, Any]:
         """Photographs' counts are noisy, and few: a prior, where there is one, holds them more. Those of things do lie

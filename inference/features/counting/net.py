@@ -12,6 +12,7 @@ The paper has a network of presences instead (``presence``), which keeps less of
 
 import copy
 import math
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -43,6 +44,8 @@ class CountNet(nn.Module):
     """
 
     unit = 1.0
+    reduction: Tensor
+    group_cells: Tensor
 
     def __init__(
         self,
@@ -75,9 +78,11 @@ class CountNet(nn.Module):
         )
         self.register_buffer("group_cells", torch.ones(()))  # cells that an ordinary group covers
         with torch.no_grad():  # start from "nothing here", which nearly every cell holds
-            self.body[-1].weight.mul_(0.3)
-            self.body[-1].bias.zero_()
-            self.body[-1].bias[0] = 3.0
+            last = cast(nn.Conv2d, self.body[-1])
+            last.weight.mul_(0.3)
+            bias = cast(Tensor, last.bias)
+            bias.zero_()
+            bias[0] = 3.0
         self._fused: nn.Module | None = None
 
     @property
@@ -153,7 +158,7 @@ class _Residual(nn.Module):
     def __init__(self, width: int):
         super().__init__()
         self.a, self.b = nn.Sequential(*_conv(width, width, 3, 1)), nn.Sequential(*_conv(width, width, 3, 1)[:2])
-        nn.init.zeros_(self.b[1].weight)
+        nn.init.zeros_(cast(nn.BatchNorm2d, self.b[1]).weight)
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(x + self.b(self.a(x)), inplace=True)

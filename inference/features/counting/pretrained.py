@@ -18,6 +18,7 @@ Axis letters: N images, C channels of the maps, h w places, P pooled features, d
 """
 
 import math
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -47,6 +48,13 @@ class PretrainedCountNet(nn.Module):
         blocks: how many features are counts of things, counts of stuff, and directions.
         taught_by: fingerprint of the images that the heads taught themselves on, ``(32,)`` uint8; zeros for none.
     """
+
+    mean: Tensor
+    scale: Tensor
+    unit: Tensor
+    taught_by: Tensor
+    projected_mean: Tensor
+    projected_weight: Tensor
 
     def __init__(
         self,
@@ -93,13 +101,14 @@ class PretrainedCountNet(nn.Module):
         self.mean.copy_(maps.mean((0, 2, 3)).view(-1, 1, 1))
         self.scale.copy_(maps.std((0, 2, 3)).view(-1, 1, 1) + 1e-3)
         for head in self.heads:
-            head[-1].bias.copy_(target.mean((0, 2, 3)).clamp(min=1e-6).log())
+            _last(head).bias.copy_(target.mean((0, 2, 3)).clamp(min=1e-6).log())
 
     @torch.no_grad()
     def finish(self, projection: Projection, maps: Tensor) -> None:
         """Take over a projection of pooled features, and choose the unit of the counts by the things in maps of renders
         that nothing was trained on, as many as a batch of the fit has."""
-        self.projected_mean.copy_(projection.mean), self.projected_weight.copy_(projection.weight)
+        self.projected_mean.copy_(projection.mean)
+        self.projected_weight.copy_(projection.weight)
         things = self.order[: self.blocks[0]]
         self.unit[: len(self.order)] = bandwidth(self.counts(maps)[:, things])
 
@@ -108,7 +117,8 @@ class PretrainedCountNet(nn.Module):
         """Maps ``(N, C, h, w)`` and pooled features ``(N, P)`` of ``(N, 1 or 3, H, W)`` uint8 images."""
         net = self.frozen[0]
         parts = [net.places(net.enter(some)) for some in images.split(AT_ONCE)]
-        return tuple(torch.cat(part) for part in zip(*parts, strict=True))
+        maps, pooled = (torch.cat(part) for part in zip(*parts, strict=True))
+        return maps, pooled
 
     def forward(self, maps: Tensor) -> Tensor:
         """Logits of the places by each head, ``(HEADS, N, 1 + classes, h, w)``."""
@@ -159,5 +169,10 @@ def _head(channels: int, out: int) -> nn.Sequential:
         nn.Conv2d(HIDDEN, out, 1),
     )
     with torch.no_grad():
-        head[-1].weight.mul_(0.3)
+        _last(head).weight.mul_(0.3)
     return head
+
+
+def _last(head: nn.Module) -> Any:
+    """The last convolution of a head."""
+    return cast(nn.Sequential, head)[-1]

@@ -120,7 +120,8 @@ class PretrainedCountTraining:
             if each is not None:
                 each(self, {"loss": loss})
         self.net.eval()
-        projection = discriminant(*pooled[:n].chunk(2), self.net.blocks[-1], self.held_out)
+        one, other = pooled[:n].chunk(2)
+        projection = discriminant(one, other, self.net.blocks[-1], self.held_out)
         self.net.finish(projection, maps[n:])
         seen, true = self.net.counts(maps[n:]), target[n:, 1:].float().sum((2, 3))
         each_class = zip(seen.T, true.T, strict=True)
@@ -167,10 +168,10 @@ class PretrainedCountTraining:
             for part, of_drawings in zip(parts, (maps, pooled, target), strict=True):
                 part.append(of_drawings.chunk(2))
         cut = len(_parts(self.pairs))
-        renders = (
+        maps, pooled, target = (
             torch.cat([both[i] for some in (part[:cut], part[cut:]) for i in (0, 1) for both in some]) for part in parts
         )
-        return *renders, torch.cat([look(some)[0] for some in photographs] or [maps[:0]])
+        return maps, pooled, target, torch.cat([look(some)[0] for some in photographs] or [maps[:0]])
 
     def _own(self, photographs: Tensor) -> Tensor:
         """What the places of photographs' maps hold in the heads' own belief, ``(L, 1 + classes, h, w)``."""

@@ -94,14 +94,14 @@ class CountTraining:
         number = batch.target.shape[1]
         logits = self.net(batch.image)
         loss = count_loss(logits[:, :number], batch.target, batch.margin, s.count_weight)
-        if batch.votes is not None:
+        if batch.votes is not None and batch.group_cells is not None:
             loss = loss + s.group_weight * group_loss(logits[:, number:], batch.votes, batch.margin)
             self.net.group_cells.lerp_(batch.group_cells, max(0.01, 1 / (self.done + 1)))
         self.net.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         for weight, matrix in self.matrices:
-            matrix.grad = weight.grad.view_as(matrix)
+            matrix.grad = None if weight.grad is None else weight.grad.view_as(matrix)
             with torch.no_grad():  # batch norm makes the scale free; fixed, the rate means the same all the way
                 matrix.mul_(len(matrix) ** 0.5 / matrix.norm())
         for optimiser in self.optimisers.values():

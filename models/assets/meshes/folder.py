@@ -23,7 +23,7 @@ from probscene.errors import DataError
 from probscene.mesh import Mesh
 
 from ..catalogue import DECORATION, KINDS, street
-from .reader import SUFFIXES, read
+from .reader import SUFFIXES, Fields, read
 
 MOST_TRIANGLES = 200_000
 
@@ -139,7 +139,7 @@ def _checked(file: Path, kind: str) -> Mesh:
     return Mesh(**parts)
 
 
-def _scale(parts: dict, file: Path, metres: list[float], axis: int) -> None:
+def _scale(parts: Fields, file: Path, metres: list[float], axis: int) -> None:
     """As the file's name says; corner normals turn with the faces."""
     extent = np.ptp(parts["positions"], axis=0)
     wanted = np.array(metres) if len(metres) == 3 else metres[0] * np.ones(3)

@@ -7,7 +7,10 @@ import numpy as np
 _FLAT = 1e-3  # of a polygon's area, by which a triangle of its fan may be turned over: rounding
 
 
-def unfillable(positions: np.ndarray, polygons: Sequence[Sequence[int]]) -> int | None:
+Polygons = Sequence[Sequence[int]] | np.ndarray
+
+
+def unfillable(positions: np.ndarray, polygons: Polygons) -> int | None:
     """The number of the first polygon that its fan does not fill, such as one with a dent; None where all are filled.
 
     A fan fills a polygon of which the first corner sees all of it, every convex one therefore.
@@ -16,7 +19,7 @@ def unfillable(positions: np.ndarray, polygons: Sequence[Sequence[int]]) -> int 
         positions: ``(V, 3)``.
         polygons: vertices of each. One that is not there, or not finite, is no fault of the polygon.
     """
-    finite = np.isfinite(positions).all(1).tolist()
+    finite = np.asarray(np.isfinite(positions).all(1)).tolist()
     of_length: dict[int, list[int]] = {}
     for number, polygon in enumerate(polygons):
         if len(polygon) > 3 and all(0 <= vertex < len(finite) and finite[vertex] for vertex in polygon):

@@ -6,17 +6,16 @@ All of its parts become one, with their transforms; corner normals are made anew
 
 import math
 import warnings
-from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
 from probscene.errors import DataError
 
 from ..solids import corner_normals, volume
-from .polygons import unfillable
+from .polygons import Polygons, unfillable
 from .sources import Sources, sources
 from .texture_sheet import sheet
 
@@ -37,7 +36,19 @@ class Part(NamedTuple):
     texture: np.ndarray | None
 
 
-def read(file: Path) -> dict[str, np.ndarray | None]:
+class Fields(TypedDict):
+    """Fields of a ``Mesh``."""
+
+    positions: np.ndarray
+    triangles: np.ndarray
+    colour: np.ndarray
+    tinted: np.ndarray
+    normals: np.ndarray
+    uv: np.ndarray | None
+    texture: np.ndarray | None
+
+
+def read(file: Path) -> Fields:
     """Fields of a ``Mesh``: +x forward, +y left, +z up; neither moved nor scaled.
 
     Raises:
@@ -128,7 +139,7 @@ def _parts(file: Path, scene, named: Sources, triangular: type) -> list[Part]:
     return parts
 
 
-def _ply_faces(file: Path, piece) -> Sequence[Sequence[int]]:
+def _ply_faces(file: Path, piece) -> Polygons:
     """The faces of a PLY as they are in the file; trimesh takes a binary one's to be all as long as the first."""
     data = piece.metadata.get("_ply_raw", {}).get("face", {}).get("data")
     names = (data.dtype.names or ()) if isinstance(data, np.ndarray) else data or ()

@@ -27,11 +27,11 @@ def sheet(parts) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
     if not distinct:
         return None, None, flat
     if len(distinct) == 1 and all(texture is not None for _, texture, _, _ in parts):
-        return np.concatenate([uv for uv, _, _, _ in parts]), next(iter(distinct.values())), flat
-    repeats = dict.fromkeys(distinct, (1, 1))
+        return np.concatenate([uv for uv, _, _, _ in parts if uv is not None]), next(iter(distinct.values())), flat
+    repeats: dict[bytes, tuple[int, int]] = dict.fromkeys(distinct, (1, 1))
     moved = []
     for uv, texture, number, _ in parts:
-        if texture is None:
+        if uv is None or texture is None:
             moved.append((None, b"", number))
             continue
         uv = uv - np.floor(uv.min(1, keepdims=True) + 1e-6)

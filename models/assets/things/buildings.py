@@ -125,8 +125,9 @@ def _roofed(part: Solid, colour, tile: float = 6.0) -> Solid:
     low, high = corners[..., 2].min(), corners[..., 2].max()
     v = ROOF[1] + (ROOF[0] - ROOF[1]) * (corners[..., 2] - low) / (high - low)
     uv = np.where(slope[..., None], np.stack([u, v], 2), [0.5, BARE])
-    paint = np.where(slope.all(1)[:, None], colour, part.colour)
-    return part._replace(uv=uv, colour=paint, tinted=~slope.all(1) & part.tinted)
+    tiled = np.all(slope, 1, keepdims=True)
+    paint = np.where(tiled, colour, part.colour)
+    return part._replace(uv=uv, colour=paint, tinted=~tiled[:, 0] & part.tinted)
 
 
 def _gable(depth, width, height, rise, colour, wall, turned=False, over: float = 0.45) -> Solid:

@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features
@@ -72,10 +72,10 @@ def fit(
             stays, and ``resume=True`` goes on with it.
     """
     chosen, parts = chosen_preset(preset, features, divergence, guide, settings)
-    loaded = load_model(str(model), assets) if renderer is not None and not isinstance(model, SceneModel) else model
     if renderer is not None:
-        loaded = replace(loaded, renderer=renderer)
-    given = loaded if isinstance(loaded, SceneModel) else str(loaded)
+        loaded = model if isinstance(model, SceneModel) else load_model(str(model), assets)
+        model = replace(loaded, renderer=renderer)
+    given = model if isinstance(model, SceneModel) else str(model)
     folder, temporary = Path(out) if out is not None else None, None
     if folder is None:
         temporary = tempfile.mkdtemp(prefix="probscene-")
@@ -108,7 +108,7 @@ def fit(
             raise
     if temporary is not None:
         weakref.finalize(run, shutil.rmtree, temporary, True)
-    return run
+    return cast(Run, run)
 
 
 def chosen_preset(

@@ -3,6 +3,7 @@
 Exit codes: 0; 2 where the input is at fault; 1 where the machine is, where the work was interrupted, and for a bug.
 """
 
+import io
 import os
 import sys
 
@@ -15,7 +16,8 @@ __all__ = ["app", "explained", "fit_commands", "main", "model_commands", "run_co
 
 def main() -> None:
     """The console script."""
-    sys.stdout.reconfigure(errors="replace")  # a grammar's ε on a terminal that has none
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a grammar's ε on a terminal that has none
     # Torch's threads wait for one another spinning, which on a machine that has other work takes six times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()

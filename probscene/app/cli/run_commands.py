@@ -142,7 +142,9 @@ def compare(
             images = session.open_images(target, first.model, first.record["skip_bad"], show)
         elif labels is not None:
             images = fit.open_target(first, show)
-        truth = None if labels is None else read_labels(labels, first.model, images, min_height=min_height)
+        truth = None
+        if labels is not None and images is not None:
+            truth = read_labels(labels, first.model, images, min_height=min_height)
         found = compare.compare(opened, images, truth, show, num)
         comparison.draw(found, out)
     tables.show_comparison(found, Console(highlight=False))

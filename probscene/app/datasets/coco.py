@@ -9,7 +9,7 @@ rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within 
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from pycocotools import mask as rle
@@ -69,7 +69,7 @@ def write(path: Path, model: SceneModel, num: int, info: dict[str, Any], found: 
         for i in range(num)
     )
     numbered = ({"id": number, **annotation} for number, annotation in enumerate(found, 1))
-    with open(path, "w", encoding="utf-8") as file:
+    with open(path, "w", encoding="utf-8", newline="\n") as file:
         file.write(f'{{"info": {json.dumps(info)},\n"licenses": [],\n"categories": {json.dumps(categories(model))}')
         for key, entries in (("images", images), ("annotations", numbered)):
             file.write(f',\n"{key}": [')
@@ -94,7 +94,7 @@ def _masks(instance: Tensor, nodes: Tensor) -> list[dict[str, Any]]:
         return []
     columns = instance.T.contiguous()  # runs go down the columns
     masks = columns == (nodes + 1).view(-1, 1, 1).to(columns.dtype)
-    encoded = rle.encode(masks.numpy().view("uint8").transpose(2, 1, 0))
+    encoded = cast(list[dict[str, Any]], rle.encode(masks.numpy().view("uint8").transpose(2, 1, 0)))
     return [{"size": mask["size"], "counts": mask["counts"].decode("ascii")} for mask in encoded]
 
 

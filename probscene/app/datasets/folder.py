@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -172,10 +173,11 @@ class Parts:
 
 def _link(other: Path, path: Path) -> None:
     """Make ``path`` another name of a file, or a copy of it where the file system has no second names."""
-    try:
-        os.link(other, path)
-    except OSError:
-        shutil.copyfile(other, path)
+    if hasattr(os, "link"):
+        with suppress(OSError):
+            os.link(other, path)
+            return
+    shutil.copyfile(other, path)
 
 
 def _move(file: Path, path: Path) -> None:

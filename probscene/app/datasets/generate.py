@@ -205,7 +205,7 @@ class Job:
             found = (annotation for record in parts.records() for annotation in record["annotations"])
             labels["annotations.json"] = lambda path: coco.write(path, model, parts.num, parts.settings, found)
         if "yolo" in self.formats:
-            labels["data.yaml"] = lambda path: path.write_text(yolo.data(model), encoding="utf-8")
+            labels["data.yaml"] = lambda path: path.write_text(yolo.data(model), encoding="utf-8", newline="\n")
         if "webdataset" in self.formats:
             for number, chunks in enumerate(parts.chunks(shards.CHUNKS)):
                 labels[shards.shard_name(number)] = partial(self._write_shard, chunks)
@@ -229,5 +229,5 @@ def _worker(run: Path, num: int, out: Path, seed: int, format: tuple[str, ...]) 
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:
-    with open(path, "w", encoding="utf-8") as file:
+    with open(path, "w", encoding="utf-8", newline="\n") as file:
         file.writelines(lines)

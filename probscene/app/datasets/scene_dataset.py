@@ -131,7 +131,7 @@ class SceneDataset(IterableDataset):
             while at < stop:
                 chunk, first = divmod(at, CHUNK)
                 last = min(first + stop - at, CHUNK)
-                if drawn != chunk:
+                if scenes is None or drawn != chunk:
                     drawn, scenes = chunk, draw_chunk(model, policy, self.seed, start + chunk)
                 batch = render(scenes.drawing[first:last])
                 yield from self._samples(model, batch, (start + chunk) * CHUNK + first)

@@ -6,14 +6,14 @@ when it is interrupted, and a worker whose parent is gone ends after its task.
 
 import signal
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
-
-import torch
+from typing import cast
 
 from probscene.errors import MachineError, ProbsceneError
+from probscene.threads import use_threads
 
 
 def spread(
@@ -36,7 +36,8 @@ def spread(
     context = get_context("spawn")
     todo = iter(tasks)
     crew = {}
-    resource_tracker.ensure_running()  # otherwise the first start would, and let interrupts through
+    if hasattr(signal, "pthread_sigmask"):
+        resource_tracker.ensure_running()  # otherwise the first start would, and let interrupts through
     try:
         for _ in range(min(workers, len(tasks))):
             here, there = context.Pipe()
@@ -47,7 +48,7 @@ def spread(
             there.close()
             here.send(next(todo))
         while crew:
-            for here in wait(list(crew)):
+            for here in cast(list[Connection], wait(list(crew))):
                 done(_answer(here))
                 task = next(todo, None)
                 if task is None:
@@ -77,7 +78,8 @@ def _answer(here: Connection) -> int:
 
 def _work(there: Connection, prepare: Callable, arguments: tuple) -> None:
     try:
-        torch.set_num_threads(1)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # where there is no mask to inherit
+        use_threads(1)
         task = there.recv()
         work = prepare(*arguments)
         while True:
@@ -92,7 +94,10 @@ def _work(there: Connection, prepare: Callable, arguments: tuple) -> None:
 
 
 @contextmanager
-def _interrupts_held():
+def _interrupts_held() -> Iterator[None]:
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

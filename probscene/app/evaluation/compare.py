@@ -113,8 +113,10 @@ class Comparison(Evaluation):
         return self._row("class of an object", {name: shares for name, shares in each.items() if shares.any()}, {})
 
     def _row(self, words: str, shares: dict[str, Shares], means: dict[str, float]) -> Row:
-        known = shares.get(self.reference)
-        others = {} if known is None else {name: p for name, p in shares.items() if name != self.reference}
+        known = None if self.reference is None else shares.get(self.reference)
+        if known is None:
+            return Row(words, shares, means, {})
+        others = {name: p for name, p in shares.items() if name != self.reference}
         return Row(words, shares, means, {name: total_variation(p, known) for name, p in others.items()})
 
 
@@ -204,7 +206,8 @@ def _of(counts: dict[str, np.ndarray]) -> tuple[dict[str, Shares], dict[str, flo
 
 def _of_tallies(each: dict[str, Tally]) -> tuple[dict[str, Shares], dict[str, float]]:
     shares = {name: tally.histogram().share for name, tally in each.items()}
-    return shares, {name: tally.mean().value for name, tally in each.items()}
+    means = {name: tally.mean() for name, tally in each.items()}
+    return shares, {name: mean.value for name, mean in means.items() if mean is not None}
 
 
 def _nats(found: Likelihood) -> dict[str, Any]:

@@ -116,7 +116,7 @@ class Evaluation:
             "each_class": {name: histogram(source.counts[:, c]).tolist() for c, name in enumerate(self.classes)},
             "children": {
                 _key(relation): {
-                    group: _plain(found.histogram()) | {"mean": _plain(found.mean())} for group, found in each.items()
+                    group: _fields(found.histogram()) | {"mean": _plain(found.mean())} for group, found in each.items()
                 }
                 for relation, each in source.nested.items()
             },
@@ -159,7 +159,9 @@ def evaluate(
         progress("counting", done, 2 * number_of(truth, num), "")
 
     columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
-    compared = image_distances(run, target, features, progress, images, seed) if features else {}
+    compared = {}
+    if features and target is not None:
+        compared = image_distances(run, target, features, progress, images, seed)
     sources, likelihoods = {}, {}
     for name, policy in policies.items():
         found = counted(run.model, policy, num, seed, truth, each)
@@ -185,19 +187,20 @@ def network_counts(run: RunFolder, target: Images | None, progress: Progress) ->
     names = run.feature_names
     if estimated(model, names, torch.zeros(0, len(names))) is None:
         return None
-    features, done = kept_features(run, target), 0
+    features, done, total = kept_features(run, target), 0, 0 if target is None else len(target)
 
     def each(images):
         nonlocal done
         done += images
-        progress("target", done, len(target), "")
+        progress("target", done, total, "")
 
-    if target is None and features is None:
-        return None
     net = own_net(run)
     if features is None:
+        if target is None:
+            return None
         features = features_in(run, target, net, each)
-    return Source(*estimated(model, names, features * net.unit), seed=1)
+    found = estimated(model, names, features * getattr(net, "unit", 1.0))
+    return None if found is None else Source(*found, seed=1)
 
 
 def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:
@@ -209,8 +212,10 @@ def _key(relation: Relation) -> str:
 
 
 def _plain(found: Any) -> dict[str, Any] | None:
+    return None if found is None else _fields(found)
+
+
+def _fields(found: Any) -> dict[str, Any]:
     """A tuple with names for JSON, and the tuples in it."""
-    if found is None:
-        return None
     inner = {key: _plain(x) if isinstance(x, tuple) else x for key, x in found._asdict().items()}
     return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in inner.items()}

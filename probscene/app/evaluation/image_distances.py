@@ -5,7 +5,7 @@ target, and than were asked for. Generated images are compared with one half, an
 letters: L images, m images a side.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -24,7 +24,7 @@ Distances = dict[str, tuple[Any, ...]]
 def image_distances(
     run: RunFolder,
     target: Images,
-    choices: list[str],
+    choices: Sequence[str],
     progress: Callable[[str, int, int, str], None],
     num: int = IMAGES,
     seed: int = 0,

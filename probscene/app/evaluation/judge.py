@@ -18,12 +18,13 @@ from probscene.inference.judging.trust import Trust, trust
 from probscene.inference.judging.two_sample import NEEDED
 from probscene.policy import Policy
 from probscene.sampling import sample
+from probscene.threads import threads
 
 from ..chunks import CHUNK, chunk_randomness
 from ..fitting.fit import Progress
 from ..fitting.observer import Observer
 from ..fitting.run import RunFolder
-from ..fitting.scene_features import features_in, kept_features, own_net, threads
+from ..fitting.scene_features import features_in, kept_features, own_net
 from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement
@@ -58,7 +59,7 @@ class Judged:
         """For JSON."""
         if self.trust is None:
             return {"verdict": None, "because": self.absent}
-        more = {"unlike_images": list(self.names)}
+        more: dict[str, Any] = {"unlike_images": list(self.names)}
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
         return self.trust.record() | more
@@ -123,7 +124,7 @@ def judge(
     names = tuple(target.paths[i].name for i in real_unmatched)
     by_labels = None
     if evaluation is not None and "truth" in evaluation.sources:
-        by_labels = agreement(*(evaluation.sources[name] for name in ("learnt", "truth")), evaluation.classes)
+        by_labels = agreement(evaluation.sources["learnt"], evaluation.sources["truth"], evaluation.classes)
     return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels)
 
 

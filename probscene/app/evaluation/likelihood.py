@@ -7,6 +7,7 @@ import torch
 from probscene.derivation import Derivation
 from probscene.inference.judging.tally import Interval, mean_interval, resamples
 from probscene.policy import MASKED, Policy
+from probscene.threads import threads
 
 
 class Likelihood(NamedTuple):
@@ -24,7 +25,8 @@ class Likelihood(NamedTuple):
 @torch.no_grad()
 def likelihood(policy: Policy, derivation: Derivation) -> Likelihood:
     """The likelihood of structures (L of them)."""
-    logp = policy.log_prob(derivation).double()
+    with threads(1):  # the guide's tensors are tiny
+        logp = policy.log_prob(derivation).double()
     possible = logp > MASKED / 2
     known = logp[possible].numpy()
     nats = mean_interval(known, resamples(len(known))) if len(known) else None

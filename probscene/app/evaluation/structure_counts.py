@@ -18,6 +18,7 @@ from probscene.inference.judging.tally import Tally, tally, tally_images
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import PerParent, per_parent, relations
+from probscene.threads import threads
 
 from ..chunks import chunk_randomness
 
@@ -66,11 +67,10 @@ def sampled(
     Args:
         each: told how many more are counted.
     """
-    torch.set_num_threads(1)  # the guide's tensors are tiny
     parts = []
     for number, first in enumerate(range(0, num, SAMPLED_AT_ONCE)):
         size = min(SAMPLED_AT_ONCE, num - first)
-        with chunk_randomness(seed, number):
+        with threads(1), chunk_randomness(seed, number):
             derivation, _ = derive_complete(model.grammar, policy, size, model.max_steps)
         parts.append(count(model, derivation))
         if each is not None:

@@ -47,4 +47,4 @@ class Keeper:
         self.run.write_tensors(self.name, self.training.state())
 
     def _is_past(self, line: dict, stage: str) -> bool:
-        return line["stage"] == stage and line.get("step", line.get("batch")) > self.training.done
+        return line["stage"] == stage and line.get("step", line.get("batch", 0)) > self.training.done

@@ -56,10 +56,11 @@ class Observer:
 
     def _labelled(self, scenes: Scenes) -> Examples:
         groups, grammar = self.model.groups, self.model.grammar
-        by = ()
+        group, along = None, "y"
         if groups is not None:
-            by = (group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind)), groups.along)
-        drawn = examples(self.render(scenes.drawing), self.classes, *by)
+            group = group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind))
+            along = groups.along
+        drawn = examples(self.render(scenes.drawing), self.classes, group, along)
         return drawn._replace(image=self._as_read(drawn.image))
 
     def object_size(self, num: int = 64) -> float:

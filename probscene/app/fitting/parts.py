@@ -7,7 +7,7 @@ product an hour later. Axis letters: N scenes, L images, D features, T steps, K 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -95,7 +95,7 @@ def as_divergence(given: Any) -> Divergence:
         raise ModelError(
             f"Expected a divergence, called with features (N, D) and (L, D), actual {type(made).__name__}."
         )
-    return made
+    return cast(Divergence, made)
 
 
 def as_guide_maker(given: Any) -> GuideMaker:
@@ -109,7 +109,7 @@ def as_guide_maker(given: Any) -> GuideMaker:
             f"Expected a class of guides or a function guide(grammar, max_steps), actual {type(given).__name__}; every "
             "fit makes its own."
         )
-    return given
+    return cast(GuideMaker, given)
 
 
 class CheckedNet:
@@ -198,19 +198,21 @@ def check_guide(guide: Any, max_steps: int) -> Guide:
             or differ between two calls.
     """
     name = type(guide).__name__
-    if not isinstance(guide, nn.Module) or not isinstance(guide, Policy) or not hasattr(guide, "grammar"):
+    is_guide = isinstance(guide, nn.Module) and isinstance(guide, Policy) and hasattr(guide, "grammar")
+    if not is_guide:
         raise ModelError(
             f"Expected a guide that is a torch.nn.Module and a Policy, actual {name}; subclass probscene.Guide."
         )
-    if not any(p.requires_grad for p in guide.parameters()):
+    checked = cast(Guide, guide)
+    if not any(p.requires_grad for p in checked.parameters()):
         raise ModelError(f"Expected a guide with parameters to learn, actual {name} with none.")
     with torch.no_grad():
-        derivation, _ = derive_complete(guide.grammar, _Logits(guide, name), 4, max_steps)
-        found = [guide.log_prob(derivation) for _ in range(2)]
+        derivation, _ = derive_complete(checked.grammar, _Logits(checked, name), 4, max_steps)
+        found = [checked.log_prob(derivation) for _ in range(2)]
     _check_tensor(found[0], (4,), f"{name}.log_prob", "one log-probability a derivation (N,)")
     if not torch.equal(*found):
         raise ModelError(f"Expected {name}.log_prob to say the same of the same derivations, actual two; call eval().")
-    return guide
+    return checked
 
 
 class _Logits(Policy):

@@ -4,7 +4,7 @@ import os
 import shutil
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from probscene.errors import RunError
 from probscene.inference.divergence import Divergence
@@ -13,6 +13,7 @@ from probscene.inference.guides.base import Guide
 from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.model import SceneModel
+from probscene.scenarios import JointGrammar
 
 from ..files import make_folder, write_json, write_whole
 from ..loading import BUILT_IN, lasting_reference, load_model, same_assets, split_reference
@@ -61,7 +62,7 @@ class RunFolder(Storage):
         assets: Path | None = None,
         loaded: SceneModel | None = None,
         parts: Parts | None = None,
-    ) -> "RunFolder":
+    ) -> Self:
         """A new run folder; ``record`` is kept in ``run.json``.
 
         Args:
@@ -94,7 +95,7 @@ class RunFolder(Storage):
         return run
 
     @classmethod
-    def at(cls, path: Path, model: SceneModel | None = None, parts: Parts | None = None) -> "RunFolder":
+    def at(cls, path: Path, model: SceneModel | None = None, parts: Parts | None = None) -> Self:
         """An existing run folder.
 
         Args:
@@ -223,7 +224,7 @@ class RunFolder(Storage):
         if make is None and is_file_part(kind):
             self._unchanged_part(kind)
             make = as_guide_maker(load_part(kind))
-        if model.scenarios:
+        if isinstance(model.grammar, JointGrammar):
             made = ScenarioGuide(model.grammar, model.max_steps, make=make, **settings)
         elif make is not None:
             made = make(model.grammar, model.max_steps)

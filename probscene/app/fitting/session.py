@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import probscene
 from probscene.checks import check
@@ -200,11 +200,11 @@ def _say_notes(images: Images, show: Display) -> None:
         show.say(f"Note: {note}")
 
 
-def _is_folder(target: Target) -> bool:
+def _is_folder(target: Target) -> TypeGuard[Path]:
     return isinstance(target, str | os.PathLike)
 
 
-def _is_list_of_files(target: Target) -> bool:
+def _is_list_of_files(target: Target) -> TypeGuard[list[Path]]:
     return isinstance(target, list | tuple) and all(isinstance(file, str | os.PathLike) for file in target)
 
 

@@ -4,6 +4,7 @@ A colour here is a stand-in that becomes ``var(--name)``.
 """
 
 import io
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -21,7 +22,7 @@ SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimat
 VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
 SMALL = 1e-3  # a share that would be no pixel high
 WIDE, SMALLER = (9.6, 2.9), (5.6, 2.5)  # inches
-STYLE = {
+STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text, in the page's font
     "font.family": "sans-serif",
     "font.size": 10,

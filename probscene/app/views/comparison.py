@@ -83,7 +83,7 @@ def _head(name: str) -> str:
 
 
 def _cell(axes: Axes, row: Row, name: str, reference: str | None, colour: str, bins: int, highest: float) -> None:
-    known = row.shares.get(reference)
+    known = None if reference is None else row.shares.get(reference)
     if name in row.shares:
         share = row.shares[name][:bins]
         axes.bar(np.arange(len(share)), share, 0.86, color=colour)
@@ -92,7 +92,7 @@ def _cell(axes: Axes, row: Row, name: str, reference: str | None, colour: str, b
         axes.set_title("   ".join(said), loc="right", fontsize=7.5, color=INK, pad=3)
     else:
         axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", va="center", fontsize=8, color=INK)
-    if known is not None and name != reference:
+    if known is not None and reference is not None and name != reference:
         outline = np.pad(known, (0, max(0, bins - len(known))))[:bins]
         axes.stairs(outline, np.arange(bins + 1) - 0.5, color=COLOURS[reference], linewidth=1.0)
     axes.set_xlim(-0.7, bins - 0.3)

@@ -5,6 +5,7 @@ glTF's y axis points up and its cameras look along -z; the root node turns the w
 
 import logging
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from PIL import Image
@@ -28,20 +29,23 @@ def write_gltf(path: Path, world: World, scene: int, canvas: tuple[int, int]) ->
         MachineError: the file cannot be written.
     """
     import trimesh  # takes a second
+    from trimesh.scene import Camera
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     logging.getLogger("trimesh").setLevel(logging.ERROR)
     whole = trimesh.Scene()
     used: dict[str, int] = {}
     for piece in pieces(world, scene):
         number = used[piece.name] = used.get(piece.name, -1) + 1
-        material = trimesh.visual.material.PBRMaterial(
+        material = PBRMaterial(
             baseColorTexture=None if piece.texture is None else Image.fromarray(piece.texture),
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )
         # trimesh counts v from the texture's lower edge.
         uv = np.zeros((len(piece.positions), 2)) if piece.uv is None else piece.uv * [1, -1] + [0, 1]
-        visual = trimesh.visual.TextureVisuals(uv, material=material)
+        visual = TextureVisuals(uv, material=material)
         linear = np.c_[_linear(piece.colour / 255), np.ones(len(uv))]
         visual.vertex_attributes["color"] = np.rint(255 * linear).astype(np.uint8)
         mesh = trimesh.Trimesh(
@@ -55,9 +59,9 @@ def write_gltf(path: Path, world: World, scene: int, canvas: tuple[int, int]) ->
         whole.add_geometry(mesh, node_name=name, geom_name=name, transform=UP @ piece.matrix)
     focal = intrinsics(world, scene)[0, 0]
     fov = [2 * np.degrees(np.arctan(size / 2 / focal)) for size in canvas[::-1]]
-    whole.camera = trimesh.scene.Camera("camera", resolution=canvas[::-1], fov=fov)
+    whole.camera = Camera("camera", resolution=canvas[::-1], fov=fov)
     whole.camera_transform = UP @ camera_matrix(world, scene) @ LOOK
-    data = whole.export(file_type="glb")
+    data = cast(bytes, whole.export(file_type="glb"))
     make_folder(path.parent)
     write_whole(path, lambda temporary: temporary.write_bytes(data))
 

@@ -76,7 +76,8 @@ def labelled(image: Pixels, batch: RenderBatch, i: int, model: SceneModel) -> Pi
     """Scene ``i``'s image with the visible boxes and the names of its objects."""
     picture = Image.fromarray(image.copy())
     draw = ImageDraw.Draw(picture)
-    font = ImageFont.load_default(max(10, min(model.canvas) // 20))
+    size = max(10, min(model.canvas) // 20)
+    font = ImageFont.load_default(size)
     for kind, box, seen in zip(batch.kind[i].tolist(), batch.box[i].tolist(), batch.pixels[i].tolist(), strict=True):
         if kind < 0 or not seen or model.grammar.kinds[kind] not in model.classes:
             continue
@@ -84,6 +85,6 @@ def labelled(image: Pixels, batch: RenderBatch, i: int, model: SceneModel) -> Pi
         colour = colour_of(model.classes.index(name), len(model.classes))
         x0, y0, x1, y1 = box
         draw.rectangle((x0, y0, x1 - 1, y1 - 1), outline=colour)
-        above = y0 > font.size + 2
+        above = y0 > size + 2
         draw.text((x0, y0 - 1 if above else y1), name, colour, font, anchor="ls" if above else "la")
     return np.asarray(picture)

@@ -70,7 +70,7 @@ def _blueprint(in_3d: bool):
     def flat(name: str, *parts: str):
         return rrb.Spatial2DView(origin=image, name=name, contents=[f"/{image}/{part}" for part in parts])
 
-    views = [flat("image", "colour", "boxes"), flat("classes", "classes")]
+    views: list[rrb.View] = [flat("image", "colour", "boxes"), flat("classes", "classes")]
     views += [flat("depth", "depth")] * in_3d
     views.append(rrb.GraphView(origin="graph", name="scene graph"))
     if not in_3d:
@@ -115,6 +115,8 @@ def _log_world(rr, recording, world: World, batch: RenderBatch, scene: int, colo
             image_from_camera=intrinsics(world, scene), width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF
         ),
     )
+    if batch.space is None:  # as of a renderer that gives none
+        return
     drawn = (batch.kind[scene] >= 0).nonzero().flatten().tolist()
     box = batch.space.box[scene][drawn].double().numpy()  # h w l x y z rotation_y
     middle = box[:, 3:6] - np.c_[np.zeros(len(box)), box[:, 0] / 2, np.zeros(len(box))]

@@ -67,7 +67,7 @@ def report(
         if labels is not None:
             raise
         absent = str(error)
-    truth = None if labels is None else read_labels(labels, run.model, images)
+    truth = None if labels is None or images is None else read_labels(labels, run.model, images)
     evaluation = evaluate(run, images, truth, show, num)
     judged = judge(run, images, show, judged_by, evaluation) if images and judged_by else None
     return write(run, evaluation, images, out, absent, judged)

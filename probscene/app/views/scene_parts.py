@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from probscene.mesh import Mesh
@@ -79,15 +80,18 @@ def _of_mesh(mesh: Mesh, name: str, tint: NDArray[np.float64], matrix: NDArray[n
         normals = np.repeat(normal[:, None], 3, 1)
     else:
         normals = mesh.normals
-    colour = np.repeat(mesh.colour * np.where(mesh.tinted[:, None], tint, 1.0), 3, 0)
-    uv = None if mesh.texture is None else mesh.uv.reshape(-1, 2)
+    tinted = np.ones(len(corners), bool) if mesh.tinted is None else mesh.tinted
+    colour = np.repeat(mesh.colour * np.where(tinted[:, None], tint, 1.0), 3, 0)
+    uv = None if mesh.texture is None or mesh.uv is None else mesh.uv.reshape(-1, 2)
     return Piece(name, corners.reshape(-1, 3), normals.reshape(-1, 3), uv, mesh.texture, colour, matrix)
 
 
 def _of_ground(world: World, scene: int) -> Iterator[Piece]:
-    ground, x, y = world.ground, float(world.camera.x[scene]), float(world.camera.y[scene])
+    ground = world.ground
+    if ground is None:
+        return
+    x, y, offset = (float(torch.as_tensor(v)[scene]) for v in (world.camera.x, world.camera.y, ground.offset))
     edges = [y - SIDE, *np.clip(ground.edges[scene].numpy().astype(float), y - SIDE, y + SIDE), y + SIDE]
-    offset = float(ground.offset[scene])
     for strip, (right, left) in enumerate(zip(edges, edges[1:], strict=False)):
         if left <= right:
             continue
@@ -97,7 +101,7 @@ def _of_ground(world: World, scene: int) -> Iterator[Piece]:
         positions = np.c_[corners, np.zeros(6)].astype(np.float32)
         # As a Surface says: rows run along +x, columns along -y.
         uv = np.c_[-corners[:, 1] / surface.tile[1], (corners[:, 0] - offset) / surface.tile[0]]
-        up = np.tile(np.float32([0, 0, 1]), (6, 1))
+        up = np.tile(np.array([0, 0, 1], np.float32), (6, 1))
         colour = np.full((6, 3), 255.0)
         yield Piece(f"ground {strip}", positions, up, uv.astype(np.float32), surface.texture, colour, np.eye(4))
 

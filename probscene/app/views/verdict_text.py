@@ -75,13 +75,16 @@ def rows(found: Trust) -> list[Row]:
         ("effective sample size / N", f"{x.effective:.2f}", f"{x.effective_floor:.2f}"),
     ]
     for name in ("precision", "recall", "density", "coverage"):
-        out.append((name, *(f"{getattr(side, name):.2f}" for side in (x.fidelity, x.fidelity_floor))))
+        out.append((name, f"{getattr(x.fidelity, name):.2f}", f"{getattr(x.fidelity_floor, name):.2f}"))
     return out
 
 
 def _sentences(judged: Judged) -> list[str]:
-    out = [judged.trust.because, judged.trust.remedy]
-    return out if judged.agreement is None else [*out, judged.agreement.sentence(judged.trust.verdict)]
+    found = judged.trust
+    if found is None:
+        return [judged.absent]
+    out = [found.because, found.remedy]
+    return out if judged.agreement is None else [*out, judged.agreement.sentence(found.verdict)]
 
 
 def _apart(found: Apart, unit: float | None = None) -> tuple[str, str]:
