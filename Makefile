@@ -1,4 +1,4 @@
-.PHONY: install demo test lint benchmark clean
+.PHONY: install demo docs tutorial test lint benchmark clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -34,9 +34,16 @@ lint: install
 	@cp -R examples build/types
 	@$(BIN)/basedpyright --pythonpath $(BIN)/python
 
+docs: install
+	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --doctree-dir build/doctrees docs build/docs
+
+# Runs the tutorial's code and writes its output and pictures into the page.
+tutorial: install
+	@OMP_NUM_THREADS=1 $(BIN)/python docs/run_page.py docs/tutorial.md
+
 # One thread a process: two processes with one thread each are faster than one with two.
 test: export OMP_NUM_THREADS := 1
-test: lint
+test: lint docs
 	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile
 
 benchmark: install

@@ -48,14 +48,12 @@ def gaussian_kde(points: Tensor, data: Tensor, variance: float, leave_one_out: b
 class KDELogRatio:
     """``log q~(F) - log p~(F)``, whose mean is the reverse KL from generated to real features [1].
 
-    With ``marginal_variance`` the log ratios of every single feature's own density are added, one-dimensional estimates
-    that stay sharp where the joint one has to be smooth: a sum of reverse KLs, zero where the distributions agree. On
-    Multi-MNIST, true counts as features and two targets, 60 batches came to 0.4 of the distance that 100 came to
-    without them (not in the paper).
+    With ``marginal_variance`` the log ratios of every single feature's own density are added (not in the paper). They
+    are one-dimensional estimates that stay sharp where the joint one has to be smooth: a sum of reverse KLs, zero where
+    the distributions agree.
 
-    The density of the smaller sample comes out too low where it is thin, so that with ten times as many real as
-    generated scenes a list with a long tail comes out longer than the target's: a geometric one of mean 3.05 came to
-    3.8, and to 2.9 with as many real as generated ones.
+    The density of the smaller sample comes out too low where it is thin. With many more real than generated scenes, a
+    list with a long tail is therefore learnt longer than the target's. ``docs/results.md`` has measurements of both.
 
     Args:
         variance: of the joint kernel, in squared feature units; None is the paper's ``H = d I``, the feature dimension.

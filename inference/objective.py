@@ -12,9 +12,9 @@ with the exact marginal over latent vectors in log q; parameters keep their prio
 A derivation longer than T_max is redrawn, and a scene that took more than ``reject_threshold`` failed attempts pays
 ``reject_weight`` more; the paper's supplement adds that outside the score function, where it has no gradient.
 
-Nothing of that keeps probability from leaking to derivations that do not end in time, since only those that do are
-scored. So half the squared number f of failed attempts a scene is descended, too (not in the paper). With Z the
-probability to end, f is (1 - Z) / Z and grad Z is Z E grad log q(T) over derivations that do, so its gradient is
+None of this keeps probability from leaking to derivations that do not end in time, because only those that do are
+scored. Half the squared number f of failed attempts per scene is therefore minimised as well (not in the paper). With Z
+the probability to end, f is (1 - Z) / Z and grad Z is Z E grad log q(T) over derivations that do, so its gradient is
 ``-f (1 + f) E grad log q(T)``: all advantages less the same number, which is 0 where nothing fails.
 
 Departures that an argument turns on: ``updates`` takes several steps on one rendered batch with the clipped importance
@@ -80,8 +80,8 @@ class ScoreFunction:
         reject_weight, reject_threshold: lambda and epsilon of section 3.3.
         incompletion_weight: of half the squared number of failed attempts.
         prior, prior_kl_weight: a policy, and the weight of the reverse KL from it: ``log q(T) - log p(T)`` nats, at
-            most ``FAR``, are added to what a scene costs. Without it, what images cannot tell drifts, such as the
-            number of hidden cars (not in the paper).
+            most ``FAR``, are added to the cost of a scene (not in the paper). Without it, whatever images do not show
+            drifts freely, such as the number of cars that are hidden behind others.
         strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
             several guides learn together; all have one where None.
 

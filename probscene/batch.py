@@ -9,7 +9,7 @@ from .world import World
 
 
 class Space(NamedTuple):
-    """What a 3D scene has beside it; the camera's axes are KITTI's, see ``world``.
+    """What the render of a 3D scene has in addition; the camera's axes are KITTI's, see ``world``.
 
     Attributes:
         depth: ``(N, H, W)`` float32, metres along the camera's z; infinity where there is sky.

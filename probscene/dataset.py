@@ -94,12 +94,12 @@ class Images:
 class ImageFolder(Images):
     """The PNG and JPEG files that lie directly in a folder, sorted by name; hidden files and subfolders are not read.
 
-    Every file is decoded once when the folder is opened, so that nothing fails later; no image is kept. A truncated
-    file is always found, altered bytes are in a PNG but not always in a JPEG, which has no checksum. Photos are
-    turned upright by their EXIF tag, transparent pixels lie on black, 16-bit channels keep their upper byte, palettes
-    and CMYK become RGB. An image of another size is resized to the canvas, by area where it shrinks and linearly where
-    it grows: one whose shape is the canvas's to within 2 % is stretched to it, of any other the middle is taken,
-    as much as has the canvas's shape (``window``).
+    Every file is decoded once when the folder is opened, so that nothing fails later; no image is kept. Truncated files
+    are always detected, altered bytes always in a PNG but not always in a JPEG, which has no checksum. Photos are
+    turned upright by their EXIF tag, transparent pixels are put on black, 16-bit channels keep their upper byte,
+    palettes and CMYK become RGB. An image of another size is resized to the canvas, by area where it shrinks and
+    linearly where it grows. If its shape is the canvas's to within 2 % it is stretched; from any other the largest part
+    in the middle that has the canvas's shape is cut out (``window``).
 
     Args:
         path: the folder; or several files, wherever they lie.

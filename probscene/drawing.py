@@ -77,7 +77,7 @@ class Sprites:
         angle: radians, anticlockwise as seen on the screen.
         scale: canvas pixels per sprite pixel; ``scale_y`` differs from it where given.
         tint: RGB in 0..1 that multiplies the sprite's colour, ``(3,)`` or ``(N, M, 3)``.
-        labelled: whether nodes get an instance id; what only covers others says False.
+        labelled: whether nodes get an instance id; False for layers that only cover others, such as shadows.
         present: ``(N, M)`` bool, which of them are drawn; all if None.
     """
 

@@ -25,15 +25,16 @@ from .world import World
 
 @dataclass(frozen=True)
 class Groups:
-    """By what a model's objects are counted, and in which order: cars by road, say, from the top of the image.
+    """Objects are counted separately for each parent of one kind, in order: cars by road, from the top of the image.
 
-    Totals can agree where the counts of every group are wrong, so context that a guide is to learn has to be counted.
+    Totals can be right although the count of every single group is wrong. Context that a guide is to learn therefore
+    has to be counted by group.
 
     Args:
         kind: the parent that makes a group, such as ``"road"``.
-        along: the axis of the canvas along which groups follow one another, ``"x"`` or ``"y"``: from the left or from
-            the top, by the middle of their boxes, in the order in which they are derived.
-        max_groups: groups that are counted each for itself; objects of later ones are counted with the last.
+        along: the axis along which groups are ordered, ``"x"`` (from the left) or ``"y"`` (from the top), by the middle
+            of their boxes. The model has to derive them in this order.
+        max_groups: how many groups have counts of their own; objects of further groups are counted with the last.
 
     Raises:
         ModelError: another axis, or fewer than one group.
@@ -99,11 +100,12 @@ class SceneModel:
         assets: what it draws with beside its own code, in words; a run is bound to it.
         with_assets: ``with_assets(folder)``, the same model drawn with what is in a folder, an absolute path; it looks
             through all of it at once. None where there is nothing that could be replaced.
-        groups: by what objects are counted; over the whole image where None.
-        stuff: the classes of which photographs show no number: trees are a wood there, buildings a row. Where counts
-            are read in photographs, those of the others are compared, the things, and stuff by how images look.
-        pretraining: the policy whose derivations a guide is pretrained on, the prior where None. A guide learns only
-            from what it draws: give it now and then longer lists than the prior has, where the target may have them.
+        groups: counts objects by group; over the whole image if None.
+        stuff: the classes whose instances cannot be counted reliably in photographs, such as the trees of a wood or the
+            houses of a row. Where counts are read in photographs, stuff is compared only through the overall appearance
+            of the image, and all other classes, the things, by their counts.
+        pretraining: the policy whose derivations a guide is pretrained on; the prior if None. A guide learns only from
+            scenes that it draws itself, so let this policy draw longer lists now and then if the target may have them.
         scenarios: the models that this one is joined of, by name, see ``scenarios.join``.
         target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
         renderer: ``renderer(canvas, threads)`` makes the ``Renderer`` of what the program returns; ``threads`` is a

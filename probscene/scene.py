@@ -46,7 +46,7 @@ class SceneGraph:
 
     @contextmanager
     def nodes(self, *kinds: str):
-        """A plate over M in which only nodes of the named kinds count: sites are ``(N, M)``, others have log-prob 0.
+        """A plate over the M nodes, masked to the named kinds: sites are ``(N, M)``, and other nodes have log-prob 0.
 
         Raises:
             GrammarError: the grammar has no such object.

@@ -38,7 +38,8 @@ class Weights:
 
 @dataclass(frozen=True)
 class Ranked:
-    """Another distribution by the rank of the list around (``Frontier.parent_repeat``); the last one goes on."""
+    """A distribution for each rank in the list around (``Frontier.parent_repeat``); the last also for all later
+    ones."""
 
     each: tuple[Counts | Weights, ...]
 
@@ -54,7 +55,7 @@ def weights(*values: float) -> Weights:
 
 
 def ranked(*each: Counts | Weights) -> Ranked:
-    """``ranked(counts(...), counts(...))``: the first for the first element of the list around, and so on."""
+    """``ranked(counts(...), counts(...))``: one for the first element of the list around, one for all others."""
     return Ranked(each)
 
 

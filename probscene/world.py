@@ -33,7 +33,7 @@ class Meshes:
         yaw: radians, anticlockwise as seen from above.
         scale: of the mesh, one number or ``(..., 3)`` along its own x, y and z.
         tint: sRGB in 0..1 that multiplies the colour of the tinted triangles, ``(3,)`` or ``(N, M, 3)``.
-        labelled: whether nodes get an instance id; what only covers others says False.
+        labelled: whether nodes get an instance id; False for layers that only cover others.
         present: ``(N, M)`` bool, which of them are drawn; all if None.
     """
 

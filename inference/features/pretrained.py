@@ -1,17 +1,15 @@
-"""Feature networks that nobody trains here: trained on ImageNet's photographs, frozen.
+"""Frozen feature networks that were trained on ImageNet's photographs.
 
-They know nothing of a model's classes, and so they can say what the run's own network cannot: whether scenes look like
-the target at all.
+They know nothing of a model's classes, and can therefore say what the run's own network cannot: whether scenes look
+like the target at all.
 
-How an image enters. Files are read at the model's canvas (``ImageFolder``), renders have it, and from there on both go
-one way, the same bits for the same pixels: grey thrice; resized with bilinear antialiasing, without a crop, since what
-stands at an image's edge counts, too; pixel values as the network's training had them; the last feature map averaged
-over all of its places. The size has about as many pixels as the square that the network was trained on, and the image's
-own shape, in the network's steps (``_Frozen.entering``): a square enters as that square, and a street of 1242 x 375 as
-416 x 128 where the square has 224. Squashed to the square, as FID usually has it, everything in it would be a third as
-wide as it is, and say less: of the number of cars of 25 pixels and more in 81 KITTI frames, a ridge regression on
-EfficientNet's features explains 0.50 of the variance held out where the shape is kept and 0.41 in the square, in the
-same time.
+How an image enters. Files are read at the model's canvas (``ImageFolder``), renders have that size, and from there on
+both are treated alike, the same bits for the same pixels: grey images are copied to three channels; images are resized
+with bilinear antialiasing and without a crop, because objects at the edge count, too; pixel values are scaled as in the
+network's training; the last feature map is averaged over all places. An image enters with its own shape and about as
+many pixels as the square that the network was trained on, rounded to the network's steps (``_Frozen.entering``): a
+street of 1242 x 375 enters as 416 x 128 where the square has 224. FID usually squashes images to the square instead,
+which makes everything in a street a third as wide and the features less informative (measured in ``docs/results.md``).
 
 References:
     [1] Tan, Le, *EfficientNet*, ICML 2019, in its Lite form; weights converted from TensorFlow's, Apache licence.

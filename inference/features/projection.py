@@ -1,11 +1,11 @@
 """A pretrained network's features, projected to the few numbers that structure moves and parameters do not.
 
-A density in 1,280 dimensions says nothing: under the paper's H = d I all log ratios are alike, under Silverman's rule
-every scene is alone. So each of some structures of the prior is drawn twice, its parameters anew, and the features of
-the two renders are compared: what they differ by is the parameters' doing (where things stand, colours, ground), what
-they share is the structure's. The projection is Fisher's linear discriminant [1] with a structure for each class: the
-generalised eigenvectors of the total and the within-structure covariance, largest ratio first. No label is needed, and
-no real image: a direction in which photographs differ and scenes do not cannot be learnt from.
+A density estimate in 1,280 dimensions is useless: under the paper's H = d I all log ratios are nearly equal, and under
+Silverman's rule every scene is alone. Therefore some structures of the prior are drawn twice, with new parameters, and
+the features of the two renders are compared: where they differ, parameters are the cause (positions, colours, ground),
+and what they share is due to the structure. The projection is Fisher's linear discriminant [1] with a structure for
+each class: the generalised eigenvectors of the total and the within-structure covariance, largest ratio first. No label
+is needed, and no real image: a direction in which photographs differ and scenes do not cannot be learnt from.
 
 The unit of the projected features is the bandwidth of their density: the least at which a scene's own kernel has on
 average no more than ``SHARE`` of the estimated density at its place, which is to say that about ten others have the

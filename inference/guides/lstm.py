@@ -2,7 +2,7 @@
 
 At each step it reads the previous rule through a linear embedding and gives logits over all rules. With ``index=True``
 it also reads how far it is in its list and in the list around (``Frontier``), embedded in the input and as additive
-tables of logits: without them an LSTM of 50 units has to learn to count, which takes it tens of times as long.
+tables of logits. Without them an LSTM of 50 units has to learn to count, which takes much longer.
 
 ``|Z|`` fixed latent vectors set the first state; ``log_prob`` is the exact marginal over them,
 ``q(T) = 1/|Z| sum_z q(T|z)`` (section 3.3).

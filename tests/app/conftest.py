@@ -25,7 +25,17 @@ SHORT = {
     "batches": 4,
     "num_scenes": 30,
 }
-SETTINGS = ["--preset", "quick", "--threads", "1", *(w for k, v in SHORT.items() for w in ("--set", f"{k}={v}"))]
+SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache"]
+SETTINGS += [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory):
+    """Tests neither read nor write the user's cache of feature networks."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setattr("probscene.app.fitting.cache.cache_folder", lambda: folder)
+        yield
 
 
 def probscene(*words) -> SimpleNamespace:

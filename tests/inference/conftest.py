@@ -77,7 +77,9 @@ def goes_on_to_the_same_bits():
 
         kept = {}
 
-        def stop(training, _):
+        def stop(training, line):
+            if "images" in line:  # looked at before the first step
+                return
             kept.update({key: value.clone() for key, value in training.state().items()})
             raise Interrupted
 

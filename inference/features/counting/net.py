@@ -1,12 +1,13 @@
 """A network that counts: how many objects of each class an image shows, wherever they stand.
 
-Fully convolutional, so it is indifferent to place. Every cell of a coarse map holds a distribution over background and
-classes; an object spreads one unit over the four cells nearest to its centre, and the features are the sums of the map:
-soft counts of each class, and their total; or, where the model counts by groups, the number of groups and the soft
-counts in each of them, in order: three more channels then say whether a cell shows a group, where its middle is,
-and where the middle of the group is that the cell's object belongs to (``grouping``). Not in the paper, whose presence
-network (``presence_net``) never learns which classes there are in the time that a laptop has, and whose totals keep
-nothing of what counts depend on. ``count_training`` trains it.
+It is fully convolutional and thus indifferent to place. Every cell of a coarse map holds a distribution over background
+and classes, and an object spreads one unit over the four cells nearest to its centre. The features are the sums of the
+map: a soft count of each class, and their total. Where the model counts by groups they are the number of groups and the
+soft counts in each of them, in order; three more channels then say whether a cell shows a group, where that group's
+middle is, and where the middle of the group is that the cell's object belongs to (``grouping``). ``training`` trains
+it.
+
+The paper has a network of presences instead (``presence``), which keeps less of the structure and learns more slowly.
 """
 
 import copy

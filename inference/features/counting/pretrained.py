@@ -1,19 +1,18 @@
 """Counts read from the maps of a network that was trained on photographs, and what else structure moves in them.
 
-A count network that is trained on renders alone learns what renders look like, and reads photographs less well than
-its own kind; the frozen maps of a pretrained network change less between the two. Only small heads are trained
-(``pretrained_count_training``): every place of the map, 16 pixels apart, holds a distribution over background and
-classes, as in ``count_net``, and the sums of the map, every object taken to whole (``harden_counts``), are the counts.
-Heads that agree on renders differ by a quarter in how many cars they read in photographs, so the mean of several is
-taken. Groups of a model are counted as any class is. Beside them stand the directions of ``projection``, from the same
-pass: counts say how many cars there are, and nothing of how a wood differs from five trees.
+A count network that is trained on renders alone learns what renders look like, and counts less well in photographs. The
+frozen maps of a pretrained network change less between the two. Only small heads are trained on them
+(``pretrained_training``). Every place of the map, 16 pixels apart, holds a distribution over background and classes, as
+in ``net``; the counts are the sums over the map after each object's probability is rounded (``harden_counts``). Heads
+that agree on renders disagree about photographs, so the mean of several is taken. The groups of a model are counted
+like any class. The directions of ``projection`` come from the same pass: counts say nothing about how a wood differs
+from five single trees.
 
-The unit of the counts is the bandwidth of their density, as it is of the projection's directions: how many kernels away
-one object is depends on how well objects can be counted. Things and directions are blocks with a density each
-(``Blockwise``), since photographs may lie far from all renders in some direction. Stuff is counted to tell it from
-things, and for who wants to know, but not compared: in KITTI's frames heads read 12 trees and half a building, since
-every place of a wood holds some of a tree, and few facades are like the model's. Guides that were to match this learnt
-16 trees, fewer scenes without a car, and in one fit of four images no nearer to the frames than the prior's.
+The unit of the counts is the bandwidth of their density, as it is for the projection's directions: how many kernels
+away one object more is depends on how well objects can be counted. Things and directions are blocks with a density each
+(``Blockwise``), because photographs may lie far from all renders in some direction. Stuff is counted so that it is not
+mistaken for things, and is not compared: in photographs a wood has no definite number of trees (``docs/results.md`` has
+what happens if it is).
 
 Axis letters: N images, C channels of the maps, h w places, P pooled features, d directions.
 """
@@ -97,7 +96,7 @@ class PretrainedCountNet(nn.Module):
 
         Args:
             maps: ``(N, C, h, w)`` of some renders.
-            target: ``(N, 1 + classes, h, w)``, what their places hold, see ``count_batches.cells``.
+            target: ``(N, 1 + classes, h, w)``, what their places hold, see ``batches.cells``.
         """
         self.mean.copy_(maps.mean((0, 2, 3)).view(-1, 1, 1))
         self.scale.copy_(maps.std((0, 2, 3)).view(-1, 1, 1) + 1e-3)
@@ -128,7 +127,7 @@ class PretrainedCountNet(nn.Module):
 
     @torch.no_grad()
     def cell_counts(self, maps: Tensor) -> Tensor:
-        """What the heads together believe that places of maps ``(N, C, h, w)`` hold, every object taken to whole,
+        """The heads' mean counts in the places of maps ``(N, C, h, w)``, each object's probability rounded,
         ``(N, classes, h, w)``."""
         return torch.cat([harden_counts(self(some.float()).softmax(2).mean(0)[:, 1:]) for some in maps.split(64)])
 
@@ -149,12 +148,11 @@ class PretrainedCountNet(nn.Module):
 
 
 def harden_counts(probability: Tensor) -> Tensor:
-    """Maps of probabilities, each object's taken to whole: of the same shape, ``(N, classes, h, w)``.
+    """Maps of probabilities ``(N, classes, h, w)`` with each object's probability rounded; of the same shape.
 
-    In photographs heads believe less in the cars that there are, and a little in many that are not. An object's
-    probability is what it has in the 3 x 3 places around: where that is ``NOTHING`` or less it counts as none, from
-    ``WHOLE`` on as one, in between smoothly. Of 81 KITTI frames the spread of counts comes to 1.8 by this, 1.4 by plain
-    sums and 2.8 by the labels, those of frames without a car to 0.5 and 0.6.
+    In photographs heads give too little probability to the objects there are, and a little to many that are not there.
+    An object's probability is its sum over the 3 x 3 places around: up to ``NOTHING`` it counts as no object, from
+    ``WHOLE`` on as one, with a smooth transition in between.
     """
     mass = 9 * F.avg_pool2d(probability, 3, 1, 1)
     part = ((mass - NOTHING) / (WHOLE - NOTHING)).clamp(0, 1)

@@ -2,13 +2,12 @@
 
 The frozen network sees each image once; its maps stay in memory as half-precision numbers, 0.4 MB a frame of 621 x
 188, and the heads take many epochs on them. Photographs' maps are unlike renders' channel by channel, so the heads are
-kept from relying on any: channels are left out (``pretrained_count.DROPPED``) and shifted at random. The pairs give the
+kept from relying on any: channels are left out (``pretrained.DROPPED``) and shifted at random. The pairs give the
 projection.
 
-Then the heads teach themselves [1]: what they believe of the target's unlabelled images, every object taken to whole,
-is what one more epoch should find there, with channels left out and shifted, beside the renders. On KITTI's 81 frames
-heads that had read 2.2 cars with a spread of 2.0 came to 2.5 and 2.4 by it, for 2.5 and 2.8 by the labels, and their
-correlation with these from .73 to .76. A second such epoch makes more of the same: 3.0, a third 3.4.
+Then the heads train themselves [1]: for one more epoch their own rounded counts in the target's unlabelled images are
+the labels, with channels left out and shifted, beside the renders. It is one epoch because each further one raises the
+counts again (``docs/results.md``).
 
 Axis letters: N images, M nodes.
 

@@ -5,8 +5,7 @@ objects are counted by groups. What the steps look at is drawn ahead in a thread
 that it gains less from a second core than drawing does. Axis letters: N images.
 
 Reference:
-    [1] Jordan et al., *Muon: an optimizer for hidden layers in neural networks*, 2024; on Multi-MNIST it needs a third
-        of the time that AdamW alone takes.
+    [1] Jordan et al., *Muon: an optimizer for hidden layers in neural networks*, 2024.
 """
 
 import math

@@ -22,7 +22,7 @@ class Keeper:
         self.log = run.path / "log.jsonl"
         self.lines = self.log.read_text(encoding="utf-8").splitlines() if self.log.exists() else []
         self.saved = time.monotonic()
-        tensors = run.load(self.name)
+        tensors = run.read_tensors(self.name)
         if tensors is not None:
             training.restore(tensors)
         stage = {"features": "features", "guide": "structure"}[name]
@@ -44,7 +44,7 @@ class Keeper:
 
     def _save(self) -> None:
         self.finish()
-        self.run.save(self.name, self.training.state())
+        self.run.write_tensors(self.name, self.training.state())
 
     def _is_past(self, line: dict, stage: str) -> bool:
         return line["stage"] == stage and line.get("step", line.get("batch", 0)) > self.training.done

@@ -69,7 +69,7 @@ def fit(
         real = _real_features(run, net.net, progress, images)
     with threads(1):  # the guide's tensors are tiny: a second thread only waits
         guide = _learn(run, observer, net.net, real, progress)
-    run.save("guide", guide.state_dict())
+    run.write_tensors("guide", guide.state_dict())
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
     return guide
 
@@ -86,14 +86,14 @@ class _Network:
     def finish(self, folder: Path | None, use_cache: bool, say: Say) -> None:
         """Load it from the run or from the cache, else train it."""
         run, net = self.run, self.net
-        tensors = run.load("features")
+        tensors = run.read_tensors("features")
         if tensors is not None:
             load_state(net, tensors)
             self._check_taught()
             return
         training = run.features.training(inner(net), self.observer, self.target, run.record["seed"])
         if training is None:
-            run.save("features", state_of(net))
+            run.write_tensors("features", state_of(net))
             return
         taught = run.features.taught_by(inner(net))
         kept = NetworkCache(run, inner(net), folder, taught) if use_cache else None
@@ -106,7 +106,7 @@ class _Network:
             lines = self._train(training)
             if kept is not None:
                 kept.save(state_of(net), lines)
-        run.save("features", state_of(net))
+        run.write_tensors("features", state_of(net))
         (run.path / "features-checkpoint.safetensors").unlink(missing_ok=True)
         if isinstance(net, nn.Module):
             net.eval()
@@ -141,7 +141,7 @@ class _Network:
 def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: Callable[[], Images]) -> Tensor:
     """Of every image, ``(L, D)``, then of the preset's further views, kept apart: a verdict is about L images."""
     images = target()
-    cached = run.load("real")
+    cached = run.read_tensors("real")
     if cached is not None:
         if not torch.equal(fingerprint(images), cached["fingerprint"]):
             raise _others(images)
@@ -157,7 +157,7 @@ def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: 
     features, *others = (embed_all(net, images.batches(RENDERED_AT_ONCE, view), each) for view in range(views))
     check_features(features)
     kept = {"features": features, "fingerprint": fingerprint(images)}
-    run.save("real", kept | ({"views": torch.cat(others)} if others else {}))
+    run.write_tensors("real", kept | ({"views": torch.cat(others)} if others else {}))
     return torch.cat([features, *others])
 
 

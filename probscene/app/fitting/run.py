@@ -181,7 +181,7 @@ class RunFolder(Storage):
         Raises:
             RunError: the file does not hold this network's state.
         """
-        tensors = self.load("features") if self._network is None else None
+        tensors = self.read_tensors("features") if self._network is None else None
         if tensors is not None:
             net = self.build_network()
             load_state(net, tensors)
@@ -239,7 +239,7 @@ class RunFolder(Storage):
         Raises:
             RunError: the fit is not finished, or the file does not hold this run's guide.
         """
-        tensors = self.load("guide")
+        tensors = self.read_tensors("guide")
         if tensors is None:
             raise RunError(f"Expected a finished fit in {self.path}, actual an unfinished one; go on with --resume.")
         guide = self.new_guide()

@@ -34,7 +34,7 @@ def fingerprint(target: Images) -> Tensor:
 def kept_features(run: RunFolder, target: Images | None) -> Tensor | None:
     """The features ``(L, D)`` of its images that the fit kept, in the network's units; None where there are none, or
     where the target's images are others. Without a target they are the fit's."""
-    kept = run.load("real")
+    kept = run.read_tensors("real")
     if kept is None or (target is not None and not torch.equal(kept["fingerprint"], fingerprint(target))):
         return None
     return kept["features"]

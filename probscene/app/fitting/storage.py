@@ -48,7 +48,7 @@ class Storage:
         """Whether the guide is learnt."""
         return (self.path / "guide.safetensors").is_file()
 
-    def load(self, name: str) -> dict[str, Tensor] | None:
+    def read_tensors(self, name: str) -> dict[str, Tensor] | None:
         """The tensors of ``name.safetensors``, or None where there is no such file.
 
         Raises:
@@ -57,7 +57,7 @@ class Storage:
         file = self.path / f"{name}.safetensors"
         return load_tensors(file) if file.is_file() else None
 
-    def save(self, name: str, tensors: dict[str, Tensor]) -> None:
+    def write_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write ``name.safetensors``, whole or not at all."""
         save_tensors(self.path / f"{name}.safetensors", tensors)
 

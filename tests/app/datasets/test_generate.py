@@ -53,7 +53,7 @@ def a_run(path: Path, plates: float) -> RunFolder:
     run = RunFolder.create(path, str(PLATES), {"guide": GUIDE})
     guide = LSTMGuide(run.model.grammar, run.model.max_steps, **GUIDE)
     guide.out.bias.data[run.model.grammar.rules.index(Rule("Plates", "Plate", "Plates"))] += plates
-    run.save("guide", guide.state_dict())
+    run.write_tensors("guide", guide.state_dict())
     return run
 
 

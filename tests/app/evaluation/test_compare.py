@@ -47,7 +47,7 @@ def untrained(folder: Path, model: str, seed: int, target: str = "images") -> Pa
     torch.manual_seed(seed)
     guide = run.new_guide()
     guide.out.bias.data[[k for k, rule in enumerate(run.model.grammar.rules) if not rule.rhs]] += 2.0  # short lists
-    run.save("guide", guide.state_dict())
+    run.write_tensors("guide", guide.state_dict())
     return folder
 
 
@@ -118,11 +118,11 @@ def test_where_kinds_nest_children_are_compared_by_rank(nested):
         assert np.allclose(rows[words].shares["truth"][: len(share)], share)
         assert rows[words].means["truth"] == pytest.approx(np.mean(expected))
         assert 0 < rows[words].apart["a"] < 1
-    structures = sampled(first.model, nested["b"].guide(), 300, 0)
+    structures = sampled(first.model, nested["b"].guide, 300, 0)
     assert np.array_equal(found.sources["b"].counts, structures.counts)
     assert set(found.likelihoods) == {"prior", "a", "b"}
     assert found.likelihoods["b"].nats.value == pytest.approx(
-        nested["b"].guide().log_prob(truth.derivation).mean().item(), rel=1e-5
+        nested["b"].guide.log_prob(truth.derivation).mean().item(), rel=1e-5
     )
 
 

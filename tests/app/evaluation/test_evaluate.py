@@ -90,7 +90,7 @@ def test_shares_of_no_objects_are_not_compared(fitted, target):
 def test_the_estimate_is_what_the_network_counts(fitted, target, tmp_path):
     run = RunFolder.at(fitted)
     kept = network_counts(run, opened(target.images), quiet)
-    features = run.load("real")["features"]
+    features = run.read_tensors("real")["features"]
     assert np.array_equal(kept.counts, np.rint(features[:, :2].numpy()).astype(int))
     assert np.array_equal(kept.total, np.rint(features[:, 2].numpy()).astype(int))
     shutil.copytree(target.images, tmp_path / "copy")

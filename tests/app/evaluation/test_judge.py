@@ -39,8 +39,9 @@ class Guided(RunFolder):
 
     policy = None
 
+    @property
     def guide(self):
-        return self.policy or super().guide()
+        return self.policy or super().guide
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ def test_the_network_is_recorded_and_only_its_projection_kept(run, target):
     assert (run.path / "features.safetensors").stat().st_size < 40_000
     seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
     assert seen.shape == (9, len(net.names)) == (9, 3)
-    assert torch.allclose(seen, run.load("real")["features"][:9], atol=1e-4)
+    assert torch.allclose(seen, run.read_tensors("real")["features"][:9], atol=1e-4)
 
 
 def test_the_log_says_how_the_projection_came_out(run):
@@ -88,7 +88,7 @@ def test_further_views_of_the_target_are_learnt_from_and_not_judged(run, call, t
     run, words = run
     again = tmp_path / "again"
     assert call(*[again if word == run.path else word for word in words], "--set", "views=3").code == 0
-    one, other = run.load("real"), RunFolder.at(again).load("real")
+    one, other = run.read_tensors("real"), RunFolder.at(again).read_tensors("real")
     assert torch.equal(one["features"], other["features"]) and other["views"].shape == (80, 3) and "views" not in one
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     assert torch.allclose(embed_all(net, images.batches(64, 2)), other["views"][40:], atol=1e-4)
@@ -144,7 +144,7 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
     assert len(net.names) == len(run.model.classes) + 3
-    assert torch.allclose(seen, run.load("real")["features"][:9], atol=1e-3)
+    assert torch.allclose(seen, run.read_tensors("real")["features"][:9], atol=1e-3)
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
     assert [line["stage"] for line in lines] == ["features"] * 3 + ["counts"] + ["structure"] * 2
     assert len(lines[3]["correlation"]) == len(run.model.classes) and len(lines[3]["ratio"]) == 3
@@ -157,7 +157,7 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
     done = call("evaluate", run.path, *words)
     assert done.code == 0, done.err
     estimate = json.loads((tmp_path / "e.json").read_text())["sources"]["estimate"]
-    counts = run.load("real")["features"][:, :2]
+    counts = run.read_tensors("real")["features"][:, :2]
     number = (counts * net.unit[:2]).round().sum(1)  # objects, whatever the unit of the features is
     assert estimate["mean_number"] == pytest.approx(number.mean().item(), abs=1e-6)
     assert not torch.equal(number, counts.round().sum(1))

@@ -18,15 +18,15 @@ DISCS = Path(__file__).parents[1] / "discs.py"
 
 def test_tensors_that_do_not_fit_on_the_disk_leave_the_old_ones(tmp_path):
     run = RunFolder(tmp_path, {})
-    run.save("x", {"a": torch.zeros(10)})
+    run.write_tensors("x", {"a": torch.zeros(10)})
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10000, limits[1]))
     try:
         with pytest.raises(MachineError, match="x.safetensors"):
-            run.save("x", {"a": torch.zeros(10000)})
+            run.write_tensors("x", {"a": torch.zeros(10000)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert len(run.load("x")["a"]) == 10 and len(list(tmp_path.iterdir())) == 1
+    assert len(run.read_tensors("x")["a"]) == 10 and len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_free_folder_is_new_or_empty_but_for_hidden_files(tmp_path):
@@ -71,10 +71,10 @@ def test_the_guide_is_rebuilt_from_the_record(tmp_path, kind):
         del settings["kind"]
     run = RunFolder.create(tmp_path / "run", str(DISCS), {"guide": settings})
     made = make_guide(**{"kind": "lstm", **settings}, grammar=run.model.grammar, max_steps=run.model.max_steps)
-    run.save("guide", made.state_dict())
-    again = RunFolder.at(run.path).guide()
+    run.write_tensors("guide", made.state_dict())
+    again = RunFolder.at(run.path).guide
     assert type(again) is type(made)
     assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), made.state_dict().values(), strict=True))
     other = RunFolder(run.path, run.record | {"guide": {"kind": "pcfg" if kind != "pcfg" else "lstm"}})
     with pytest.raises(RunError, match="Expected a guide for model discs"):
-        other.guide()
+        _ = other.guide

@@ -66,7 +66,7 @@ def test_a_run_goes_on_to_the_same_bits(tmp_path, call, discs, joint_target, joi
     assert call(*words).code == 0
     wrong = call(*words[:-1], words[-1], "--resume", "--seed", "3")
     assert wrong.code == 2
-    one, other = (RunFolder.at(path).guide().state_dict() for path in (joint_run, tmp_path / "run"))
+    one, other = (RunFolder.at(path).guide.state_dict() for path in (joint_run, tmp_path / "run"))
     assert all(torch.equal(one[key], other[key]) for key in one)
     another = call("fit", STREETS, "--scenarios", "row", "--out", tmp_path / "run", "--resume")
     assert another.code == 2 and "streets.py:row,yard), actual" in another.err

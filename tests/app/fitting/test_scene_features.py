@@ -42,7 +42,8 @@ def test_features_are_of_those_scenes_and_the_same_for_the_same_seed(run):
 
 def test_the_target_is_seen_as_the_fit_has_seen_it(run, target):
     images = ImageFolder(target.images, run.model.canvas, run.model.channels)
-    assert torch.allclose(seen.features_in(run, images, seen.own_net(run)), run.load("real")["features"], atol=1e-4)
+    kept = run.read_tensors("real")["features"]
+    assert torch.allclose(seen.features_in(run, images, seen.own_net(run)), kept, atol=1e-4)
 
 
 def test_networks_by_their_words(run, tmp_path):

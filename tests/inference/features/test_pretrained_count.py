@@ -18,8 +18,7 @@ from probscene.inference.features.projection import SHARE, bandwidth, discrimina
 
 @pytest.fixture(scope="module")
 def draw_twice(dots):
-    view = Observer(dots, 1)
-    return lambda num: view.draw_twice(num, dots.prior)
+    return Observer(dots, 1).draw_twice
 
 
 def training(dots, draw_twice, pairs, epochs, held_out, batch_size=32, **words) -> PretrainedCountTraining:
@@ -112,7 +111,13 @@ def learnt(dots, draw_twice):
     """A finished training, what it found, and what it told of its drawings."""
     seen = []
     fit = training(dots, draw_twice, 80, 15, 64, 8)
-    return fit, fit.run(drawn=lambda *done: seen.append(done)), seen
+    fit.run(lambda _, line: seen.append(line))
+    return fit, fit.found, seen
+
+
+def looked(seen: list[dict]) -> dict:
+    """The last that was told of images looked at."""
+    return [line for line in seen if "images" in line][-1]
 
 
 def number(drawings) -> torch.Tensor:
@@ -127,7 +132,7 @@ def read(net: PretrainedCountNet, images: torch.Tensor) -> torch.Tensor:
 
 def test_it_learns_to_count(learnt, draw_twice):
     fit, found, seen = learnt
-    assert seen[-1] == (224, 224) and (found.correlation > 0.9).all() and (found.ratio > 2).all()
+    assert looked(seen) == {"images": 224, "of": 224} and (found.correlation > 0.9).all() and (found.ratio > 2).all()
     torch.manual_seed(99)
     fresh = draw_twice(50)
     counts = number(fresh)
@@ -148,8 +153,8 @@ def test_it_teaches_itself_on_images_unlike_renders(learnt, dots, draw_twice):
     fit = training(dots, draw_twice, 80, 15, 64, 8, photographs=photographs)
     fit.restore(learnt[0].state())
     seen = []
-    fit.run(drawn=lambda *done: seen.append(done))
-    assert fit.done == 16 and seen[-1] == (304, 304)
+    fit.run(lambda _, line: seen.append(line))
+    assert fit.done == fit.total == 16 and looked(seen) == {"images": 304, "of": 304}
     before, after = (read(each.net, pale(fresh.image)) for each in (learnt[0], fit))
     assert (after - number(fresh)).square().mean() < 0.85 * (before - number(fresh)).square().mean()
     assert before.mean() < after.mean() < 1.05 * number(fresh).mean()

@@ -1,0 +1,57 @@
+"""The documentation's Python runs and prints what the pages say, and the options that it lists are those there are."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+import probscene
+from probscene.app.cli import app
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+RUN = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+COMMANDS = typer.main.get_command(app).commands
+
+
+def text(name: str) -> str:
+    return (ROOT / "docs" / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "```python" in page.read_text()], ids=lambda page: page.stem
+)
+def test_python_prints_what_the_page_says(page):
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    run = subprocess.run([sys.executable, ROOT / "docs" / "run_page.py", page, "--check"],
+                         env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)  # fmt: skip
+    assert run.returncode == 0, run.stderr
+
+
+def test_every_command_has_a_section():
+    assert set(re.findall(r"^## (\w+)$", text("command_line.md"), re.MULTILINE)) == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_of_a_command_is_listed(name):
+    section = re.search(rf"^## {name}$(.*?)(?=^## |\Z)", text("command_line.md"), re.MULTILINE | re.DOTALL)[1]
+    listed = set(re.findall(r"^\| `(--[\w-]+)", section, re.MULTILINE)) - {"--objective", "--guide"}
+    there = {option for parameter in COMMANDS[name].params for option in parameter.opts if option.startswith("--")}
+    assert listed == there - {"--help", "--objective", "--guide"}
+
+
+def test_the_face_is_listed_whole():
+    tables = re.findall(r"^\|.*\|$", text("api/face.md"), re.MULTILINE)
+    assert set(re.findall(r"`(\w+)`", " ".join(tables))) == set(probscene.__all__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_files_that_pages_name_are_there(page):
+    found = page.read_text(encoding="utf-8")
+    named = re.findall(r"\b(?:examples|benchmarks|inference|models|renderers|tests)/[\w/]+\.\w+", found)
+    for name in [*named, *re.findall(r"\]\(\.\./([^)#]+)", found)]:
+        assert (ROOT / name).is_file() or (ROOT / "docs" / name).is_file(), name
