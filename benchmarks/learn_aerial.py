@@ -6,24 +6,22 @@ The target's images are drawn by the model's own target program with its own spr
 nine on the first road and three on the others, in the mean. Each seed has a target of its own, and fits see the folder
 alone. Printed is the total variation of 20,000 learnt structures from the distributions that the target was drawn from,
 the mean numbers of cars, and log q of 5,000 structures that no image shows, in nats a scene: its bound is the target's
-own log p. The fits of one preset and seed share their feature network, which depends on nothing else.
+own log p. The fits of one preset and seed share their feature network, whose training counts as the first one's time.
 """
 
 import argparse
 import json
 import math
-import shutil
-import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.presets import DEFAULT, QUICK, Preset
-from probscene.app.fitting.run import RunFolder
+from probscene.app.fitting.session import timing
 from probscene.derive import derive_complete
 from probscene.inference.judging.metrics import total_variation
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
@@ -76,30 +74,9 @@ def judged(policy: Policy) -> dict[str, float]:
 
 def fit_images(preset: str, name: str, seed: int, out: Path) -> tuple[Policy, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
-    path, shared = out / f"{preset}-{name}-{seed}", out / f"features-{preset}-{seed}"
-    if (path / "run.json").exists():
-        run = RunFolder.at(path)
-    else:
-        run = create("aerial2d", out / f"target-{seed}" / "images", path, chosen(preset, name), seed)
-    took, last = {}, [None, time.monotonic()]
-
-    def progress(stage, done, total, note):
-        if stage != last[0]:
-            last[:] = [stage, time.monotonic()]
-        took[stage] = time.monotonic() - last[1]
-
-    kept = ("features.safetensors", "real.safetensors")
-    if shared.is_dir() and not (path / kept[0]).exists():
-        for file in kept:
-            shutil.copyfile(shared / file, path / file)
-    guide = fit(run, progress)
-    if not shared.is_dir():
-        aside = shared.with_suffix(".part")
-        aside.mkdir(exist_ok=True)
-        for file in kept:
-            shutil.copyfile(path / file, aside / file)
-        aside.rename(shared)
-    return guide, took
+    images, path = out / f"target-{seed}" / "images", out / f"{preset}-{name}-{seed}"
+    run = fit("aerial2d", images, chosen(preset, name), seed, out=path, resume=True, cache=out / "cache")
+    return run.guide, timing(run)
 
 
 def main():

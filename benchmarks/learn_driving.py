@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.run import RunFolder
+from probscene.app.fitting.session import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.derive import derive_complete
@@ -54,18 +54,11 @@ def main():
         chosen = override(preset(args.preset), args.settings)
         path = args.out / f"run-{seed}"
         began = path.exists()
-        run = RunFolder.at(path) if began else create(args.model, folder / "images", path, chosen, seed)
-        start, took, last = time.monotonic(), {}, [None, 0.0]
-
-        def progress(stage, done, total, note, took=took, last=last):
-            if stage != last[0]:
-                last[:] = [stage, time.monotonic()]
-            took[stage] = round(time.monotonic() - last[1], 1)
-
-        guide = fit(run, progress)
+        start = time.monotonic()
+        run = fit(args.model, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
         truth = counted(model, target.prior)
-        row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": took, "resumed": began}
-        for name, policy in (("prior", model.prior), ("learnt", guide)):
+        row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
+        for name, policy in (("prior", model.prior), ("learnt", run.guide)):
             found = counted(model, policy)
             each = {
                 c: round(total_variation(histogram(found[:, i]), histogram(truth[:, i])), 4)

@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 import torch
 
+from probscene.app.api.fit import fit
 from probscene.app.files import write_json
-from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
-from probscene.app.fitting.run import RunFolder
+from probscene.app.fitting.session import timing
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
@@ -86,27 +86,9 @@ def distances(policy, target: int) -> tuple[float, float]:
 
 def fit_images(name: str, target: int, seed: int, args) -> tuple[LSTMGuide, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
-    out = args.out / f"{name}-{target}"
-    shared = args.out / f"features-{'paper' if name == 'paper' else name.split('-')[0]}.safetensors"
-    if (out / "run.json").exists():
-        run = RunFolder.at(out)
-    else:
-        run = create("multi_mnist", args.out / f"target-{target}", out, PRESETS[name], seed)
-    took, last = {}, [None, time.monotonic()]
-
-    def progress(stage, done, total, note):
-        if stage != last[0]:
-            last[:] = [stage, time.monotonic()]
-        took[stage] = time.monotonic() - last[1]
-        if stage in ("features", "structure") and done == total:
-            print(f"  {name} target {target}: {stage} {took[stage]:.0f} s, {note}", flush=True)
-
-    if shared.exists() and not (out / "features.safetensors").exists():
-        shutil.copyfile(shared, out / "features.safetensors")
-    guide = fit(run, progress)
-    if not shared.exists():
-        shutil.copyfile(out / "features.safetensors", shared)
-    return guide, took
+    images, out = args.out / f"target-{target}" / "images", args.out / f"{name}-{target}"
+    run = fit("multi_mnist", images, PRESETS[name], seed, out=out, resume=True, cache=args.out / "cache")
+    return run.guide, timing(run)
 
 
 def fit_counts(target: int, seed: int, images: int) -> tuple[LSTMGuide, dict[str, float]]:

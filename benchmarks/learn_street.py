@@ -16,13 +16,12 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import Evaluation, evaluate
 from probscene.app.evaluation.labels import read_labels
 from probscene.app.files import write_json
-from probscene.app.fitting.fit import create, fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.run import RunFolder
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
@@ -83,9 +82,8 @@ def main():
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
         chosen = override(preset("street").with_features(args.features), args.settings)
-        run = RunFolder.at(path) if path.exists() else create(args.model, args.images, path, chosen, seed)
         start = time.monotonic()
-        fit(run, lambda *_: None)
+        run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False)
         seconds = round(time.monotonic() - start, 1)
         target = ImageFolder(args.images, run.model.canvas, run.model.channels)
         truth = read_labels(args.labels, run.model, target, False, args.min_height)

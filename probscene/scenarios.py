@@ -232,7 +232,8 @@ def mixture(grammar: JointGrammar, policies: list[Policy], weights: list[float] 
     """``Mixture``; of tables it is one table, about which more can be proved."""
     tables = [policy for policy in policies if type(policy) is StructurePrior]
     if len(tables) == len(policies):
-        return StructurePrior.joined(grammar, tables, [1.0] * len(policies) if weights is None else weights)
+        given = [1.0] * len(policies) if weights is None else weights
+        return StructurePrior.joined(grammar, tables, grammar.first_symbol, grammar.first_rule, given)
     return Mixture(grammar, policies, weights)
 
 

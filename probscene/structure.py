@@ -7,7 +7,6 @@ hazard h(c) = P(n = c) / P(n >= c).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,9 +15,6 @@ from .derivation import Frontier
 from .errors import GrammarError
 from .grammar import Grammar
 from .policy import Policy
-
-if TYPE_CHECKING:
-    from .scenarios import JointGrammar
 
 
 @dataclass(frozen=True)
@@ -96,14 +92,26 @@ class StructurePrior(Policy):
         self.table = table.log().float()
 
     @staticmethod
-    def joined(grammar: "JointGrammar", priors: Sequence["StructurePrior"], weights: list[float]) -> "StructurePrior":
-        """The prior of a ``JointGrammar``: a scenario by its weight, then that scenario's own table."""
+    def joined(
+        grammar: Grammar,
+        priors: Sequence["StructurePrior"],
+        first_symbol: Sequence[int],
+        first_rule: Sequence[int],
+        weights: Sequence[float],
+    ) -> "StructurePrior":
+        """The prior of a grammar that begins with a choice of scenario: one by its weight, then its own table.
+
+        Args:
+            priors: of the scenarios.
+            first_symbol, first_rule: where the nonterminals and the rules of each scenario begin in the grammar's.
+            weights: of the scenarios, up to a factor.
+        """
         V, K = len(grammar.nonterminals), len(grammar.rules)
         P, C = (max(prior.table.shape[i] for prior in priors) for i in (1, 2))
         table = torch.full((V + 1, P, C, K), -torch.inf)
         table[0, :, :, : len(priors)] = _normalised(tuple(weights), len(priors), "weights of scenarios").log().float()
         table[V, :, :, 0] = 0.0
-        for prior, v, k in zip(priors, grammar.first_symbol, grammar.first_rule, strict=True):
+        for prior, v, k in zip(priors, first_symbol, first_rule, strict=True):
             own = prior.table[:-1]
             own = own[:, torch.arange(P).clamp(max=own.shape[1] - 1)][:, :, torch.arange(C).clamp(max=own.shape[2] - 1)]
             table[v : v + own.shape[0], :, :, k : k + own.shape[3]] = own

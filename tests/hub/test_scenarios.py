@@ -67,7 +67,9 @@ def policies(draw):
     share = draw(st.sampled_from([None, [1.0, 3.0]]))
     kind = draw(st.sampled_from(["table", "mixture", "lstm", "pcfg", "grammar-vae"]))
     if kind == "table":
-        return StructurePrior.joined(JOINT, list(PRIORS.values()), share or [1.0, 1.0]), list(PRIORS.values()), share
+        first = JOINT.first_symbol, JOINT.first_rule
+        joint = StructurePrior.joined(JOINT, list(PRIORS.values()), *first, share or [1.0, 1.0])
+        return joint, list(PRIORS.values()), share
     if kind == "mixture":
         return Mixture(JOINT, list(PRIORS.values()), share), list(PRIORS.values()), share
     torch.manual_seed(draw(st.integers(0, 2**31)))

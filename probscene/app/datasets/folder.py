@@ -28,7 +28,7 @@ from .provenance import image_name
 LINES = "provenance.jsonl"
 
 
-class Parts:
+class DatasetFolder:
     """The folder of a dataset.
 
     Args:

@@ -29,12 +29,13 @@ from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder
 from ..loading import renderer_for
 from . import coco, kitti, shards, yolo
-from .folder import LINES, Parts
+from .folder import LINES, DatasetFolder
 from .formats import chosen
 from .provenance import provenance
 from .workers import spread
 
-Progress = Callable[[int, int], None]
+Done = Callable[[int, int], None]
+"""Called with the number of images there are, and how many there are to be."""
 
 
 class Dataset(NamedTuple):
@@ -51,7 +52,7 @@ def generate(
     seed: int = 0,
     workers: int = 1,
     format: str | Iterable[str] = "coco",
-    progress: Progress | None = None,
+    progress: Done | None = None,
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
 
@@ -88,7 +89,7 @@ def generate_scenes(
     out: Path,
     seed: int = 0,
     format: str | Iterable[str] = "coco",
-    progress: Progress | None = None,
+    progress: Done | None = None,
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
 
@@ -136,25 +137,25 @@ class Job:
             kitti.check(model)
         self.model, self.policy = model, policy
         self.origin = {"seed": seed, "model": model.name, "guide": guide, "version": probscene.__version__}
-        self.parts = Parts(out, self.origin, num, self.formats)
+        self.folder = DatasetFolder(out, self.origin, num, self.formats)
         self._renderer = renderer_for(model, threads=1)
 
-    def run(self, work: Callable[[list[int], Callable[[int], None]], None], progress: Progress | None) -> Dataset:
+    def run(self, work: Callable[[list[int], Callable[[int], None]], None], progress: Done | None) -> Dataset:
         """Do what is missing by ``work(chunks, done)``, then write the labels."""
-        parts, made = self.parts, 0
-        chunks = parts.missing()
-        before = parts.num - sum(map(parts.size, chunks))
+        folder, made = self.folder, 0
+        chunks = folder.missing()
+        before = folder.num - sum(map(folder.size, chunks))
 
         def done(chunk: int | None) -> None:
             nonlocal made
-            made += 0 if chunk is None else parts.size(chunk)
+            made += 0 if chunk is None else folder.size(chunk)
             if progress is not None:
-                progress(before + made, parts.num)
+                progress(before + made, folder.num)
 
         done(None)
         work(chunks, done)
-        parts.finish(self._labels())
-        return Dataset(parts.out, made)
+        folder.finish(self._labels())
+        return Dataset(folder.out, made)
 
     def each(self, chunks: list[int], done: Callable[[int], None]) -> None:
         """Make chunks one after the other."""
@@ -167,23 +168,23 @@ class Job:
         Raises:
             MachineError: the disk is full.
         """
-        first, size = chunk * CHUNK, self.parts.size(chunk)
+        first, size = chunk * CHUNK, self.folder.size(chunk)
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
         batch = self._renderer(scenes.drawing[:size])
         found = [] if self.formats == ("images",) else coco.annotations(self.model, batch, first)
         record = {"annotations": found, "provenance": provenance(self.model, scenes, first, self.origin)[:size]}
-        self.parts.write(chunk, *self._files(batch, first, found), record)
+        self.folder.write(chunk, *self._files(batch, first, found), record)
         return chunk
 
     def _files(
         self, batch: RenderBatch, first: int, found: list[dict[str, Any]]
     ) -> tuple[dict[str, bytes], dict[str, str]]:
-        """What is written of each image at once, and further names of that; see ``Parts.write``."""
+        """What is written of each image at once, and further names of that; see ``DatasetFolder.write``."""
         of_image: dict[int, list] = {first + i: [] for i in range(len(batch.image))}
         for annotation in found:
             of_image[annotation["image_id"]].append(annotation)
         images = map(png, as_written(self.model, batch.image))
-        files = {self.parts.image(i): image for i, image in zip(of_image, images, strict=True)}
+        files = {self.folder.image(i): image for i, image in zip(of_image, images, strict=True)}
         links = {}
         if "yolo" in self.formats:
             files |= {yolo.label_name(i): yolo.label(self.model, of_image[i]).encode() for i in of_image}
@@ -194,30 +195,30 @@ class Job:
             if batch.space is not None:
                 calibs = map(kitti.calib, batch.space.intrinsics)
                 files |= {kitti.file_name("calib", i): text.encode() for i, text in zip(of_image, calibs, strict=True)}
-            links |= {kitti.file_name("image_2", i): self.parts.image(i) for i in of_image}
+            links |= {kitti.file_name("image_2", i): self.folder.image(i) for i in of_image}
         return files, links
 
     def _labels(self) -> dict[str, Callable[[Path], Any]]:
         """What is written when every chunk is there."""
-        model, parts = self.model, self.parts
+        model, folder = self.model, self.folder
         labels = {}
         if "coco" in self.formats:
-            found = (annotation for record in parts.records() for annotation in record["annotations"])
-            labels["annotations.json"] = lambda path: coco.write(path, model, parts.num, parts.settings, found)
+            found = (annotation for record in folder.records() for annotation in record["annotations"])
+            labels["annotations.json"] = lambda path: coco.write(path, model, folder.num, folder.settings, found)
         if "yolo" in self.formats:
             labels["data.yaml"] = lambda path: path.write_text(yolo.data(model), encoding="utf-8", newline="\n")
         if "webdataset" in self.formats:
-            for number, chunks in enumerate(parts.chunks(shards.CHUNKS)):
+            for number, chunks in enumerate(folder.chunks(shards.CHUNKS)):
                 labels[shards.shard_name(number)] = partial(self._write_shard, chunks)
-        lines = (line for record in parts.records() for line in record["provenance"])
+        lines = (line for record in folder.records() for line in record["provenance"])
         labels[LINES] = lambda path: _write_lines(path, (json.dumps(line, ensure_ascii=False) + "\n" for line in lines))
         return labels
 
     def _write_shard(self, chunks: range, path: Path) -> None:
         def samples() -> Iterator[tuple[int, dict[str, bytes]]]:
-            for record in self.parts.records(chunks):
+            for record in self.folder.records(chunks):
                 for i, label in shards.labels(self.model, record):
-                    yield i, {"png": (self.parts.out / self.parts.image(i)).read_bytes(), "json": label}
+                    yield i, {"png": (self.folder.out / self.folder.image(i)).read_bytes(), "json": label}
 
         shards.write(path, samples())
 

@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probscene.dataset import Images
 from probscene.decoding import Window
 from probscene.errors import DataError
 from probscene.model import SceneModel
-
-from ..evaluation.structure_counts import Counts
 
 COLUMNS = (
     "type", "truncated", "occluded", "alpha", "left", "top", "right", "bottom", "height", "width", "length",
@@ -78,7 +77,7 @@ def read_objects(file: Path) -> list[Object]:
 
 def read_kitti(
     folder: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0
-) -> tuple[Counts, tuple[str, ...], tuple[str, ...]]:
+) -> tuple[NDArray[np.int64], tuple[str, ...], tuple[str, ...]]:
     """The counts ``(L, C)`` of a target's images, the C labelled classes in the model's order, and notes.
 
     Files of images that are not in the target are not read, which the notes say.

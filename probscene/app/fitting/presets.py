@@ -35,12 +35,7 @@ class Preset:
         head_epochs: training of the heads that count on pretrained maps, on the same renders.
         photographs: images of the target, at most, on which those heads teach themselves in one more epoch.
         views: of each real image in the density of their features, the image itself and parts of it
-            (``ImageFolder.load``). Among few images they take some noise out: of 81 KITTI frames under EfficientNet's
-            projected features, 4 views lower the standard deviation between the log densities that two halves of the
-            frames give at the model's scenes from 0.50 to 0.45, and raise that of held-out frames by 0.02 nats; a view
-            lies 0.6 kernels from its image, their mean 0.1. More views change nothing, a bandwidth chosen for the few
-            (``projection``) does the rest. There are no flips: they did not help (-0.006 nats), and traffic keeps to a
-            side.
+            (``Images.load``). Among few images they take some noise out of the density.
         guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``; ``FILE.py:NAME`` for one's own.
         objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
             value for each scene; ``"mmd"``, MMD as a reward that all scenes share; ``FILE.py:NAME`` for one's own.
@@ -49,9 +44,8 @@ class Preset:
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Trainer`` and ``ScoreFunction``.
         draws_per_structure: drawings of each structure, of which the clearest is looked at.
-        baseline, scale, incompletion_weight, prior_kl_weight: see ``ScoreFunction``, whose prior is what a guide is
-            pretrained on. Where cars stand behind cars, images say how many there are up to a point: of two hidden
-            targets of streets unanchored fits were 8.7 and 10.5 cars off (Wasserstein-1), at 0.1 0.9 and 1.1.
+        baseline, scale, incompletion_weight, prior_kl_weight: see ``ScoreFunction``, whose prior is the policy
+            that guides are pretrained on.
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
     """
 
@@ -193,9 +187,8 @@ class Preset:
 
 QUICK = Preset()
 DEFAULT = replace(QUICK, count=CountSchedule(steps=12000), batches=120)
-# Ten counts, of which some spread over tens, leave each of 500 scenes alone under a kernel of variance 1 (a self share
-# of 0.5; at 5 it is 0.05 to 0.1), and the log ratio of a density there is anything. What stands behind others is
-# counted as far as it can be seen at all, and the anchor holds what cannot.
+# Streets have ten counts, some of which spread over tens: kernels of variance 1 would leave most of 500 scenes alone.
+# Objects behind others are counted as far as they can be seen at all; the prior holds what cannot.
 STREET = replace(
     QUICK,
     objective="js",

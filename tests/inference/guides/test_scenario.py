@@ -24,6 +24,8 @@ TRUTH = StructurePrior.joined(
         StructurePrior(LISTS, Items=counts(0.1, 0.1, 0.7, 0.1)),
         StructurePrior(PAIRS, Items=counts(0.7, 0.2, 0.1), Doors=counts(0.1, 0.2, 0.7)),
     ],
+    JOINT.first_symbol,
+    JOINT.first_rule,
     [1.0, 1.0],
 )
 
