@@ -51,6 +51,7 @@ def generate(
     workers: int = 1,
     progress: bool = True,
     policy: Policy | None = None,
+    min_visible: float = 0.0,
 ) -> Dataset:
     """Write a labelled dataset; the same call goes on after an interruption.
 
@@ -62,6 +63,7 @@ def generate(
         workers: processes of a run's generation; the bytes do not depend on their number. More than one are spawned: a
             script calls this under ``if __name__ == "__main__":``.
         policy: other structures for a model.
+        min_visible: objects of which a smaller fraction is visible have no label, in any format.
 
     Raises:
         ProbsceneError: see ``generate_run``.
@@ -73,9 +75,9 @@ def generate(
         if isinstance(source, SceneModel):
             if workers != 1:
                 raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
-            return generate_scenes(source, policy or source.prior, num, out, seed, format, said)
+            return generate_scenes(source, policy or source.prior, num, out, seed, format, said, min_visible)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
-        return generate_run(run, num, out, seed, workers, format, said)
+        return generate_run(run, num, out, seed, workers, format, said, min_visible)
 
 
 def evaluate(

@@ -71,9 +71,10 @@ class Run(RunFolder):
         seed: int = 0,
         workers: int = 1,
         progress: bool = True,
+        min_visible: float = 0.0,
     ) -> Dataset:
         """Write a labelled dataset of the learnt structures, see ``generate``."""
-        return calls.generate(self, num, out, format, seed, workers, progress)
+        return calls.generate(self, num, out, format, seed, workers, progress, min_visible=min_visible)
 
     def evaluate(
         self, target: Target | None = None, labels: Path | str | Labels | None = None, **options: Any

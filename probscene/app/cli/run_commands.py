@@ -23,6 +23,9 @@ def generate(
     ] = None,
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,
+    min_visible: Annotated[
+        float, typer.Option(metavar="FRACTION", help="No label for objects of which less is visible, 0 to 1.")
+    ] = 0.0,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
     from ..datasets.generate import generate
@@ -30,7 +33,8 @@ def generate(
     from ..progress import Display
 
     with Display() as show:
-        dataset = generate(RunFolder.at(run), num, out, seed, workers, format or "coco", show.stage("generating"))
+        said = show.stage("generating")
+        dataset = generate(RunFolder.at(run), num, out, seed, workers, format or "coco", said, min_visible)
     print(f"{num} images in {dataset.path}, {dataset.made} of them made now")
 
 

@@ -16,6 +16,7 @@ from pycocotools import mask as rle
 from torch import Tensor
 
 from probscene.batch import RenderBatch
+from probscene.errors import ProbsceneError
 from probscene.model import SceneModel
 
 from .provenance import image_name
@@ -26,21 +27,32 @@ def categories(model: SceneModel) -> list[dict[str, Any]]:
     return [{"id": i, "name": name, "supercategory": model.name} for i, name in enumerate(model.classes, 1)]
 
 
-def labelled(model: SceneModel, batch: RenderBatch) -> Tensor:
+def check_min_visible(min_visible: float) -> None:
+    """See that a least visible fraction is one.
+
+    Raises:
+        ProbsceneError: it is not in 0..1.
+    """
+    if not 0 <= min_visible <= 1:
+        raise ProbsceneError(f"Expected min_visible from 0 to 1, actual {min_visible}.")
+
+
+def labelled(model: SceneModel, batch: RenderBatch, min_visible: float = 0.0) -> Tensor:
     """The category ids ``(N, M)`` int64 of the nodes that are labelled in every format: those of a class that have a
-    visible pixel; 0 at the others.
+    visible pixel, and of which at least the fraction ``min_visible`` is visible; 0 at the others.
     """
     category = torch.tensor([_category(model, name) for name in model.grammar.kinds])
-    return torch.where((batch.kind >= 0) & (batch.pixels > 0), category[batch.kind.clamp(min=0)], 0)
+    shown = (batch.kind >= 0) & (batch.pixels > 0) & (batch.visible >= min_visible)
+    return torch.where(shown, category[batch.kind.clamp(min=0)], 0)
 
 
-def annotations(model: SceneModel, batch: RenderBatch, first: int) -> list[dict[str, Any]]:
-    """Annotations of rendered scenes, but for their ids: one for each node of a class that has a visible pixel.
+def annotations(model: SceneModel, batch: RenderBatch, first: int, min_visible: float = 0.0) -> list[dict[str, Any]]:
+    """Annotations of rendered scenes, but for their ids: one for each node that is ``labelled``.
 
     Args:
         batch: the renders, of images ``first``, ``first + 1``, ...
     """
-    category = labelled(model, batch)
+    category = labelled(model, batch, min_visible)
     found = []
     for i in range(len(category)):
         nodes = category[i].nonzero()[:, 0]

@@ -26,6 +26,8 @@ from .formats import found
 from .provenance import image_name
 
 LINES = "provenance.jsonl"
+UNSAID = {"min_visible": 0.0}
+"""Settings that are recorded only where they have another value than this."""
 
 
 class DatasetFolder:
@@ -154,7 +156,8 @@ class DatasetFolder:
             with open(self.out / LINES, encoding="utf-8") as file:
                 line = json.loads(next(file))
                 num = 1 + sum(1 for _ in file)
-            settings = {key: line[key] for key in self._origin}
+            settings = {key: line[key] for key in self._origin.keys() - UNSAID}
+            settings |= {key: line.get(key, usual) for key, usual in UNSAID.items()}
         except (OSError, StopIteration, ValueError, KeyError, TypeError) as error:
             raise DataError(
                 f"Expected lines of provenance in {self.out / LINES}, actual something else; name another folder."
@@ -162,9 +165,10 @@ class DatasetFolder:
         return {**settings, "num": num, "format": ",".join(found(self.out))}
 
     def _compare(self, before: dict[str, Any]) -> None:
-        differing = [key for key in self.settings if before.get(key) != self.settings[key]]
+        before, settings = UNSAID | before, UNSAID | self.settings
+        differing = [key for key in settings if before.get(key) != settings[key]]
         if differing:
-            was, now = (", ".join(f"{key} {s.get(key)}" for key in differing) for s in (before, self.settings))
+            was, now = (", ".join(f"{key} {s.get(key)}" for key in differing) for s in (before, settings))
             raise DataError(
                 f"Expected the settings that the dataset in {self.out} was begun with ({was}), actual {now}; "
                 "give the same, or name another folder; this one is left as it is."

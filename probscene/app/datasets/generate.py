@@ -29,7 +29,7 @@ from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder
 from ..loading import renderer_for
 from . import coco, kitti, shards, yolo
-from .folder import LINES, DatasetFolder
+from .folder import LINES, UNSAID, DatasetFolder
 from .formats import chosen
 from .provenance import provenance
 from .workers import spread
@@ -53,6 +53,7 @@ def generate(
     workers: int = 1,
     format: str | Iterable[str] = "coco",
     progress: Done | None = None,
+    min_visible: float = 0.0,
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
 
@@ -61,17 +62,18 @@ def generate(
         format: names of ``formats.FORMATS``, such as ``"coco"``, ``"coco,yolo"`` or ``("coco", "yolo")``; ``"images"``
             for no labels.
         progress: called with the number of images there are and ``num``; first with what an interrupted call left.
+        min_visible: objects of which a smaller fraction is visible have no label, in any format.
 
     Raises:
-        ProbsceneError: a number that is not positive, a negative seed, an unknown format, more classes or objects than
-            KITTI's masks can number.
+        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
+            format, more classes or objects than KITTI's masks can number.
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped.
     """
     if workers < 1:
         raise ProbsceneError(f"Expected a positive number of workers, actual {workers}.")
-    job = Job(run.model, run.guide, num, Path(out), seed, chosen(format), run.guide_hash())
+    job = Job(run.model, run.guide, num, Path(out), seed, chosen(format), run.guide_hash(), min_visible)
     if workers == 1:
         return job.run(job.each, progress)
     if run.in_memory:
@@ -79,7 +81,8 @@ def generate(
             f"Expected one worker for a run of {run.in_memory} that are in memory alone, actual {workers}; fit a model "
             "and parts in files for more."
         )
-    return job.run(partial(spread, _worker, (run.path, num, Path(out), seed, job.formats), workers), progress)
+    task = (run.path, num, Path(out), seed, job.formats, min_visible)
+    return job.run(partial(spread, _worker, task, workers), progress)
 
 
 def generate_scenes(
@@ -90,12 +93,13 @@ def generate_scenes(
     seed: int = 0,
     format: str | Iterable[str] = "coco",
     progress: Done | None = None,
+    min_visible: float = 0.0,
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
 
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
-    job = Job(model, policy, num, out, seed, format)
+    job = Job(model, policy, num, out, seed, format, min_visible=min_visible)
     return job.run(job.each, progress)
 
 
@@ -112,10 +116,11 @@ class Job:
 
     Args:
         guide: SHA-256 of the policy's checkpoint, where it is a learnt one.
+        min_visible: see ``generate``.
 
     Raises:
-        ProbsceneError: a number that is not positive, a negative seed, an unknown format, more classes than KITTI's
-            masks can number.
+        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
+            format, more classes than KITTI's masks can number.
     """
 
     def __init__(
@@ -127,16 +132,20 @@ class Job:
         seed: int = 0,
         format: str | Iterable[str] = "coco",
         guide: str | None = None,
+        min_visible: float = 0.0,
     ):
         if num < 1:
             raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
         if seed < 0:
             raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
+        coco.check_min_visible(min_visible)
         self.formats = chosen(format)
         if "kitti" in self.formats:
             kitti.check(model)
-        self.model, self.policy = model, policy
+        self.model, self.policy, self.min_visible = model, policy, float(min_visible)
         self.origin = {"seed": seed, "model": model.name, "guide": guide, "version": probscene.__version__}
+        if self.min_visible != UNSAID["min_visible"]:
+            self.origin["min_visible"] = self.min_visible
         self.folder = DatasetFolder(out, self.origin, num, self.formats)
         self._renderer = renderer_for(model, threads=1)
 
@@ -171,7 +180,7 @@ class Job:
         first, size = chunk * CHUNK, self.folder.size(chunk)
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
         batch = self._renderer(scenes.drawing[:size])
-        found = [] if self.formats == ("images",) else coco.annotations(self.model, batch, first)
+        found = [] if self.formats == ("images",) else coco.annotations(self.model, batch, first, self.min_visible)
         record = {"annotations": found, "provenance": provenance(self.model, scenes, first, self.origin)[:size]}
         self.folder.write(chunk, *self._files(batch, first, found), record)
         return chunk
@@ -189,7 +198,7 @@ class Job:
         if "yolo" in self.formats:
             files |= {yolo.label_name(i): yolo.label(self.model, of_image[i]).encode() for i in of_image}
         if "kitti" in self.formats:
-            masks = kitti.instances(self.model, batch, first)
+            masks = kitti.instances(self.model, batch, first, self.min_visible)
             files |= {kitti.file_name("label_2", i): kitti.label(self.model, of_image[i]).encode() for i in of_image}
             files |= {kitti.file_name("instance", i): mask for i, mask in zip(of_image, masks, strict=True)}
             if batch.space is not None:
@@ -223,10 +232,12 @@ class Job:
         shards.write(path, samples())
 
 
-def _worker(run: Path, num: int, out: Path, seed: int, format: tuple[str, ...]) -> Callable[[int], int]:
+def _worker(
+    run: Path, num: int, out: Path, seed: int, format: tuple[str, ...], min_visible: float
+) -> Callable[[int], int]:
     """What a worker process does with a chunk's number."""
     opened = RunFolder.at(run)
-    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash()).make
+    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), min_visible).make
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:

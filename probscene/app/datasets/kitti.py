@@ -91,17 +91,18 @@ def calib(intrinsics: Tensor) -> str:
     return "".join(f"{name}: {' '.join(f'{v:.12e}' for v in m.ravel())}\n" for name, m in matrices.items())
 
 
-def instances(model: SceneModel, batch: RenderBatch, first: int) -> list[bytes]:
+def instances(model: SceneModel, batch: RenderBatch, first: int, min_visible: float = 0.0) -> list[bytes]:
     """The mask files of rendered scenes.
 
     Args:
         batch: the renders, of images ``first``, ``first + 1``, ...
+        min_visible: see ``coco.labelled``.
 
     Raises:
         ProbsceneError: more than 255 objects of a class in an image.
     """
     files = []
-    for i, category in enumerate(labelled(model, batch).numpy()):
+    for i, category in enumerate(labelled(model, batch, min_visible).numpy()):
         of_node = np.zeros(len(category) + 1, np.uint16)  # by the renderer's ids: 0, then node index + 1
         for number in np.unique(category[category > 0]):
             nodes = np.flatnonzero(category == number)

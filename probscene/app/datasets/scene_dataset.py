@@ -33,7 +33,7 @@ from probscene.policy import Policy
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
-from .coco import labelled
+from .coco import check_min_visible, labelled
 
 Sample = tuple[Tensor, dict[str, Any]]
 _ENDLESS = 1 << 20  # chunks of an epoch that has no end
@@ -44,8 +44,10 @@ class SceneDataset(IterableDataset):
 
     ``image`` is ``(3, H, W)`` float32 from 0 to 1, RGB. ``target`` holds ``boxes`` ``(n, 4)`` float32 x0, y0, x1, y1 in
     pixels, ends exclusive; ``labels`` ``(n,)`` int64 from 1, 0 being the background; ``masks`` ``(n, H, W)`` uint8 of
-    what is visible; ``area`` ``(n,)`` float32, its pixels; ``iscrowd`` ``(n,)`` int64 zeros; ``image_id``, an int. An
-    image may have no object: n = 0.
+    what is visible; ``area`` ``(n,)`` float32, its pixels; ``iscrowd`` ``(n,)`` int64 zeros; ``amodal_boxes``
+    ``(n, 4)`` float32, boxes of the whole silhouettes, which others may cover and the canvas may cut; ``visible``
+    ``(n,)`` float32, the visible fraction, see ``RenderBatch``; ``image_id``, an int. An image may have no object:
+    n = 0.
 
     Worker processes start Taichi themselves: give the loader ``multiprocessing_context="spawn"``. Several ranks of a
     distributed training take seeds of their own.
@@ -82,8 +84,7 @@ class SceneDataset(IterableDataset):
                 raise ProbsceneError(f"Expected a positive number of {name}, actual {number}.")
         if seed < 0:
             raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
-        if not 0 <= min_visible <= 1:
-            raise ProbsceneError(f"Expected min_visible from 0 to 1, actual {min_visible}.")
+        check_min_visible(min_visible)
         self.num, self.seed, self.min_visible, self.batch_size = num, seed, min_visible, batch_size
         self._source = source if isinstance(source, SceneModel) else _resolved(source)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that persist see it change
@@ -158,8 +159,7 @@ class SceneDataset(IterableDataset):
 
     def _samples(self, model: SceneModel, batch: RenderBatch, first: int) -> Iterator[Sample]:
         images = as_written(model, batch.image)
-        category = labelled(model, batch)
-        category = category.where(batch.visible >= self.min_visible, 0)
+        category = labelled(model, batch, self.min_visible)
         for i, image in enumerate(images):
             nodes = category[i].nonzero()[:, 0]
             instance = batch.instance[i]
@@ -169,6 +169,8 @@ class SceneDataset(IterableDataset):
                 "masks": (instance == (nodes + 1).view(-1, 1, 1).to(instance.dtype)).to(torch.uint8),
                 "area": batch.pixels[i, nodes].float(),
                 "iscrowd": torch.zeros(len(nodes), dtype=torch.int64),
+                "amodal_boxes": batch.amodal_box[i, nodes].float(),
+                "visible": batch.visible[i, nodes],
                 "image_id": first + i,
             }
             yield image.expand(3, -1, -1).to(torch.float32, memory_format=torch.contiguous_format).div(255), target
