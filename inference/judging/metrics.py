@@ -7,6 +7,7 @@ References:
     [2] Vallender, *Calculation of the Wasserstein distance between probability distributions on the line*, 1974.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,30 @@ def histogram(values: ArrayLike, bins: int | None = None) -> Shares:
     if bins is not None and len(found) > bins:
         raise ProbsceneError(f"Expected counts below {bins}, actual {len(found) - 1}; give more bins.")
     return found / len(counts)
+
+
+def ranges(samples: Iterable[ArrayLike], most: int = 15, tail: float = 0.01) -> list[tuple[int, int]]:
+    """The first and the last count of each row of a histogram of several samples that a person reads, from 0 on.
+
+    Every count is a row of its own where that makes no more rows than ``most``. Else each tail that holds at most the
+    share ``tail`` of every sample is one row, and the counts between them are in rows of one width.
+
+    Args:
+        samples: one or more of ``(N,)`` counts.
+        most: rows, 3 or more.
+
+    Raises:
+        ProbsceneError: a sample without values, or values that are no counts.
+    """
+    found = [_counts(values, 1) for values in samples]
+    largest = max(int(counts.max()) for counts in found)
+    if largest < most:
+        return [(k, k) for k in range(largest + 1)]
+    low = min(int(np.quantile(counts, tail, method="lower")) for counts in found)
+    high = max(int(np.quantile(counts, 1 - tail, method="higher")) for counts in found)
+    below, above = [(0, low - 1)] if low else [], [(high + 1, largest)] if high < largest else []
+    width = -(-(high + 1 - low) // (most - len(below) - len(above)))
+    return [*below, *((k, min(k + width - 1, high)) for k in range(low, high + 1, width)), *above]
 
 
 def pooled_shares(counts: ArrayLike) -> Shares:

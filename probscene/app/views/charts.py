@@ -4,18 +4,22 @@ A colour here is a stand-in that becomes ``var(--name)``.
 """
 
 import io
+import math
+from collections.abc import Sequence
+from itertools import count
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.textpath import TextPath
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from probscene.inference.judging.metrics import Histogram
 
 from ..evaluation.evaluate import Evaluation
-from ..evaluation.structure_counts import GROUPS, PARENTS, label
+from .tables import nested_counts
 
 INK, FAINT = "#010203", "#010204"
 SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
@@ -66,13 +70,11 @@ def nested(evaluation: Evaluation) -> list[str]:
     for c, kind in enumerate(evaluation.classes):
         each = {name: source.kinds[c].histogram() for name, source in sources.items()}
         charts.append(_counts(each, f"{kind} per image", "share of images", kind, SMALLER))
-    for relation in sources["learnt"].nested:
-        known = {name: source.nested[relation] for name, source in sources.items() if relation in source.nested}
-        for group in GROUPS:
-            each = {name: found[group].histogram() for name, found in known.items() if not found[group].empty}
-            if len(each) > 1 and not (group == PARENTS and relation[0] in evaluation.classes):  # that one is above
-                what = label(relation, group)
-                charts.append(_counts(each, what, "share of images" if group == PARENTS else "share", what, SMALLER))
+    for what, tallies in nested_counts(evaluation).items():
+        each = {name: found.histogram() for name, found in tallies.items()}
+        if len(each) > 1:
+            share = "share of images" if what.endswith("per image") else "share"
+            charts.append(_counts(each, what, share, what, SMALLER))
     return charts
 
 
@@ -101,12 +103,11 @@ def _counts(each: dict[str, Histogram], x: str, y: str, salt: str, size: tuple[f
     """Shares by count, up to the last that can be seen."""
     bins = 1 + max(int(np.flatnonzero(found.share >= SMALL).max(initial=0)) for found in each.values())
     each = {name: Histogram(*(x[:bins] for x in found)) for name, found in each.items()}
-    step = 1 if size == WIDE else -(-bins // 12)
-    return _bars(each, [str(k) if k % step == 0 else "" for k in range(bins)], x, y, salt, size)
+    return _bars(each, range(bins), x, y, salt, size)
 
 
 def _bars(
-    each: dict[str, Histogram], ticks: list[str], x: str, y: str, salt: str, size: tuple[float, float] = WIDE
+    each: dict[str, Histogram], bins: Sequence[int | str], x: str, y: str, salt: str, size: tuple[float, float] = WIDE
 ) -> str:
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt, "axes.grid": True}):
         figure, axes = _figure(*size)
@@ -116,13 +117,37 @@ def _bars(
             axes.bar(at, found.share, width * 0.92, color=SOURCES[name])
             error = np.clip([found.share - found.low, found.high - found.share], 0, None)
             axes.errorbar(at, found.share, error, fmt="none", ecolor=INK, elinewidth=0.8)
-        axes.set_xticks(range(len(ticks)), ticks)
-        axes.set_xlim(-0.6, len(ticks) - 0.4)
+        axes.set_xlim(-0.6, len(bins) - 0.4)
         axes.set_ylim(bottom=0)
         axes.set_xlabel(x)
         axes.set_ylabel(y)
         axes.tick_params(length=0)
+        figure.draw_without_rendering()  # which lays it out
+        label_bins(axes, bins)
         return _svg(figure)
+
+
+def label_bins(axes: Axes, bins: Sequence[int | str]) -> None:
+    """Label the bins at 0, 1, ... of an x axis so that no label touches another.
+
+    Of counts, every first, second, fifth, tenth ... is labelled. Names stand upright where they have no room side by
+    side; of more than have room even then, some are left out.
+
+    Args:
+        axes: of a figure that is laid out, with the limits that it keeps.
+    """
+    size = axes.xaxis.get_ticklabels()[0].get_fontsize()
+    low, high = axes.get_xlim()
+    room = axes.get_window_extent().width / axes.get_figure(root=True).dpi * 72 / (high - low)  # points for a bin
+    widest = max(TextPath((0, 0), str(name), size=size).get_extents().width for name in bins) + size / 2
+    upright = 0
+    if all(isinstance(k, int) for k in bins):
+        step = next(s * 10**power for power in count() for s in (1, 2, 5) if s * 10**power * room >= widest)
+    elif widest <= room:
+        step = 1
+    else:
+        step, upright = math.ceil(1.2 * size / room), 90
+    axes.set_xticks(range(0, len(bins), step), [str(name) for name in bins[::step]], rotation=upright)
 
 
 def _curve(
@@ -136,11 +161,11 @@ def _curve(
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         if log:
             axes.set_yscale("log")
-            axes.yaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
+            axes.yaxis.set_major_locator(LogLocator(10, (1, 2, 5) if value.max() < 100 * value.min() else (1,)))
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_locator(NullLocator())
         elif value.min() >= 0 and spread is None:
-            axes.set_ylim(0, max(1e-6, 1.05 * value.max()))
+            axes.set_ylim(0, 1.05 * value.max() or 1.0)
         axes.set_title(title)
         axes.set_xlabel(x)
         axes.tick_params(length=0)

@@ -1,22 +1,24 @@
 """A comparison as one picture: a column for each source, a row for each kind of count, the reference as an outline."""
 
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from probscene.errors import DataError
 
 from ..evaluation.compare import ESTIMATE, PRIOR, TRUTH, Comparison, Row
 from ..evaluation.structure_counts import ALL, OTHERS, label
 from ..files import make_folder, write_whole
+from .charts import label_bins
 
 COLOURS = {PRIOR: "#9aa3ad", TRUTH: "#30363d", ESTIMATE: "#30363d"}
 RUNS = ("#2b7bba", "#e07b39", "#3a9a5b", "#b04f9e", "#c9a227", "#5c6bc0")
 INK, FAINT = "#1f2328", "#d0d7de"
+CLASSES = "class of an object"  # the row of ``Comparison.shares_of_classes``
 SEPARATE = 4  # classes that get a row each; more share one
 SMALL = 2e-3  # a share that would be no pixel high
 CELL = (2.15, 1.25)  # inches
@@ -50,14 +52,14 @@ def picture(comparison: Comparison) -> Figure:
     figure = Figure((1.5 + CELL[0] * len(names), 0.7 + CELL[1] * len(rows)), layout="constrained", facecolor="white")
     grid = figure.subplots(len(rows), len(names), squeeze=False)
     run_colours = dict(zip(comparison.runs, (RUNS[i % len(RUNS)] for i in range(len(comparison.runs))), strict=True))
+    labels: dict[Axes, Sequence[int | str]] = {}
     for i, row in enumerate(rows):
         bins = 1 + max(int(np.flatnonzero(share >= SMALL).max(initial=0)) for share in row.shares.values())
         highest = max(share.max() for share in row.shares.values())
         for j, name in enumerate(names):
             axes = grid[i, j]
             _cell(axes, row, name, comparison.reference, {**COLOURS, **run_colours}[name], bins, highest)
-            if row.label == "class of an object":
-                axes.set_xticks(range(bins), comparison.classes[:bins], rotation=90 if bins > 12 else 0)
+            labels[axes] = comparison.classes[:bins] if row.label == CLASSES else range(bins)
             if i == 0:
                 axes.annotate(
                     textwrap.fill(_head(name), 22), (0.5, 1), (0, 18), "axes fraction", "offset points",
@@ -66,6 +68,9 @@ def picture(comparison: Comparison) -> Figure:
         grid[i, 0].set_ylabel(
             textwrap.fill(row.label, 16), rotation=0, ha="right", va="center", fontsize=9, labelpad=8, color=INK
         )
+    figure.draw_without_rendering()  # which lays it out
+    for axes, each in labels.items():
+        label_bins(axes, each)
     return figure
 
 
@@ -74,7 +79,8 @@ def shown(comparison: Comparison) -> list[Row]:
     classes, their shares alone."""
     pooled = {label(relation, g) for relation in comparison.sources[PRIOR].nested for g in (ALL, OTHERS)}
     reference, C = comparison.reference, len(comparison.classes)
-    rows = [row for row in comparison.rows() if row.label not in pooled and (not reference or reference in row.shares)]
+    each = {row.label: row for row in comparison.rows()}.values()  # how many parents there are, once
+    rows = [row for row in each if row.label not in pooled and (not reference or reference in row.shares)]
     return rows if C <= SEPARATE else [rows[0], comparison.shares_of_classes(), *rows[1 + C :]]
 
 
@@ -97,7 +103,6 @@ def _cell(axes: Axes, row: Row, name: str, reference: str | None, colour: str, b
         axes.stairs(outline, np.arange(bins + 1) - 0.5, color=COLOURS[reference], linewidth=1.0)
     axes.set_xlim(-0.7, bins - 0.3)
     axes.set_ylim(0, 1.05 * highest)
-    axes.xaxis.set_major_locator(MaxNLocator(min(8, bins), integer=True))
     axes.set_yticks([])
     axes.tick_params(length=2, labelsize=7.5, color=FAINT, labelcolor=INK)
     axes.spines[["top", "right", "left"]].set_visible(False)

@@ -182,12 +182,15 @@ def _nested(evaluation: Evaluation) -> str:
 def _figures(evaluation: Evaluation) -> str:
     """Every table of the evaluation that the charts do not hold."""
     parts = []
-    for table in (*tables.nested(evaluation), *tables.likelihoods(evaluation), *tables.images(evaluation)):
-        head = [str(column.header).removesuffix(" *") for column in table.columns]
+    compared = *tables.apart(evaluation, spread=True), *tables.nested(evaluation, spread=True)
+    for table in (*compared, *tables.likelihoods(evaluation), *tables.images(evaluation)):
+        head = [str(column.header).replace(" *", "") for column in table.columns]
         rows = list(zip(*(column.cells for column in table.columns), strict=True))
         parts.append(
             f'<h3>{html.escape(str(table.title).replace(" *", ""))}</h3><div class="chart">{_table(head, rows)}</div>'
         )
+        if table.caption:
+            parts.append(f'<p class="soft">{html.escape(str(table.caption))}</p>')
     return "".join(parts)
 
 

@@ -1,31 +1,30 @@
 """Evaluations and comparisons as tables of text."""
 
 import textwrap
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 
-from probscene.inference.judging.metrics import Histogram
+from probscene.inference.judging.metrics import Histogram, histogram_interval, ranges
 from probscene.inference.judging.tally import Interval, Tally
 
 from ..evaluation.compare import ESTIMATE, Comparison
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.likelihood import Likelihood
-from ..evaluation.sources import Source
-from ..evaluation.structure_counts import GROUPS, PARENTS, Relation, label
+from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, label
 
 NAMES = {"prior": "prior", "learnt": "learnt", "truth": "truth", "estimate": "estimate *"}
 FITTED = ("prior", "learnt")
-DISTANCES = {
-    "number": "number of objects, total variation",
-    "classes": "classes, total variation",
-    "number_wasserstein": "number of objects, Wasserstein-1",
-}
 FOOTNOTE = (
     "* An estimate without labels: what the feature network counts in the target's images, rounded; not the truth."
 )
+LEGEND = "TV: total variation, 0 to 1. W-1: Wasserstein-1, in objects."
 
+ALL_OBJECTS, SHARES = "all objects", "class shares"
 WIDEST = 1000  # characters
 WORDS = {"truth": "the truth", "estimate": "what the feature network sees *"}
 FLOOR = "The floor is what two halves of the target are apart; every figure of FID and KID is of as many images a side."
@@ -34,8 +33,8 @@ FLOOR = "The floor is what two halves of the target are apart; every figure of F
 def show(evaluation: Evaluation, console: Console) -> None:
     """Print the distances, then the histograms in percent with half the width of their 95 % intervals."""
     more = (*nested(evaluation), *likelihoods(evaluation), *images(evaluation))
-    for table in (*distances(evaluation.distances()), _numbers(evaluation), _classes(evaluation), *more):
-        console.print(table)
+    for table in (*apart(evaluation), _numbers(evaluation), _classes(evaluation), *more):
+        _print(table, console)
         console.print()
     notes = {figure.note for each in evaluation.images.values() for found in each.values() for figure in found} - {""}
     if "estimate" in evaluation.sources:
@@ -48,26 +47,71 @@ def show(evaluation: Evaluation, console: Console) -> None:
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
 
 
-def distances(measured: dict[str, Any]) -> list[Table]:
-    """How far prior and learnt structures are from the truth and from the estimate, a table each; ``measured`` is
-    ``Evaluation.distances()``."""
+def apart(evaluation: Evaluation, spread: bool = False) -> list[Table]:
+    """``distances`` with the means of every source."""
+    means = {
+        name: {ALL_OBJECTS: float(source.total.mean())}
+        | {kind: found.mean() for kind, found in zip(evaluation.classes, source.kinds, strict=True)}
+        for name, source in evaluation.sources.items()
+    }
+    return distances(evaluation.distances(), means, spread)
+
+
+def distances(
+    measured: dict[str, Any], means: Mapping[str, Mapping[str, Any]] | None = None, spread: bool = False
+) -> list[Table]:
+    """How far prior and learnt structures are from the truth and from the estimate: a table each, with a row for all
+    objects, one for each class's count, and one for the classes' shares.
+
+    Args:
+        measured: ``Evaluation.distances()``.
+        means: by source and row, where they are to be shown.
+        spread: also half the width of the 95 % intervals that are known.
+    """
     tables = []
     for b, found in measured.items():
-        what = "the truth" if b == "truth" else "what the feature network sees *"
-        table = _table(f"Distance to {what}", "", ["prior", "learnt"])
-        for key, words in DISTANCES.items():
-            values = (found[a][key] for a in ("prior", "learnt"))
-            table.add_row(words, *("-" if value is None else f"{value:.3f}" for value in values))
+        shown = () if means is None else (*FITTED, b)
+        table = _distances(f"Distance to {WORDS[b]}", shown, "" if tables else LEGEND)
+        kinds = {kind: [_both(found[a]["kinds"][kind]) for a in FITTED] for kind in found["learnt"]["kinds"]}
+        rows = {ALL_OBJECTS: [(found[a]["number"], found[a]["number_wasserstein"]) for a in FITTED]}
+        if len(kinds) > 1:  # one class is all objects
+            rows |= kinds | {SHARES: [(found[a]["classes"], None) for a in FITTED]}
+        for words, values in rows.items():
+            _add(table, words, values, [means[name].get(words) for name in shown] if means else [], spread)
         tables.append(table)
     return tables
+
+
+def _both(found: dict[str, Any] | None) -> tuple[Interval | None, Interval | None]:
+    """Total variation and Wasserstein-1 of a record of ``Evaluation.distance``."""
+    return (None, None) if found is None else (Interval(**found["total_variation"]), Interval(**found["wasserstein"]))
+
+
+def _distances(title: str, shown: Iterable[str], legend: str = "") -> Table:
+    """A table with columns of both distances of prior and learnt, and of the means of the sources shown."""
+    heads = [f"{what}\n{a}" for what in ("TV", "W-1") for a in FITTED]
+    table = _table(title, "", [*heads, *(f"mean\n{'seen *' if name == ESTIMATE else name}" for name in shown)])
+    if legend:
+        table.caption, table.caption_justify = legend, "left"
+    return table
+
+
+def _add(table: Table, words: str, values: list[tuple[Any, Any]], means: list[Any], spread: bool) -> None:
+    figures = [pair[i] for i in (0, 1) for pair in values]
+    table.add_row(words, *(_figure(x, 3, spread) for x in figures), *(_figure(x, 2, spread) for x in means))
 
 
 def _numbers(evaluation: Evaluation) -> Table:
     sources = evaluation.sources
     table = _table("Images by number of objects, %", "objects", [NAMES[name] for name in sources])
-    each = [source.number() for source in sources.values()]
-    for k in range(max(len(found.share) for found in each)):
-        table.add_row(str(k), *(_percent(found, k) for found in each))
+    rows = ranges(source.total for source in sources.values())
+    firsts = [first for first, _ in rows]
+    each = [histogram_interval(np.searchsorted(firsts, s.total, "right") - 1, len(rows)) for s in sources.values()]
+    for k, (first, last) in enumerate(rows):
+        words = str(first) if first == last else f"{first} to {last}"
+        if first < last and k == len(rows) - 1:
+            words = f"{first} or more"
+        table.add_row(words, *(_percent(found, k) for found in each))
     table.add_section()
     table.add_row("mean", *(f"{source.total.mean():.2f}" for source in sources.values()))
     return table
@@ -82,50 +126,65 @@ def _classes(evaluation: Evaluation) -> Table:
     return table
 
 
-def _rows(source: Source, relations: list[Relation]) -> dict[tuple[Relation, str], Tally]:
-    """The tallies of a source, by relation and group, that hold any node."""
-    return {
-        (relation, group): found
-        for relation in relations
-        for group, found in source.nested.get(relation, {}).items()
-        if not found.empty
-    }
+def nested_counts(evaluation: Evaluation) -> dict[str, dict[str, Tally]]:
+    """Where kinds nest, what is counted of them, in words, with the tallies of each source that has such nodes.
+
+    What another row says is left out: how many parents there are, where they are a class or have been counted below
+    their own one parent; the first parent, where no image has a second; the later ones, where there is one alone.
+    """
+    found: dict[str, dict[str, Tally]] = {}
+    whole: list[tuple[str, dict[str, Tally]]] = []
+    for relation in dict.fromkeys(r for source in evaluation.sources.values() for r in source.nested):
+        known = {
+            name: source.nested[relation] for name, source in evaluation.sources.items() if relation in source.nested
+        }
+        before = [each for child, each in whole if child == relation[0]]
+        for group in GROUPS:
+            each = {name: tallies[group] for name, tallies in known.items() if not tallies[group].empty}
+            if not each or (group == PARENTS and relation[0] in evaluation.classes):
+                continue
+            if not any(_same(each, other) for other in before):
+                found.setdefault(label(relation, group), each)
+            before += [] if group == PARENTS else [each]
+            whole += [(relation[1], each)] if group == ALL else []
+    return found
 
 
-def nested(evaluation: Evaluation) -> list[Table]:
-    """Where kinds nest: the mean of every kind of count, then how far each is from the truth and from the estimate."""
-    relations = list(evaluation.sources["learnt"].nested)
-    if not relations:
+def _same(each: dict[str, Tally], other: dict[str, Tally]) -> bool:
+    return each.keys() == other.keys() and all(
+        np.array_equal(x, y) for name in each for x, y in zip(each[name], other[name], strict=True)
+    )
+
+
+def nested(evaluation: Evaluation, spread: bool = False) -> list[Table]:
+    """Where kinds nest: how far every kind of count is from the truth and from the estimate, and its means; without
+    either, the means alone.
+
+    Args:
+        spread: also half the width of the 95 % intervals.
+    """
+    rows, tables = nested_counts(evaluation), []
+    if not rows:
         return []
-    each = {name: _rows(source, relations) for name, source in evaluation.sources.items()}
-    known = dict.fromkeys(key for found in each.values() for key in found)
-    means = _table("Counts by what they depend on, means", "", [NAMES[name] for name in each])
-    for key in sorted(known, key=lambda key: _order(key, relations)):
-        found = (tallies.get(key) for tallies in each.values())
-        means.add_row(label(*key), *("-" if tally is None else _figure(tally.mean(), 2) for tally in found))
-    tables = [means]
-    for b in evaluation.distances():
-        keys = [key for key in each[b] if not (key[1] == PARENTS and key[0][0] in evaluation.classes)]
-        for field, title in (("total_variation", "total variation"), ("wasserstein", "Wasserstein-1")):
-            what = "the truth" if b == "truth" else "what the feature network sees *"
-            table = _table(f"Counts by what they depend on, {title} to {what}", "", ["prior", "learnt"])
-            found = {
-                f"{name} per image": [(evaluation.sources[a].kinds[c], evaluation.sources[b].kinds[c]) for a in FITTED]
-                for c, name in enumerate(evaluation.classes)
-            } | {
-                label(*key): [(each[a].get(key), each[b][key]) for a in FITTED]
-                for key in sorted(keys, key=lambda key: _order(key, relations))
-            }
-            for words, pairs in found.items():
-                apart = (one and one.distance(other) for one, other in pairs)
-                table.add_row(words, *(_figure(found and getattr(found, field), 3) for found in apart))
-            if each[b]:
-                tables.append(table)
+    title = "Counts by what they depend on"
+    for b in (name for name in evaluation.sources if name not in FITTED):
+        table = _distances(f"{title}, distance to {WORDS[b]}", (*FITTED, b))
+        for words, each in rows.items():
+            if b in each:
+                found = [each[a].distance(each[b]) if a in each else None for a in FITTED]
+                _add(table, words, [x or (None, None) for x in found], [_mean(each, n) for n in (*FITTED, b)], spread)
+        if table.row_count:
+            tables.append(table)
+    if not tables:
+        table = _table(f"{title}, means", "", list(FITTED))
+        for words, each in rows.items():
+            table.add_row(words, *(_figure(_mean(each, name), 2) for name in FITTED))
+        tables.append(table)
     return tables
 
 
-def _order(key: tuple[Relation, str], relations: list[Relation]) -> tuple[int, int]:
-    return relations.index(key[0]), GROUPS.index(key[1])
+def _mean(each: dict[str, Tally], name: str) -> Interval | None:
+    return each[name].mean() if name in each else None
 
 
 def likelihoods(evaluation: Evaluation) -> list[Table]:
@@ -160,11 +219,14 @@ def _short(figure: Any) -> str:
     return f"{figure.value:.4g} ± {(figure.high - figure.low) / 2:.2g}"
 
 
-def _figure(found: Interval | None, digits: int) -> str:
-    """A figure and half the width of its interval."""
+def _figure(found: Interval | float | None, digits: int, spread: bool = True) -> str:
+    """A figure and, if asked for and known, half the width of its interval."""
     if found is None:
         return "-"
-    return f"{found.value:.{digits}f} ± {(found.high - found.low) / 2:.{digits}f}"
+    if not isinstance(found, Interval):
+        return f"{found:.{digits}f}"
+    half = f" ± {(found.high - found.low) / 2:.{digits}f}" if spread else ""
+    return f"{found.value:.{digits}f}{half}"
 
 
 def _table(title: str, first: str, columns: list[str]) -> Table:
@@ -176,16 +238,21 @@ def _table(title: str, first: str, columns: list[str]) -> Table:
 
 
 def _percent(found: Histogram, k: int) -> str:
-    if k >= len(found.share):
-        return "0.0"
     return f"{100 * found.share[k]:.1f} ± {50 * (found.high[k] - found.low[k]):.1f}"
 
 
-def show_comparison(comparison: Comparison, console: Console) -> None:
-    """Print it as wide as it is: a narrow terminal wraps its lines, a file has them whole."""
-    table = comparison_table(comparison)
-    whole = Console(width=WIDEST).measure(table).maximum
+def _print(table: Table, console: Console) -> None:
+    """Print it as wide as its figures are: a narrow terminal wraps its lines, a file has them whole."""
+    for column in table.columns:
+        if column.no_wrap:
+            column.min_width = max(map(cell_len, (*str(column.header).split("\n"), *map(str, column.cells))))
+    whole = Console(width=WIDEST).measure(table).minimum
     Console(file=console.file, width=max(console.width, whole), highlight=False).print(table)
+
+
+def show_comparison(comparison: Comparison, console: Console) -> None:
+    """Print it, whole."""
+    _print(comparison_table(comparison), console)
     if comparison.reference == ESTIMATE:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
     for note in comparison.notes:
@@ -200,10 +267,10 @@ def comparison_table(comparison: Comparison) -> Table:
     table.add_column("", no_wrap=True)
     for name in comparison.sources:
         table.add_column(textwrap.fill(NAMES.get(name, name), 16), justify="right", no_wrap=True)
-    rows = comparison.rows()
-    if len(comparison.classes) > 1:
-        rows.insert(1 + len(comparison.classes), comparison.shares_of_classes())
-    for row in rows:
+    rows, kinds = comparison.rows(), len(comparison.classes) if len(comparison.classes) > 1 else 0
+    known = nested_counts(comparison)
+    deeper = {row.label: row for row in rows[1 + kinds :] if row.label in known}
+    for row in (*rows[: 1 + kinds], *([comparison.shares_of_classes()] if kinds else []), *deeper.values()):
         cells = (_compared(row.apart.get(name), row.means.get(name)) for name in comparison.sources)
         table.add_row(row.label, *cells)
     if comparison.likelihoods:

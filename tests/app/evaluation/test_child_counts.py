@@ -145,7 +145,8 @@ def test_the_command_shows_what_depends_on_context(call, plates, found, tmp_path
     assert json.loads((tmp_path / "e.json").read_text()) == json.loads(json.dumps(found.record()))
     for group in ("all", "first", "others"):
         value = found.distance("prior", "truth")["children"]["mug per plate"][group]["total_variation"]["value"]
-        assert any(label(PAIR, group) in line and f"{value:.3f} ±" in line for line in shown.out.splitlines())
+        name = label(PAIR, group)[:12]  # a long name goes on in the line below
+        assert any(name in line and f"{value:.3f}" in line for line in shown.out.splitlines())
     assert "impossible" in shown.out and "log q" in shown.out
     plain = call(*words)
     assert plain.code == 0 and "mug per first plate" in plain.out and "log q" not in plain.out
@@ -155,14 +156,14 @@ def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
     shown = call("evaluate", fitted, "--target", target.images, "--labels", target.labels, "--num", 100, "--scenes", 0)
     titles = [line.strip() for line in shown.out.splitlines() if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
-        "Distance to the truth", "Distance to what the feature network sees *", "Images by number of objects",
+        "Distance to the truth", "TV: total variation", "Distance to what the feature network sees *", "Images by number of objects",
         "Objects by class"]  # fmt: skip
 
 
 def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_path):
     text = write(plates.run, found, plates.opened, tmp_path / "r.html").read_text(encoding="utf-8")
     for group in ("all", "first", "second", "others"):
-        assert text.count(label(PAIR, group)) >= 4  # a chart and three tables
+        assert text.count(label(PAIR, group)) >= 2  # a chart and a table
     assert "log q of the labelled structures" in text and "impossible" in text
     from probscene.app.progress import Display
 

@@ -106,3 +106,23 @@ def test_wrong_arguments_are_refused():
         metrics.wasserstein([1.5, -0.5], [1.0])
     with pytest.raises(ProbsceneError, match="level"):
         metrics.histogram_interval([1], level=1.0)
+
+
+@given(st.lists(st.lists(st.integers(0, 400), min_size=1, max_size=60), min_size=1, max_size=4), st.integers(3, 20))
+def test_ranges_are_few_and_hold_every_count_once(samples, most):
+    found = metrics.ranges(samples, most)
+    assert len(found) <= most
+    assert [k for first, last in found for k in range(first, last + 1)] == list(range(max(map(max, samples)) + 1))
+    if max(map(max, samples)) < most:
+        assert all(first == last for first, last in found)
+
+
+@given(st.integers(0, 2**31), st.integers(5, 60))
+def test_ranges_merge_tails_alone_where_the_rest_has_room(seed, mean):
+    samples = [np.random.default_rng(seed + i).poisson(mean, 2000) for i in range(3)]
+    found = metrics.ranges(samples)
+    widths = {last + 1 - first for first, last in found[1:-2]}
+    assert len(widths) <= 1  # of one width, but for the tails and what is left over
+    for first, last in (found[0], found[-1]):
+        if last + 1 - first > max(widths):  # a tail
+            assert all(np.mean((sample >= first) & (sample <= last)) <= 0.0105 for sample in samples)
