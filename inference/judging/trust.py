@@ -15,7 +15,7 @@ from probscene.errors import ProbsceneError
 from .modes import effective_share, interval, modes
 from .support import Fidelity, Mask, fidelity, foreign, likeness, unlike_floor
 from .two_sample import NEEDED, Apart, Features, apart, check_features, marginals, permutation_p, principal
-from .verdict import REMEDY, Figures, Gap, Verdict, decide
+from .verdict import PRETRAINED_REMEDY, REMEDY, Figures, Gap, Verdict, decide
 
 EXAMINED = 2000  # real images whose likes are looked for
 SHOWN = 16  # images of each side that are least like the other
@@ -29,16 +29,19 @@ class Trust:
         verdict: in words.
         because: one sentence with the figures that decided.
         figures: all of them.
+        pretrained: whether the features are a pretrained network's.
     """
 
     verdict: Verdict
     because: str
     figures: Figures
+    pretrained: bool = False
 
     @property
     def remedy(self) -> str:
         """What to do."""
-        return REMEDY[self.verdict]
+        usual = REMEDY[self.verdict]
+        return PRETRAINED_REMEDY.get(self.verdict, usual) if self.pretrained else usual
 
     def record(self) -> dict[str, Any]:
         """Everything, for JSON."""
@@ -86,6 +89,7 @@ def trust(
     resolution: float = 0.0,
     looks: tuple[ArrayLike, ArrayLike] | None = None,
     seed: int = 0,
+    pretrained: bool = False,
 ) -> Trust:
     """Judge a fit.
 
@@ -98,6 +102,7 @@ def trust(
         looks: features of appearance of some real images and of some scenes ``(A, E)``, ``(B, E)``, to tell another
             domain by.
         seed: of the splits.
+        pretrained: whether the features are a pretrained network's, which advice goes by.
 
     Raises:
         DataError: see ``check_features``: fewer real images than are needed, all alike, or not finite.
@@ -157,7 +162,7 @@ def trust(
         rest = apart(generated, some[~nowhere], seed=seed), marginals(read_generated, read_some[~nowhere], seed=seed)
         explained = _halved(rest[0], joint) and _halved(rest[1].largest, single.largest)
     verdict, because = decide(figures, explained)
-    return Trust(verdict, because, figures)
+    return Trust(verdict, because, figures, pretrained)
 
 
 def _read(features: Features, resolution: float, rng: np.random.Generator) -> Features:

@@ -54,8 +54,14 @@ REMEDY = {
     Verdict.OUT_OF_REACH: "Look at these images: widen the prior or the grammar, so that it can make them, or leave "
     "them out of the target folder.",
     Verdict.ANOTHER_DOMAIN: "Check that the target folder belongs to this model; if it does, its renders do not look "
-    "like the images: change its sprites and their scale, or take pretrained features if it has its own.",
+    "like the images: change its sprites and their scale, or take pretrained features.",
 }
+PRETRAINED_REMEDY = {
+    Verdict.APART: "Fit longer (the default preset, more batches).",
+    Verdict.ANOTHER_DOMAIN: "Check that the target folder belongs to this model; if it does, its renders do not look "
+    "like the images: change its sprites and their scale.",
+}
+"""What to do instead where the features are a pretrained network's: to take them, or to train them, is no advice."""
 
 
 class Gap(NamedTuple):

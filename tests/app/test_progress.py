@@ -2,11 +2,16 @@
 
 import io
 import re
+import time
+from itertools import pairwise
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
-from probscene.app.progress import STAGES, Display
+from probscene.app import progress
+from probscene.app.progress import EVERY, STAGES, Display
 
 
 def shown(terminal: bool, reports, error: bool = False) -> tuple[str, Display]:
@@ -58,3 +63,91 @@ def test_bars_fit_a_terminal_of_80_columns(stage):
     title, unit = STAGES[stage]
     assert title in plain and "10000/10000" in plain and unit[:4] in plain
     assert all(len(row.split("\r")[-1]) <= 80 for row in plain.splitlines())
+
+
+class Clock:
+    """A clock that the test sets."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def logged(reports) -> tuple[list[tuple[float, str]], Display]:
+    """What a log file gets, with its times, from ``(seconds later, stage, done, total, note)``."""
+    clock, out = Clock(), io.StringIO()
+    display, lines = Display(Console(file=out, width=80), clock), []
+    for later, *report in reports:
+        clock.now += later
+        display(*report)
+        for line in out.getvalue().splitlines()[len(lines) :]:
+            lines.append((clock.now - Clock.now, line))
+    return lines, display
+
+
+@given(st.lists(st.floats(0.01, 100), min_size=1, max_size=60))
+def test_a_log_file_gets_a_line_every_half_minute(gaps):
+    lines, _ = logged([(gap, "structure", i + 1, 1000, "") for i, gap in enumerate(gaps)])
+    times = [0.0, *(at for at, _ in lines), sum(gaps)]
+    assert all(later - at < EVERY + max(gaps) for at, later in pairwise(times))
+    assert len(lines) <= sum(gaps) / EVERY  # and no more than that
+
+
+def test_a_line_says_stage_done_of_total_rate_and_time_left():
+    lines, _ = logged([(0, "features", 0, 600, ""), *((2, "features", i, 600, f"loss {i}") for i in range(1, 100))])
+    assert lines[0] == (30.0, "Feature network: 15 of 600 steps, 0.5 steps/s, 19:30 left, loss 15")
+    assert [at for at, _ in lines] == [30, 60, 90, 120, 150, 180]
+
+
+def test_a_beat_between_reports_counts_the_time_down_and_before_all_stages_says_that_something_is_done():
+    clock, out = Clock(), io.StringIO()
+    display = Display(Console(file=out, width=80), clock)
+    for later in (29, 1, 0, 29, 1):
+        clock.now += later
+        display.beat()
+    assert out.getvalue().splitlines() == [f"Preparing what comes next, for {t}" for t in ("0:30", "1:00")]
+    display("structure", 0, 10)
+    for done in (1, 2):
+        clock.now += 20
+        display("structure", done, 10)
+    clock.now += 31
+    display.beat()
+    assert out.getvalue().splitlines()[2:] == [
+        "Structure: 2 of 10 batches, 0.05 batches/s, 2:40 left",
+        "Structure: 2 of 10 batches, 0.05 batches/s, 2:09 left",
+    ]
+
+
+@given(st.floats(0, 1000), st.integers(1, 50), st.integers(1, 50), st.floats(0.1, 10))
+def test_a_stages_clock_leaves_out_what_was_loaded_before_it(loading, first, more, each):
+    """It first reports when ``first`` units are done, ``loading`` seconds later than they would take alone."""
+    total = first + more
+    reports = [(loading + first * each, "target", first, total, "")]
+    reports += [(each, "target", first + i, total, "") for i in range(1, more + 1)]
+    lines, display = logged(reports)
+    assert display.seconds["target"] == pytest.approx(total * each, rel=1e-6)
+    assert lines[-1][1].startswith(f"Target's features: {total} images in {total * each:.1f} s, ")
+
+
+def test_a_thread_says_it_while_nothing_is_reported(monkeypatch):
+    monkeypatch.setattr(progress, "EVERY", 0.05)
+    out = io.StringIO()
+    with Display(Console(file=out, width=80)) as display:
+        display("generating", 0, 10)
+        deadline = time.monotonic() + 20
+        while out.getvalue().count("Generating: 0 of 10 images") < 3 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    said = out.getvalue()
+    assert said.count("Generating: 0 of 10 images") >= 3
+    time.sleep(0.1)
+    assert out.getvalue() == said  # nothing after the end
+
+
+def test_terminals_and_quiet_consoles_have_no_such_lines():
+    for console in (Console(file=io.StringIO(), force_terminal=True), Console(file=io.StringIO(), quiet=True)):
+        clock = Clock()
+        display = Display(console, clock)
+        clock.now += 100
+        display.beat()
+        assert console.file.getvalue() == ""

@@ -14,6 +14,8 @@ from torch import Tensor
 from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.counting.choices import PretrainedCountFeatures
+from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.judging.trust import Trust, trust
 from probscene.inference.judging.two_sample import NEEDED
 from probscene.policy import Policy
@@ -100,6 +102,7 @@ def judge(
         done += images
         progress("judging", done, total, "")
 
+    each(0)
     eyes = [_Eyes(net, looks, each, keep) for keep in (True, False)]
     draws = preset.draws_per_structure
     scenes = [_features(run, policy, eye, draws, num, seed) for policy, eye in zip(policies, eyes, strict=True)]
@@ -116,6 +119,7 @@ def judge(
             resolution=run.features.resolution,
             looks=(seen.numpy(), torch.cat([look for eye in eyes for look in eye.looks]).numpy()),
             seed=seed,
+            pretrained=isinstance(run.features, PretrainedCountFeatures | ProjectedFeatures),
         )
     except DataError as error:
         return Judged(None, str(error))

@@ -25,15 +25,16 @@ FOOTNOTE = (
 LEGEND = "TV: total variation, 0 to 1. W-1: Wasserstein-1, in objects."
 
 ALL_OBJECTS, SHARES = "all objects", "class shares"
-WIDEST = 1000  # characters
+WIDEST, ROOMY = 1000, 140  # characters; and so many that distances have room for their intervals
 WORDS = {"truth": "the truth", "estimate": "what the feature network sees *"}
 FLOOR = "The floor is what two halves of the target are apart; every figure of FID and KID is of as many images a side."
 
 
 def show(evaluation: Evaluation, console: Console) -> None:
     """Print the distances, then the histograms in percent with half the width of their 95 % intervals."""
-    more = (*nested(evaluation), *likelihoods(evaluation), *images(evaluation))
-    for table in (*apart(evaluation), _numbers(evaluation), _classes(evaluation), *more):
+    roomy = console.width >= ROOMY
+    more = (*nested(evaluation, roomy), *likelihoods(evaluation), *images(evaluation))
+    for table in (*apart(evaluation, roomy), _numbers(evaluation), _classes(evaluation), *more):
         _print(table, console)
         console.print()
     notes = {figure.note for each in evaluation.images.values() for found in each.values() for figure in found} - {""}

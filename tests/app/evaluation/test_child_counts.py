@@ -156,8 +156,8 @@ def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
     shown = call("evaluate", fitted, "--target", target.images, "--labels", target.labels, "--num", 100, "--scenes", 0)
     titles = [line.strip() for line in shown.out.splitlines() if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
-        "Distance to the truth", "TV: total variation", "Distance to what the feature network sees *", "Images by number of objects",
-        "Objects by class"]  # fmt: skip
+        "Distance to the truth", "TV: total variation", "Distance to what the feature network sees *",
+        "Images by number of objects", "Objects by class"]  # fmt: skip
 
 
 def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_path):

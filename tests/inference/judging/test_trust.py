@@ -106,6 +106,15 @@ def test_the_verdict_is_right(make, case, expected):
     json.dumps(found.record(), allow_nan=False)
 
 
+@pytest.mark.parametrize("case", ["another domain", "context lost"])
+def test_advice_asks_for_nothing_that_a_fit_has(case):
+    sets = aerial(case, np.random.default_rng(7))
+    one, other = (trust(*sets, resolution=0.5, pretrained=has) for has in (False, True))
+    assert (one.verdict, one.because) == (other.verdict, other.because) and one.remedy != other.remedy
+    assert "pretrained" not in other.remedy and "train the feature" not in other.remedy
+    assert {key for key, value in one.record().items() if other.record()[key] != value} == {"remedy"}
+
+
 def test_false_alarms_are_rare_and_the_prior_is_never_good():
     good = prior = 0
     for seed in range(15):
