@@ -194,11 +194,13 @@ def network_counts(run: RunFolder, target: Images | None, progress: Progress) ->
         done += images
         progress("target", done, total, "")
 
+    if features is None and target is None:
+        return None
     net = own_net(run)
-    if features is None:
-        if target is None:
-            return None
+    if features is None and target is not None:
         features = features_in(run, target, net, each)
+    if features is None:
+        return None
     found = estimated(model, names, features * getattr(net, "unit", 1.0))
     return None if found is None else Source(*found, seed=1)
 
