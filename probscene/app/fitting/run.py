@@ -143,8 +143,8 @@ class RunFolder(Storage):
             named = ", ".join(f"{name} ({objects[name]})" for name in missing)
             again = ", ".join(f"{name}=..." for name in missing)
             raise RunError(
-                f"Expected what the run in {self.path} was begun with, actual its folder alone, without the {named}: "
-                f"in memory then. Open it from Python: probscene.Run.open({str(self.path)!r}, {again})."
+                f"Expected all that the run in {self.path} was begun with, actual its folder, which cannot give back "
+                f"what was in memory: {named}. Open it from Python: probscene.Run.open({str(self.path)!r}, {again})."
             )
 
     @property
