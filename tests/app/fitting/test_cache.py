@@ -137,6 +137,23 @@ def test_other_assets_are_another_entry(whole, python_of, tmp_path):
     assert NetworkCache(run, net, tmp_path).key == key
 
 
+def test_a_folder_of_assets_is_known_by_all_that_it_holds(whole, python_of, tmp_path, monkeypatch):
+    run, net = python_of
+    folder = tmp_path / "assets"
+    folder.mkdir()
+    drawn = type(run)(run.path, run.record | {"assets_folder": str(folder)}, run.model)
+    keys = []
+    for content in ("one", "other", "one"):
+        (folder / "picture").write_text(content)
+        keys.append(NetworkCache(drawn, net).key)
+    assert keys[0] == keys[2] != keys[1]
+    monkeypatch.setenv("DISCS", str(folder))
+    named = type(run)(run.path, run.record, replace(run.model, assets_variable="DISCS", with_assets=str))
+    key = NetworkCache(named, net).key
+    (folder / "picture").rename(folder / "photo")
+    assert NetworkCache(named, net).key != key
+
+
 @pytest.fixture
 def python_of(fitted):
     run = ps.Run.open(fitted)
