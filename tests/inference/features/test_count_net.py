@@ -91,19 +91,6 @@ def test_it_learns_to_count(dots, draw_dots):
     assert ((seen - counts).square().mean(0) < 0.35 * counts.var(0)).all()
 
 
-@pytest.mark.parametrize("kind", ["count", "presence"])
-def test_training_goes_on_to_the_same_bits(dots, draw_dots, kind, goes_on_to_the_same_bits):
-    def training():
-        torch.manual_seed(0)
-        if kind == "count":
-            net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
-            schedule = CountSchedule(steps=48, images=4, crops=4, crop=32, window=2)
-            return CountTraining(net, draw_dots, schedule, seed=1)
-        return PresenceTraining(PresenceNet(dots.classes, 4, 8), draw_dots, 60, 4, 20, accuracy=1.1, seed=1)
-
-    goes_on_to_the_same_bits(training)
-
-
 def test_what_goes_wrong_while_drawing_ahead_ends_the_training(dots, draw_dots):
     calls = []
 
