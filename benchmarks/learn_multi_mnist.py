@@ -86,7 +86,7 @@ def distances(policy, target: int) -> tuple[float, float]:
 
 def fit_images(name: str, target: int, seed: int, args) -> tuple[LSTMGuide, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
-    images, out = args.out / f"target-{target}" / "images", args.out / f"{name}-{target}"
+    images, out = args.out / f"target-{target}", args.out / f"{name}-{target}"
     run = fit("multi_mnist", images, PRESETS[name], seed, out=out, resume=True, cache=args.out / "cache")
     return run.guide, timing(run)
 

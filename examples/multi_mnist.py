@@ -42,8 +42,8 @@ def seen_counts(steps):
     def draw(num):
         return examples(render(ps.sample(MODEL, MODEL.prior, num).drawing), classes)
 
-    def report(training, line):
-        print(f"features  step {training.done:5d}  loss {line['loss']:.3f}")
+    def report(training, told):
+        print(f"features  step {training.done:5d}  loss {told['loss']:.3f}")
 
     CountTraining(net, draw, CountSchedule(steps=steps)).run(report)
     return lambda scenes: torch.cat([net.embed(render(part).image) for part in parts(scenes.drawing)])

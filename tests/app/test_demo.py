@@ -8,7 +8,7 @@ from PIL import Image
 
 from probscene.app import demo as module
 from probscene.app.demo import demo
-from probscene.app.fitting import session
+from probscene.app.fitting import fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
@@ -34,7 +34,7 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    for where, name in ((session.fit, "_learn"), (module, "generate"), (module, "evaluate")):
+    for where, name in ((fit, "_learn"), (module, "generate"), (module, "evaluate")):
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(where, name, interrupt)
             go()

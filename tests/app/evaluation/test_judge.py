@@ -80,8 +80,7 @@ def structure(model, number, colour) -> StructurePrior:
 
 
 def guided(path, policy) -> Guided:
-    run = Guided.open(path)
-    run = Guided(run.path, run.record)
+    run = Guided.at(path)
     run.policy = policy(run.model)
     return run
 
