@@ -48,6 +48,18 @@ def test_loss_is_least_at_the_target():
         assert count_loss(target.clamp(min=1e-9).log() + torch.randn_like(target), target, 1, 0.5) > best
 
 
+@given(st.integers(1, 3), st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31))
+def test_grey_images_pass_the_same_layers_with_the_same_gradient(N, h, w, seed):
+    torch.manual_seed(seed)
+    net = CountNet(("a", "b"), 1, (128, 128)).eval()
+    image = torch.rand(N, 1, STRIDE * h, STRIDE * w)
+    first, sides = net.body[0].weight, (net(image), net.body(image))
+    assert torch.allclose(*sides, atol=1e-5)
+    weight = torch.randn_like(sides[0])
+    ours, plain = (torch.autograd.grad((side * weight).sum(), first)[0] for side in sides)
+    assert torch.allclose(ours, plain, rtol=1e-4, atol=1e-4 * float(plain.abs().max()))
+
+
 def test_embedding_is_the_map_summed_and_indifferent_to_place(dots):
     torch.manual_seed(0)
     net = CountNet(dots.classes, 3, (128, 128))
