@@ -74,15 +74,21 @@ def orthogonalise(matrix: Tensor) -> Tensor:
     """
     if matrix.shape[0] > matrix.shape[1]:
         return orthogonalise(matrix.T).T
-    a, b, c = QUINTIC
     x = matrix / matrix.norm().clamp(min=1e-7)
     for steps in ROUNDS:
-        gram, product = x @ x.T, None
-        for step in range(steps):
-            factor = torch.addmm(gram, gram, gram, beta=b, alpha=c)
-            factor.diagonal().add_(a)
-            product = factor if product is None else factor @ product
-            if step + 1 < steps:
-                gram = factor @ gram @ factor
+        gram = x @ x.T
+        product = factor = _factor(gram)
+        for _ in range(steps - 1):
+            gram = factor @ gram @ factor
+            factor = _factor(gram)
+            product = factor @ product
         x = product @ x
     return x
+
+
+def _factor(gram: Tensor) -> Tensor:
+    """P of a Gram matrix, ``a I + b A + c A^2``."""
+    a, b, c = QUINTIC
+    factor = torch.addmm(gram, gram, gram, beta=b, alpha=c)
+    factor.diagonal().add_(a)
+    return factor

@@ -103,11 +103,9 @@ class CountNet(nn.Module):
         """
         if self.channels > 1:
             return self.body(x.contiguous(memory_format=torch.channels_last))
-        first, *rest = self.body
-        x = _halve(x, first.weight)
-        for layer in rest:
-            x = layer(x)
-        return x
+        first = self.body[0]
+        assert isinstance(first, nn.Conv2d)
+        return self.body[1:](_halve(x, first.weight))
 
     def enter(self, images: Tensor) -> Tensor:
         """Reduced images with a clear border, padded to whole cells."""

@@ -217,20 +217,28 @@ def inner(net: FeatureNet) -> FeatureNet:
 
 
 class CheckedDivergence:
-    """A user's divergence, whose answers are looked at. It may draw random numbers: each batch has its own seed."""
+    """A user's divergence, whose answers are looked at."""
 
     def __init__(self, divergence: Divergence):
         self.divergence = divergence
+        self._checked = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
         """``(N,)``, see ``Divergence``.
 
         Raises:
-            ModelError: something else.
+            ModelError: something else, or another answer to the same features.
         """
         cost = self.divergence(generated, real)
         what = getattr(self.divergence, "__name__", None) or f"{type(self.divergence).__name__}.__call__"
         _check_tensor(cost, (len(generated),), what, "one cost a generated scene (N,)")
+        if not self._checked:
+            if not torch.equal(self.divergence(generated, real), cost):
+                raise ModelError(
+                    f"Expected {what} to give the same costs whenever it is given the same features, actual others; "
+                    "draw no random numbers in it, and keep nothing from call to call."
+                )
+            self._checked = True
         return cost.detach().float()
 
 

@@ -130,6 +130,7 @@ PARTS = {
     "of features": ({"features": OddDivergence()}, r"one cost a generated scene \(N,\)"),
     "a cost a feature": ({"divergence": lambda g, r: g}, r"one cost a generated scene .* actual .* \(\d+, \d\)"),
     "whole costs": ({"divergence": lambda g, r: g[:, 0].long()}, r"one cost .* actual torch.int64"),
+    "random costs": ({"divergence": lambda g, r: torch.rand(len(g))}, "<lambda> to give the same costs whenever"),
     "NaN costs": ({"divergence": lambda g, r: nan(g[:, 0])}, "finite values of <lambda>"),
     "no divergence": ({"divergence": 0.5}, r"a divergence, called with features .* actual float"),
     "one argument": ({"divergence": lambda g: g}, r"a divergence, called with .* actual <lambda>\(g\)"),
