@@ -18,7 +18,7 @@ def import_file(path: Path) -> ModuleType:
     """
     path = Path(path)
     if not path.is_file():
-        raise ModelError(f"Expected a model file, actual {str(path)!r}, which is not there.")
+        raise ModelError(f"Expected a Python file, actual {str(path)!r}, which is not there.")
     name = "probscene_model_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None
@@ -31,7 +31,7 @@ def import_file(path: Path) -> ModuleType:
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         raise ModelError(
-            f"Model file {path} does not import: {type(error).__name__}: {error} "
+            f"The file {path} does not import: {type(error).__name__}: {error} "
             f"({Path(where.filename).name}, line {where.lineno}). Try 'python {path}'."
         ) from error
     return module
