@@ -17,7 +17,6 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.judging.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
 
@@ -106,6 +105,7 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
     assert len(found.real_unmatched) == len(found.generated_unmatched) == verdict.SHOWN
     assert found.names == tuple(target.paths[i].name for i in found.real_unmatched)
     assert all(picture.shape == (64, 64, 3) for picture in found.generated_unmatched)
+    assert not found.trust.pretrained
     record = json.loads(json.dumps(found.record(), allow_nan=False))
     assert record["verdict"] == str(expected) and "labels" not in record
     assert set(record["single_features"]) == {"red", "blue", "total"}
@@ -116,20 +116,6 @@ def test_the_same_run_has_the_same_verdict(seeing, drawn):
     one, other = (judge(run, drawn.target, quiet, 100) for _ in range(2))
     assert one.record() == other.record()
     assert all(np.array_equal(a, b) for a, b in zip(one.generated_unmatched, other.generated_unmatched, strict=True))
-
-
-class OnPretrained(Guided):
-    """A run that says that its features are a pretrained network's."""
-
-    @property
-    def features(self):
-        return ProjectedFeatures("efficientnet")
-
-
-def test_a_run_with_pretrained_features_is_not_told_to_take_them(seeing, drawn):
-    found = [judge(make.at(seeing), drawn.aerial, quiet, SCENES).trust for make in (Guided, OnPretrained)]
-    assert [one.verdict for one in found] == [Verdict.ANOTHER_DOMAIN] * 2
-    assert ["pretrained" in one.remedy for one in found] == [True, False]
 
 
 @pytest.mark.parametrize(("some", "close"), [(True, True), (False, False)])
