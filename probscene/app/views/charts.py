@@ -136,9 +136,9 @@ def label_bins(axes: Axes, bins: Sequence[int | str]) -> None:
     Args:
         axes: of a figure that is laid out, with the limits that it keeps.
     """
-    size = axes.xaxis.get_ticklabels()[0].get_fontsize()
+    size = axes.get_xticklabels()[0].get_fontproperties().get_size_in_points()
     low, high = axes.get_xlim()
-    room = axes.get_window_extent().width / axes.get_figure(root=True).dpi * 72 / (high - low)  # points for a bin
+    room = axes.get_window_extent().width / axes.figure.dpi * 72 / (high - low)  # points for a bin
     widest = max(TextPath((0, 0), str(name), size=size).get_extents().width for name in bins) + size / 2
     upright = 0
     if all(isinstance(k, int) for k in bins):
