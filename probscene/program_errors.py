@@ -46,11 +46,11 @@ class Place(NamedTuple):
 
 
 @contextmanager
-def told(name: str, program: Any = None) -> Iterator[None]:
+def told(what: str, program: Any = None) -> Iterator[None]:
     """Errors of the user's code come out as one clear ``ModelError``.
 
     Args:
-        name: of the model.
+        what: is run, in words, such as "the program of model 'tabletop'".
         program: the code that is run; lines of its own file are preferred to those of other files of the user's.
 
     Raises:
@@ -65,8 +65,7 @@ def told(name: str, program: Any = None) -> Iterator[None]:
         if place is None:
             raise
         raise ModelError(
-            f"Expected the program of model {name!r} to run, actual {type(error).__name__} in {place}: "
-            f"{useful_text(error)}; {remedy(error)}."
+            f"Expected {what} to run, actual {type(error).__name__} in {place}: {useful_text(error)}; {remedy(error)}."
         ) from error
 
 

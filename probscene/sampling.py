@@ -85,7 +85,7 @@ def run_program(
             "nonterminals left; draw them with derive_complete."
         )
     known = Given(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
-    with told(name, model), torch.no_grad(), poutine.block(), known:
+    with told(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"].get("value")
