@@ -264,7 +264,7 @@ def _is_canvas(canvas: Any) -> bool:
 
 
 def _is_positive(number: Any) -> bool:
-    return isinstance(number, Integral) and number >= 1
+    return isinstance(number, Integral) and int(number) >= 1
 
 
 def _takes_one(draw: Any) -> bool:

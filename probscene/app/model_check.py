@@ -4,27 +4,24 @@
 policy of pretraining, and renders some of the scenes. Axis letters: N scenes, M nodes.
 """
 
-import functools
 from dataclasses import replace
 from typing import NamedTuple
 
 import pyro
 import torch
-from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from probscene.batch import RenderBatch
 from probscene.checks import Report, check
 from probscene.errors import MachineError, ProbsceneError
-from probscene.grammar import Grammar, Node, is_nonterminal
 from probscene.inference.features.counting.net import CountNet
 from probscene.model import SceneModel
 from probscene.program_errors import told
-from probscene.relations import relations
 from probscene.sampling import Scenes, run_program, sample
 
 from .chunks import chunk_randomness
 from .loading import renderer_for
+from .watch import Watch, longer, lookups, shorter, watched
 
 SCENES, RENDERED = 256, 32  # how many scenes the program is run on, and how many of them are rendered
 QUICK = 64, 16  # the same before a fit
@@ -34,10 +31,12 @@ LEAST_SIZE = 6.0  # pixels that an object needs in what the count network reads,
 
 
 class Findings(NamedTuple):
-    """What running a model has shown: ``faults``, each with what to do, and ``warnings``."""
+    """What running a model has shown: faults, each with what to do, warnings, and of each class the sizes ``(n,)`` of
+    objects that can be seen, pixels."""
 
-    faults: tuple[str, ...]
-    warnings: tuple[str, ...]
+    faults: list[str]
+    warnings: list[str]
+    sizes: dict[str, Tensor]
 
 
 def check_model(model: SceneModel, scenes: int = SCENES, rendered: int = RENDERED) -> Report:
@@ -54,70 +53,40 @@ def check_model(model: SceneModel, scenes: int = SCENES, rendered: int = RENDERE
     if report.faults:
         return report
     faults, warnings = [], list(report.warnings)
+    sizes: dict[str, list[Tensor]] = {name: [] for name in model.classes}
     each = dict(model.scenarios) or {"": model}
     for name, part in each.items():
+        part = replace(part, renderer=model.renderer)
         found = check_program(part, -(-scenes // len(each)), -(-rendered // len(each)))
         before = f"Scenario {name!r}: " if name else ""
         faults += [before + text for text in found.faults]
         warnings += [before + text for text in found.warnings]
+        for kind, size in found.sizes.items():
+            sizes[kind].append(size)
+    warnings += _small(model, {kind: torch.cat(some) for kind, some in sizes.items() if some})
     return replace(report, faults=tuple(faults), warnings=tuple(warnings))
 
 
 def check_program(model: SceneModel, scenes: int, rendered: int) -> Findings:
     """Run a model's program and render some of its scenes; arguments as of ``check_model``."""
-    watch = Watch(model.grammar)
-    with pyro.get_param_store().scope(), chunk_randomness(0, 0):
+    watch, store = Watch(model.grammar), pyro.get_param_store()
+    with store.scope(store.get_state()), chunk_randomness(0, 0):
         try:
             policies = [model.prior] if model.pretraining is None else [model.prior, model.pretraining]
             number = -(-scenes // len(policies))
-            drawn = [sample(_watched(model, watch), policy, number) for policy in policies]
+            drawn = [sample(watched(model, watch), policy, number) for policy in policies]
             wrong = _not_finite(drawn)
             if wrong:
-                return Findings(tuple(wrong), ())
+                return Findings(wrong, [], {})
             batches = _rendered(model, drawn, rendered)
         except MachineError:
             raise
         except ProbsceneError as error:
-            return Findings(tuple(_shorter(model, watch)) or (str(error),), ())
-        faults, warnings = _seen(model, batches)
-        warnings += _small(model, batches)
-    faults += _shorter(model, watch)
-    warnings += [*_longer(model, watch), *_lookups(model, watch, drawn[0])]
-    return Findings(tuple(faults), tuple(warnings))
-
-
-class Watch(Messenger):
-    """An effect handler that notes what a program asks for.
-
-    Attributes:
-        max_steps: that it derives the grammar with.
-        asked: whether it looks up values of parents.
-        found: whether any node has had one then.
-    """
-
-    def __init__(self, grammar: Grammar):
-        super().__init__()
-        self.grammar, self.asked, self.found = grammar, False, False
-        self.max_steps: set[int] = set()
-
-    def _pyro_derive(self, msg) -> None:
-        grammar, _, _, max_steps = msg["args"]
-        if grammar.rules == self.grammar.rules:
-            self.max_steps.add(max_steps)
-
-    def _pyro_of_parent(self, msg) -> None:
-        _, parent, _ = msg["args"]
-        self.asked = True
-        self.found |= bool((parent >= 0).any())
-
-
-def _watched(model: SceneModel, watch: Watch) -> SceneModel:
-    @functools.wraps(model.program)
-    def program(num_scenes, structure):
-        with watch:
-            return model.program(num_scenes, structure)
-
-    return replace(model, program=program)
+            return Findings(shorter(model, watch) or [str(error)], [], {})
+    faults, warnings = _seen(model, batches)
+    faults += shorter(model, watch)
+    warnings += [*longer(model, watch), *lookups(model, watch, drawn[0])]
+    return Findings(faults, warnings, {name: _sizes(model.grammar.kind(name), batches) for name in model.classes})
 
 
 def _not_finite(drawn: list[Scenes]) -> list[str]:
@@ -219,17 +188,18 @@ def _why_hidden(model: SceneModel, box: Tensor) -> str:
     )
 
 
-def _small(model: SceneModel, batches: list[tuple[Tensor, RenderBatch]]) -> list[str]:
+def _sizes(kind: int, batches: list[tuple[Tensor, RenderBatch]]) -> Tensor:
+    box = torch.cat([batch.amodal_box[(batch.kind == kind) & (batch.pixels > 0)] for _, batch in batches])
+    return (box[:, 2:] - box[:, :2]).prod(-1).sqrt()
+
+
+def _small(model: SceneModel, sizes: dict[str, Tensor]) -> list[str]:
     """Classes of which half are too small for the count network, as it would reduce the images."""
-    sizes = {}
-    for name in model.classes:
-        kind = model.grammar.kind(name)
-        box = torch.cat([batch.amodal_box[(batch.kind == kind) & (batch.pixels > 0)] for _, batch in batches])
-        if len(box) >= FEW:
-            sizes[name] = (box[:, 2:] - box[:, :2]).prod(-1).sqrt()
+    sizes = {name: size for name, size in sizes.items() if len(size) >= FEW}
     if not sizes:
         return []
-    net = CountNet(model.classes, model.channels, model.canvas, groups=model.groups)
+    with torch.random.fork_rng(devices=[]):
+        net = CountNet(model.classes, model.channels, model.canvas, groups=model.groups)
     net.fit_to(float(torch.cat(list(sizes.values())).quantile(0.1)))
     middle = {name: float(size.median()) for name, size in sizes.items()}
     small = [f"{name!r} {size:.2g}" for name, size in middle.items() if size / net.reduce < LEAST_SIZE]
@@ -240,54 +210,3 @@ def _small(model: SceneModel, batches: list[tuple[Tensor, RenderBatch]]) -> list
         f"Objects are small, in pixels: {', '.join(small)}{reduced}; below {LEAST_SIZE:g} there they can hardly be "
         "counted; draw them larger."
     ]
-
-
-def _shorter(model: SceneModel, watch: Watch) -> list[str]:
-    return [
-        f"The program derives with max_steps = {other} and the model says max_steps = {model.max_steps}: longer scenes "
-        "would be cut short; give derive(...) the model's, or say it once with scene_model."
-        for other in sorted(watch.max_steps)
-        if other < model.max_steps
-    ]
-
-
-def _longer(model: SceneModel, watch: Watch) -> list[str]:
-    return [
-        f"The program derives with max_steps = {other} and the model says max_steps = {model.max_steps}, which counts; "
-        "give derive(...) the model's, or say it once with scene_model."
-        for other in sorted(watch.max_steps)
-        if other > model.max_steps
-    ]
-
-
-def _lookups(model: SceneModel, watch: Watch, scenes: Scenes) -> list[str]:
-    """What a program reads of parents that its grammar does not give; ``scenes`` are some of it."""
-    grammar = model.grammar
-    parents = {parent for parent, _ in relations(grammar)}
-    for rule in grammar.rules:
-        for i, (symbol, after) in enumerate(zip(rule.rhs, rule.rhs[1:], strict=False)):
-            if not isinstance(symbol, str) or is_nonterminal(symbol) or symbol in parents:
-                continue
-            if not isinstance(after, str) or not is_nonterminal(after) or after == rule.lhs:
-                continue
-            is_list = bool(grammar.recursive[grammar.nonterminals.index(after)])
-            grouped = model.groups is not None and model.groups.kind == symbol
-            if grouped or (watch.asked and (not watch.found or (is_list and _has_sites(grammar, scenes, symbol)))):
-                right = " ".join(map(str, (*rule.rhs[:i], Node(symbol, (after,)), *rule.rhs[i + 2 :])))
-                who = "groups are counted by it" if grouped else "scene.of_parent finds no parent there"
-                return [
-                    f"In '{rule}' what {after} derives stands beside {symbol!r} and not below it, and {who}; if it "
-                    f"belongs to {symbol!r}, write '{rule.lhs} -> {right}'."
-                ]
-    if watch.asked and not watch.found:
-        return [
-            "The program reads values of parents (scene.of_parent), and no object has a parent; make children with "
-            "brackets, such as 'Plate -> plate(Mugs)'."
-        ]
-    return []
-
-
-def _has_sites(grammar: Grammar, scenes: Scenes, kind: str) -> bool:
-    """Whether nodes of a kind have parameters of their own."""
-    here = scenes.drawing.kind == grammar.kind(kind)
-    return any(mask.shape == here.shape and bool((mask & here).any()) for mask in scenes.site_mask.values())

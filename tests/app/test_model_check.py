@@ -201,12 +201,15 @@ def test_it_leaves_no_trace(discs):
 
     def program(num_scenes, structure):
         pyro.param("drawn", lambda: torch.rand(3))
+        assert pyro.get_param_store()["kept"] == 5
         return model.program(num_scenes, structure)
 
     pyro.clear_param_store()
+    pyro.param("kept", torch.tensor(5.0))
     before = torch.get_rng_state()
     assert not check_model(replace(model, program=program)).faults
-    assert torch.equal(torch.get_rng_state(), before) and "drawn" not in pyro.get_param_store()
+    assert torch.equal(torch.get_rng_state(), before) and set(pyro.get_param_store()) == {"kept"}
+    pyro.clear_param_store()
 
 
 @pytest.mark.parametrize("name", ["multi_mnist", "aerial2d"])
