@@ -81,6 +81,28 @@ def test_a_fault_of_the_program_is_found_before_anything_is_written(fault, call,
         assert part in told and part in fitted, (told, fitted)
 
 
+IMPORTS = {
+    "raises": ("x = 1\ny = [][3]\n", "IndexError: list index out of range (m.py, line 2: 'y = [][3]')"),
+    "raises inside torch": (
+        "import torch\ntorch.zeros(2) @ torch.zeros(3)\n",
+        "line 2: 'torch.zeros(2) @ torch.zeros(3)'",
+    ),
+    "syntax": ("x = 1\ndef f(:\n", "SyntaxError: invalid syntax (m.py, line 2: 'def f(:')"),
+    "exits": ("import sys\nsys.exit(3)\n", "SystemExit: 3 (m.py, line 2: 'sys.exit(3)')"),
+    "a distribution": (
+        "import pyro.distributions as dist\nD = dist.Normal(0.0, -1.0)\n",
+        "GreaterThan(lower_bound=0.0), but found -1.0 (m.py, line 2: 'D = dist.Normal(0.0, -1.0)')",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", IMPORTS)
+def test_a_file_that_does_not_import_is_told_with_its_line(fault, call, tmp_path):
+    text, part = IMPORTS[fault]
+    (tmp_path / "m.py").write_text(text)
+    assert part in one_line(call("check", tmp_path / "m.py"))
+
+
 def test_debug_shows_the_users_traceback(call, tmp_path):
     result = call("--debug", "preview", written(tmp_path, X, "x = 1 / 0"), "--out", tmp_path / "grid.png")
     assert result.code == 1 and "probscene: " not in result.err
