@@ -5,29 +5,27 @@
 
 The target is drawn with digits that the model does not have, upright in a row, where the model scatters and turns them;
 what is compared in the end is the learnt distribution of structures with the target's.
+
+``probscene.fit`` takes the same steps; it also seeds each batch, keeps checkpoints, and draws each structure several
+times.
 """
 
 import argparse
 import math
 
-import pyro
 import torch
 from pyro.infer import SVI
 from pyro.optim.lr_scheduler import PyroLRScheduler
 from torch.optim.lr_scheduler import LambdaLR
 
+import probscene as ps
 from probscene.derive import derive_complete
-from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.features.counting.training import CountTraining
-from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import ScoreFunction
-from probscene.inference.pretrain import pretrain
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL, target
 from probscene.renderers.sprites import SpriteRenderer
-from probscene.sampling import sample
 
 
 def true_counts(scenes):
@@ -42,7 +40,7 @@ def seen_counts(steps):
     net = CountNet(MODEL.classes, MODEL.channels, MODEL.canvas)
 
     def draw(num):
-        return examples(render(sample(MODEL, MODEL.prior, num).drawing), classes)
+        return examples(render(ps.sample(MODEL, MODEL.prior, num).drawing), classes)
 
     def report(training, told):
         print(f"features  step {training.done:5d}  loss {told['loss']:.3f}")
@@ -73,20 +71,20 @@ def main():
     parser.add_argument("--num-scenes", type=int, default=500, help="scenes a batch")
     parser.add_argument("--num-real", type=int, default=5000, help="target images")
     args = parser.parse_args()
-    pyro.set_rng_seed(args.seed)
+    ps.seed_everything(args.seed)
 
     truth = target(args.seed)
     observe = true_counts if args.oracle else seen_counts(args.steps)
     chunks = [min(500, args.num_real - done) for done in range(0, args.num_real, 500)]
-    real = torch.cat([observe(sample(truth, truth.prior, size)) for size in chunks])
+    real = torch.cat([observe(ps.sample(truth, truth.prior, size)) for size in chunks])
 
-    guide = LSTMGuide(GRAMMAR, MODEL.max_steps)
-    pretrain(guide, MODEL.prior)
+    guide = ps.LSTMGuide(GRAMMAR, MODEL.max_steps)
+    ps.pretrain(guide, MODEL.prior)
 
     updates = 3
     cosine = {"lr_lambda": lambda step: 0.5 * (1 + math.cos(math.pi * step / (updates * args.batches)))}
     adam = PyroLRScheduler(LambdaLR, {"optimizer": torch.optim.Adam, "optim_args": {"lr": 1e-2}, **cosine})
-    loss = ScoreFunction(observe, KDELogRatio(), updates=updates)
+    loss = ps.ScoreFunction(observe, ps.KDELogRatio(), updates=updates)
     svi = SVI(MODEL, guide, adam, loss=loss)
     for step in range(updates * args.batches):
         cost = svi.step(args.num_scenes, real=real)

@@ -85,7 +85,7 @@ def decoded(
             w, h = image.size
             size = (w, h) if turned else (h, w)
             image.draft(None, (max(canvas), max(canvas)))  # a large JPEG is decoded at a half, a fourth, an eighth
-            pixels = np.array(_eight_bit(ImageOps.exif_transpose(image)).convert("L" if channels == 1 else "RGB"))
+            pixels = np.array(eight_bit(ImageOps.exif_transpose(image)).convert("L" if channels == 1 else "RGB"))
     except Fault:
         raise
     except UnidentifiedImageError as error:
@@ -114,7 +114,7 @@ def fitted(
     return np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
 
 
-def _eight_bit(image: Image.Image) -> Image.Image:
+def eight_bit(image: Image.Image) -> Image.Image:
     """An opaque image of at most 8 bits a channel."""
     if image.mode.startswith("I"):
         return Image.fromarray((np.asarray(image).astype(np.uint16) >> 8).astype(np.uint8))

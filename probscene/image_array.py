@@ -1,16 +1,17 @@
 """Images in memory as a target: an array, or a torch dataset of images. Axis letters: L images, C H W."""
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from .dataset import Images, grey, part_of
-from .decoding import fitted, window
+from .decoding import eight_bit, fitted, window
 from .errors import DataError
 
 
@@ -50,19 +51,38 @@ class ImageArray(Images):
 
     def load(self, i: int, view: int = 0) -> Tensor:
         """Image number ``i``, ``(C, H, W)`` uint8; see ``Images.load``."""
-        image = torch.from_numpy(fitted(self._whole[i], self.canvas, part_of(i, view) if view else None))
+        # A copy: the array may be one that nobody may write.
+        image = torch.tensor(fitted(self._whole[i], self.canvas, part_of(i, view) if view else None))
         return grey(image.expand(3, -1, -1)) if self.channels == 1 else image.expand(3, -1, -1).contiguous()
 
 
 def _items(images: Any) -> Iterable[Any]:
+    """The images one by one.
+
+    Raises:
+        DataError: an array of another shape, or what has no length or no items by number.
+    """
     if isinstance(images, np.ndarray | Tensor) and images.ndim not in (3, 4):
         raise DataError(f"Expected an array of images (L, H, W, C) or (L, H, W), actual shape {tuple(images.shape)}.")
     try:
-        return (images[i] for i in range(len(images)))
-    except TypeError as error:
+        number = len(images)
+    except (TypeError, NotImplementedError):
+        number = -1
+    if number < 0 or not hasattr(images, "__getitem__") or isinstance(images, Mapping):
         raise DataError(
-            "Expected as target a folder, a list of files, an array of images or a dataset with a length, actual "
-            f"{type(images).__name__}."
+            "Expected as target a folder, a list of files, an array of images or a dataset with a length and images by "
+            f"number, actual {type(images).__name__}; make a list of it."
+        )
+    return (_item(images, i) for i in range(number))
+
+
+def _item(images: Any, i: int) -> Any:
+    try:
+        return images[i]
+    except NotImplementedError as error:
+        raise DataError(
+            f"Expected a dataset that gives images by number, actual {type(images).__name__}, which does not; make a "
+            "list of its images."
         ) from error
 
 
@@ -75,7 +95,9 @@ def _array(image: Any, i: int) -> np.ndarray:
             image = image.permute(1, 2, 0)
         if image.is_floating_point() and bool(((image >= 0) & (image <= 1)).all()):
             image = (image * 255).round().to(torch.uint8)
-        image = image.numpy()
+        image = image.detach().cpu().numpy()
+    if isinstance(image, Image.Image):
+        image = eight_bit(image)
     found = np.asarray(image)
     found = found[..., 0] if found.ndim == 3 and found.shape[2] == 1 else found
     if found.dtype != np.uint8 or (found.ndim != 2 and found.shape[2:] != (3,)) or not found.size:

@@ -1,5 +1,7 @@
 """The documentation's Python runs and prints what the pages say, and the options that it lists are those there are."""
 
+import ast
+import inspect
 import os
 import re
 import subprocess
@@ -55,3 +57,19 @@ def test_files_that_pages_name_are_there(page):
     named = re.findall(r"\b(?:examples|benchmarks|inference|models|renderers|tests)/[\w/]+\.\w+", found)
     for name in [*named, *re.findall(r"\]\(\.\./([^)#]+)", found)]:
         assert (ROOT / name).is_file() or (ROOT / "docs" / name).is_file(), name
+
+
+def test_the_page_on_extending_names_what_there_is():
+    page = text("extending.md")
+    named = dict(re.findall(r"`(own_\w+\.py):(\w+)`", page))
+    assert {"own_renderer.py", *named} == {path.name for path in (ROOT / "examples").glob("own_*.py")}
+    for file, name in named.items():
+        tree = ast.parse((ROOT / "examples" / file).read_text(encoding="utf-8"))
+        assert name in {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}, file
+        assert f"examples/{file}:{name}" in ast.get_docstring(tree)
+    rows = re.findall(r"^\| `(\w+)(?:\(([\w, ]+)\))?` \|", page.partition("| method | says |")[2], re.MULTILINE)
+    for name, arguments in rows:
+        there = getattr(probscene.Features, name)
+        assert not arguments or list(inspect.signature(there).parameters) == ["self", *arguments.split(", ")]
+    own = {name for name in vars(probscene.Features) if not name.startswith("_")}
+    assert {name for name, _ in rows} == own

@@ -88,6 +88,8 @@ class ProjectionTraining:
         Raises:
             ProbsceneError: see ``discriminant``.
         """
+        if self.done == self.total:
+            return
         seed_everything(self.seed)
         parts, self.done = [], 0
         for first in range(0, self.total, DRAWN_AT_ONCE):

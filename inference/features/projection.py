@@ -60,7 +60,9 @@ def discriminant(one: Tensor, other: Tensor, directions: int, scenes: int) -> Pr
     """
     both = torch.cat([one, other]).double()
     if not torch.isfinite(both).all():
-        raise ProbsceneError("Expected finite features of the prior's renders, actual NaN or infinity.")
+        raise ProbsceneError(
+            "Expected finite features of the prior's renders, actual NaN or infinity; name another network."
+        )
     mean = both.mean(0)
     _, size, axes = torch.linalg.svd(both - mean, full_matrices=False)
     varying = int((size > 1e-6 * size[0]).sum())

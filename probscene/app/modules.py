@@ -18,7 +18,7 @@ def import_file(path: Path) -> ModuleType:
     """
     path = Path(path)
     if not path.is_file():
-        raise ModelError(f"Expected a model file, actual {str(path)!r}, which is not there.")
+        raise ModelError(f"Expected a Python file, actual {str(path)!r}, which is not there.")
     name = "probscene_model_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None
@@ -32,7 +32,7 @@ def import_file(path: Path) -> ModuleType:
         place = user_place(error, str(path.absolute()))
         where = f" ({Path(place.file).name}, line {place.line}: '{place.text}')" if place else ""
         what = f"{type(error).__name__}: {useful_text(error)}"
-        raise ModelError(f"Model file {path} does not import: {what}{where}. Try 'python {path}'.") from error
+        raise ModelError(f"The file {path} does not import: {what}{where}. Try 'python {path}'.") from error
     return module
 
 

@@ -63,8 +63,8 @@ def idx_folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def discs() -> SimpleNamespace:
-    """``file``: a model; ``settings``: words that make a fit of it short."""
-    return SimpleNamespace(file=DISCS, settings=SETTINGS)
+    """``file``: a model; ``settings``: words that make a fit of it short; ``short``: the preset's fields among them."""
+    return SimpleNamespace(file=DISCS, settings=SETTINGS, short=SHORT)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """The example of a renderer of one's own goes the whole path on the command line, and its labels are right."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from typer.testing import CliRunner
 
-from probscene.app.cli import app
+import probscene as ps
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.loading import load_model, renderer_for
 from probscene.checks import check
@@ -19,14 +19,6 @@ from probscene.sampling import sample, seed_everything
 
 FILE = Path(__file__).parents[2] / "examples" / "own_renderer.py"
 MODEL = load_model(str(FILE))
-SHORT = ("count.steps=16", "count.images=4", "count.crops=4", "width=4,8,8", "pretrain_derivations=100",
-         "pretrain_epochs=1", "batches=2", "num_scenes=20")  # fmt: skip
-
-
-def probscene(*words):
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, result.output
-    return result.stdout
 
 
 def test_a_newcomer_reads_it_in_one_go():
@@ -79,15 +71,20 @@ def test_lights_add_up():
     assert (both >= red).all() and (both > red).any()
 
 
-def test_it_is_fitted_and_generated(tmp_path):
-    truth, run = MODEL.target(0), tmp_path / "run"
+def test_it_is_fitted_and_generated(tmp_path, call, both_ways, short):
+    """By the model that has it, and by one that is drawn otherwise, to which a fit gives it."""
+    truth = MODEL.target(0)
     generate_scenes(truth, truth.prior, 40, tmp_path / "drawn", format="images")
-    short = [word for setting in SHORT for word in ("--set", setting)]
-    probscene("fit", FILE, "--target", tmp_path / "drawn" / "images", "--out", run, "--preset", "quick", *short)
-    probscene("generate", run, "--num", 4, "--out", tmp_path / "dataset")
+    plain = replace(MODEL, renderer=None)
+    drawn = tmp_path / "drawn" / "images"
+    run = both_ways([], {"renderer": MODEL.renderer}, FILE, drawn).command
+    given = ps.fit(plain, drawn, "quick", 3, renderer=MODEL.renderer, settings=short, threads=1, progress=False)
+    assert (given.path / "guide.safetensors").read_bytes() == (run / "guide.safetensors").read_bytes()
+    assert torch.equal(given.render(3).image, ps.Run.open(run).render(3).image)
+    call("generate", run, "--num", 4, "--out", tmp_path / "dataset")
     coco = json.loads((tmp_path / "dataset" / "annotations.json").read_text())
     assert len(coco["images"]) == 4 and {c["name"] for c in coco["categories"]} == {"red", "green"}
     first = np.asarray(Image.open(tmp_path / "dataset" / "images" / coco["images"][0]["file_name"]))
     assert first.shape == (96, 96, 3) and (first[0, 0, :3] < 60).all()
-    probscene("preview", run, "--out", tmp_path / "night.png", "--boxes", "--num", 3)
+    call("preview", run, "--out", tmp_path / "night.png", "--boxes", "--num", 3)
     assert (tmp_path / "night.png").is_file()

@@ -65,32 +65,3 @@ def draw_dots(dots):
     """Labelled prior renders of ``dots``, by number."""
     render, classes = SpriteRenderer(dots.canvas, threads=1), class_table(dots.grammar.kinds, dots.classes)
     return lambda num: examples(render(sample(dots, dots.prior, num).drawing), classes)
-
-
-@pytest.fixture(scope="session")
-def goes_on_to_the_same_bits():
-    """Checks that a training, interrupted and restored, ends as one that never was; by what makes it."""
-
-    def check(training):
-        class Interrupted(Exception):
-            pass
-
-        kept = {}
-
-        def stop(training, line):
-            if "images" in line:  # looked at before the first step
-                return
-            kept.update({key: value.clone() for key, value in training.state().items()})
-            raise Interrupted
-
-        whole, first, second = training(), training(), training()
-        whole.run()
-        with pytest.raises(Interrupted):
-            first.run(stop)
-        second.restore(kept)
-        assert 0 < second.done < whole.done
-        second.run()
-        for (key, a), b in zip(whole.net.state_dict().items(), second.net.state_dict().values(), strict=True):
-            assert torch.equal(a, b), key
-
-    return check

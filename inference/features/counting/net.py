@@ -101,7 +101,11 @@ class CountNet(nn.Module):
         If there are groups, three more channels: the logit that a cell shows a group, how many cells away that group's
         middle is, and how many that of the group of the object that the cell holds.
         """
-        return self.body(x.contiguous(memory_format=torch.channels_last))
+        if self.channels > 1:
+            return self.body(x.contiguous(memory_format=torch.channels_last))
+        first = self.body[0]
+        assert isinstance(first, nn.Conv2d)
+        return self.body[1:](_halve(x, first.weight))
 
     def enter(self, images: Tensor) -> Tensor:
         """Reduced images with a clear border, padded to whole cells."""
@@ -147,6 +151,13 @@ def toward_whole(counts: Tensor) -> Tensor:
     here, so that an image of seven is like a render of seven and not like a mixture of six and seven.
     """
     return counts - torch.sin(2 * math.pi * counts) / (2 * math.pi)
+
+
+def _halve(x: Tensor, weight: Tensor) -> Tensor:
+    """The 5 x 5 convolution at stride 2 of grey images ``(N, 1, H, W)``, as one of 3 x 3 at stride 1 of their blocks of
+    2 x 2: with its gradient it takes two fifths of the time where there is AVX2 alone."""
+    blocks = F.pixel_unshuffle(x, 2).contiguous(memory_format=torch.channels_last)
+    return F.conv2d(blocks, F.pixel_unshuffle(F.pad(weight, (0, 1, 0, 1)), 2), padding=1)
 
 
 def _conv(inner: int, outer: int, size: int, stride: int) -> list[nn.Module]:

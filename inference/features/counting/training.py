@@ -20,6 +20,7 @@ from probscene.threads import threads
 from ...training import Report, check_finite, restore_training, training_state
 from ..base import Draw
 from .batches import CountBatch, CountBatches, CountSchedule, Votes
+from .muon import Muon
 from .net import CountNet
 
 
@@ -45,9 +46,7 @@ class CountTraining:
         rest = [p for p in net.parameters() if not any(p is weight for weight in inner)]
         self.optimisers = {
             "adam": torch.optim.AdamW(rest, lr=schedule.learning_rate, betas=(0.9, 0.99), weight_decay=1e-3),
-            "muon": torch.optim.Muon(
-                [matrix for _, matrix in self.matrices], lr=schedule.muon_rate, momentum=0.8, weight_decay=0.0
-            ),
+            "muon": Muon([matrix for _, matrix in self.matrices], lr=schedule.muon_rate, momentum=0.8),
         }
         self.done = 0
 

@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 from probscene.inference.divergence import Divergence
@@ -14,7 +15,7 @@ from probscene.model import SceneModel
 
 from ..fitting import session
 from ..fitting.overrides import override
-from ..fitting.parts import IN_MEMORY, GuideMaker, Parts, lasting_word
+from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
 from ..fitting.presets import Preset
 from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
@@ -64,7 +65,7 @@ def fit(
         assets: a folder that the model is drawn with.
         cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
             folder.
-        resume: go on with the run in ``out`` where there is one.
+        resume: go on with the run in ``out`` where there is one; the other arguments are those that it was begun with.
         progress: show it, on stderr.
 
     Raises:
@@ -82,11 +83,11 @@ def fit(
         folder = Path(temporary) / "run"
     with display(progress) as show:
         try:
+            assets_folder = None if assets is None else Path(assets)
             if resume and (folder / "run.json").exists():
-                run = Run.at(folder, given if isinstance(given, SceneModel) else None, parts)
-                images = session.open_images(target, run.model, skip_bad, show)
+                begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads}
+                run, images = session.resume(folder, show, given, target, chosen, assets_folder, parts, Run, **begun)
             else:
-                assets_folder = None if assets is None else Path(assets)
                 run, images = session.begin(
                     given,
                     target,
@@ -118,27 +119,34 @@ def chosen_preset(
     guide: str | GuideMaker | None,
     settings: Mapping[str, Any] | Sequence[str],
 ) -> tuple[Preset, Parts]:
-    """The preset with all that was chosen beside it, and what of that are objects; arguments as of ``fit``."""
+    """The preset with all that was chosen beside it, and the user's own parts of it, of objects and of files; arguments
+    as of ``fit``."""
     chosen = preset if isinstance(preset, Preset) else preset_of(preset)
-    own = parts_of(
-        None if isinstance(features, str) else features,
-        None if isinstance(divergence, str) else divergence,
-        None if isinstance(guide, str) else guide,
-    )
-    if isinstance(divergence, str):
-        chosen = chosen.with_objective(lasting_word(divergence))
-    if isinstance(guide, str):
-        chosen = chosen.with_guide(lasting_word(guide))
-    if isinstance(features, str):
-        chosen = chosen.with_features(lasting_word(features))
-    if own.features is not None:
-        chosen = chosen.with_features_of(own.features, f"{IN_MEMORY}{own.features.name}")
+    imported: dict[Path, ModuleType] = {}
+    given = (features, divergence, guide)
+    own = parts_of(*(_part(part, imported) for part in given))
+    of_features, of_divergence, of_guide = (lasting_word(part) if isinstance(part, str) else "" for part in given)
     if own.divergence is not None:
-        chosen = replace(chosen, objective=f"{IN_MEMORY}{_name(own.divergence)}")
+        chosen = replace(chosen, objective=of_divergence or in_memory(_name(own.divergence)))
+    elif of_divergence:
+        chosen = chosen.with_objective(of_divergence)
     if own.guide is not None:
-        chosen = replace(chosen, guide=f"{IN_MEMORY}{_name(own.guide)}")
+        chosen = replace(chosen, guide=of_guide or in_memory(_name(own.guide)))
+    elif of_guide:
+        chosen = chosen.with_guide(of_guide)
+    if own.features is not None:
+        chosen = chosen.with_features_of(own.features, of_features or in_memory(own.features.name))
+    elif of_features:
+        chosen = chosen.with_features(of_features)
     words = [f"{key}={_word(value)}" for key, value in settings.items()] if isinstance(settings, Mapping) else settings
     return override(chosen, list(words)), own
+
+
+def _part(given: Any, imported: dict[Path, ModuleType]) -> Any:
+    """An object, or what a word names in a file; None for the library's words."""
+    if not isinstance(given, str):
+        return given
+    return load_part(given, imported) if is_file_part(given) else None
 
 
 def _name(part: Any) -> str:

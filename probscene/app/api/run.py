@@ -50,14 +50,18 @@ class Run(RunFolder):
             model, features, divergence, guide: what the run was begun with, where that were objects in memory.
 
         Raises:
-            RunError: there is none, it is damaged, or another version wrote it.
+            RunError: there is none, it is damaged, or another version wrote it; its model or its guide were in memory
+                and are not given. Features and a divergence are asked for where they are used.
         """
-        return cls.at(Path(path), model, parts_of(features, divergence, guide))
+        run = cls.at(Path(path), model, parts_of(features, divergence, guide))
+        run.check_objects("model", "guide")
+        return run
 
     def sample(self, num: int, seed: int = 0) -> Scenes:
         """Scenes with learnt structures; the same for the same seed."""
+        guide = self.guide  # is made with random numbers of its own
         with chunk_randomness(checked_seed(seed), 0):
-            return sample(self.model, self.guide, _positive(num, "scenes"))
+            return sample(self.model, guide, _positive(num, "scenes"))
 
     def render(self, num: int, seed: int = 0) -> RenderBatch:
         """``sample``, rendered and labelled."""

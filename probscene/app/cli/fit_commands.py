@@ -56,10 +56,8 @@ def fit(
 
     if seed is not None:
         checked_seed(seed)
-    if threads is not None and threads < 1:
-        raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
     name = str(preset or PresetName.default)
-    chosen, _ = chosen_preset(name, features, objective, guide, settings or [])
+    chosen, parts = chosen_preset(name, features, objective, guide, settings or [])
     if scenarios is not None:
         if model is None:
             raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")
@@ -70,13 +68,15 @@ def fit(
         if resume:
             given = chosen if preset or objective or guide or features or settings else None
             begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads}
-            run, images = session.resume(out, show, model, target, given, assets, **begun)
+            run, images = session.resume(out, show, model, target, given, assets, parts, **begun)
         elif model is None or target is None:
             raise ProbsceneError(
                 "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
             )
         else:
-            run, images = session.begin(model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets)
+            run, images = session.begin(
+                model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets, parts
+            )
             ctx.obj.words.append("--resume")
         if not run.is_finished:
             session.carry_out(run, images, show, cache, not no_cache)

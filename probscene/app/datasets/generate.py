@@ -74,10 +74,10 @@ def generate(
     job = Job(run.model, run.guide, num, Path(out), seed, chosen(format), run.guide_hash())
     if workers == 1:
         return job.run(job.each, progress)
-    if run.in_memory:
+    if run.objects:
         raise ProbsceneError(
-            f"Expected one worker for a run of {run.in_memory} that are in memory alone, actual {workers}; fit a model "
-            "and parts in files for more."
+            f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual {workers}; "
+            "fit a model and parts in files for more."
         )
     return job.run(partial(spread, _worker, (run.path, num, Path(out), seed, job.formats), workers), progress)
 

@@ -3,7 +3,9 @@ network was finished: with the same bytes, since a network is found under all th
 
 import hashlib
 import json
+import os
 import platform
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +21,7 @@ from probscene.inference.features.base import FeatureNet
 from ..files import make_folder, write_text
 from .parts import IN_MEMORY, is_file_part
 from .run import RunFolder
-from .storage import load_tensors, save_tensors
+from .storage import load_tensors, save_tensors, state_of
 
 
 class Cached(NamedTuple):
@@ -55,8 +57,11 @@ class NetworkCache:
             "torch": torch.__version__,
             "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability(), record["threads"]],
             "model": [record["model"], record["model_sha256"], record["assets"], list(run.model.canvas)],
+            "assets": _folder_digest(
+                record.get("assets_folder") or os.environ.get(run.model.assets_variable or "", "")
+            ),
             "features": [words[1], repr(run.features) if self.usable and not is_file_part(words[1]) else ""],
-            "weights": bytes(getattr(net, "origin", torch.zeros(0, dtype=torch.uint8)).tolist()).hex(),
+            "weights": _digest(state_of(net)),
             "parts": record.get("parts", {}),
             "seed": record["seed"],
             "target": target,
@@ -70,13 +75,14 @@ class NetworkCache:
 
     def load(self) -> Cached | None:
         """A network that was kept; None where there is none, or where its files are damaged."""
-        log = self.file.with_suffix(".jsonl")
-        if not self.usable or not self.file.is_file() or not log.is_file():
+        if not self.usable:
             return None
         try:
-            return Cached(load_tensors(self.file), log.read_text(encoding="utf-8").splitlines())
-        except (RunError, OSError, UnicodeDecodeError):
+            digest, *lines = self._log.read_text(encoding="utf-8").splitlines()
+            tensors = load_tensors(self.file)
+        except (RunError, OSError, ValueError):
             return None
+        return Cached(tensors, lines) if digest == json.dumps({"sha256": _digest(tensors, lines)}) else None
 
     def save(self, tensors: dict[str, Tensor], lines: list[str]) -> None:
         """Keep a network; where that cannot be, the fit goes on without."""
@@ -84,10 +90,33 @@ class NetworkCache:
             return
         try:
             make_folder(self.folder)
-            write_text(self.file.with_suffix(".jsonl"), "".join(f"{line}\n" for line in lines))
             save_tensors(self.file, tensors)
+            whole = [json.dumps({"sha256": _digest(tensors, lines)}), *lines]
+            write_text(self._log, "".join(f"{line}\n" for line in whole))
         except ProbsceneError:
             return
+
+    @property
+    def _log(self) -> Path:
+        """The log of the network's training, under a digest of both."""
+        return self.file.with_suffix(".jsonl")
+
+
+def _digest(tensors: dict[str, Tensor], lines: Sequence[str] = ()) -> str:
+    """SHA-256 of tensors and lines, hexadecimal."""
+    digest = hashlib.sha256("\n".join(lines).encode())
+    for name, value in sorted(tensors.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _folder_digest(folder: str) -> str:
+    """Of all that a folder of assets holds; the words that a model has for it need not say."""
+    digest = hashlib.sha256()
+    for file in sorted(path for path in Path(folder).rglob("*") if path.is_file()) if folder else ():
+        digest.update(repr(file.relative_to(folder).parts).encode() + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 @cache

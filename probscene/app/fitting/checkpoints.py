@@ -28,8 +28,10 @@ class Keeper:
         stage = {"features": "features", "guide": "structure"}[name]
         self.lines = [line for line in self.lines if not self._is_past(json.loads(line), stage)]
 
-    def __call__(self, line: dict[str, float | str]) -> None:
-        self.lines.append(json.dumps(line))
+    def __call__(self, line: dict[str, float | str] | None) -> None:
+        """After some steps; ``line`` is what the log has of them, None for nothing."""
+        if line is not None:
+            self.lines.append(json.dumps(line))
         if time.monotonic() - self.saved > SAVE_EVERY:
             self._save()
             self.saved = time.monotonic()

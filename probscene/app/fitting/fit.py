@@ -30,9 +30,10 @@ from ..progress import Progress
 from .cache import NetworkCache
 from .checkpoints import Keeper
 from .observer import RENDERED_AT_ONCE, Observer
-from .parts import inner, load_state, state_of
+from .parts import inner
 from .run import RunFolder
 from .scene_features import fingerprint
+from .storage import load_state, state_of
 
 Say = Callable[[str], None]
 """Told a sentence that a person should know."""
@@ -66,6 +67,7 @@ def fit(
     with threads(run.record["threads"]):
         net = _Network(run, observer, progress, images)
         net.finish(cache_in, use_cache, say or (lambda text: None))
+        run.keep_network(net.net)
         real = _real_features(run, net.net, progress, images)
     with threads(1):  # the guide's tensors are tiny: a second thread only waits
         guide = _learn(run, observer, net.net, real, progress)
@@ -94,6 +96,7 @@ class _Network:
         training = run.features.training(inner(net), self.observer, self.target, run.record["seed"])
         if training is None:
             run.write_tensors("features", state_of(net))
+            _ready(net)
             return
         taught = run.features.taught_by(inner(net))
         kept = NetworkCache(run, inner(net), folder, taught) if use_cache else None
@@ -108,8 +111,7 @@ class _Network:
                 kept.save(state_of(net), lines)
         run.write_tensors("features", state_of(net))
         (run.path / "features-checkpoint.safetensors").unlink(missing_ok=True)
-        if isinstance(net, nn.Module):
-            net.eval()
+        _ready(net)
 
     def _train(self, training: Training) -> list[str]:
         keep = Keeper(self.run, "features", training)
@@ -119,9 +121,9 @@ class _Network:
             if "images" in line:
                 self.progress("looking", int(line["images"]), int(line["of"]), "")
                 return
+            line = {name: value.item() if isinstance(value, Tensor) else value for name, value in line.items()}
             note = ", ".join(f"{name} {value:.3f}" for name, value in line.items())
-            if "loss" in line:
-                keep({"stage": "features", "step": training.done, **line})
+            keep({"stage": "features", "step": training.done, **line} if "loss" in line else None)
             self.progress("features", training.done, training.total, note, training.unit)
 
         training.run(each)
@@ -136,6 +138,13 @@ class _Network:
         taught_by = self.run.features.taught_by(inner(self.net))
         if taught_by and self.target().fingerprint != taught_by:
             raise _others(self.target())
+
+
+def _ready(net: FeatureNet) -> None:
+    """A module is used in the mode in which no answer depends on a batch."""
+    module = inner(net)
+    if isinstance(module, nn.Module):
+        module.eval()
 
 
 def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: Callable[[], Images]) -> Tensor:
@@ -196,8 +205,8 @@ def open_target(run: RunFolder, progress: Progress) -> Images:
     model, target = run.model, run.record["target"]
     if target is None:
         raise RunError(
-            f"Expected the images that the run in {run.path} was begun with, actual only their number: they were in "
-            "memory. Name them again."
+            f"Expected the images that the run in {run.path} was begun with, actual none: they were in memory. Give "
+            "them again: as the target of the command, or from Python, probscene.fit(..., resume=True) for a fit."
         )
     return ImageFolder(
         target if isinstance(target, list) else Path(target),

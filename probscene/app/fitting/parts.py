@@ -4,17 +4,20 @@ Each is checked where it is first used, so that what it returns wrongly is named
 product an hour later. Axis letters: N scenes, L images, D features, T steps, K rules.
 """
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
+import pyro
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from probscene.derivation import Derivation
-from probscene.derive import derive_complete
-from probscene.errors import ModelError, ProbsceneError, RunError
+from probscene.derive import derive
+from probscene.errors import ModelError, ProbsceneError
 from probscene.grammar import Grammar
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features, Fixed
@@ -38,6 +41,11 @@ class Parts:
     guide: GuideMaker | None = None
 
 
+def in_memory(name: str) -> str:
+    """The word of a part that is no file's."""
+    return f"{IN_MEMORY}{name}"
+
+
 def is_file_part(word: str) -> bool:
     """Whether a word has the form ``FILE.py:NAME``."""
     return ".py:" in word
@@ -53,17 +61,22 @@ def lasting_word(word: str) -> str:
     return f"{part_file(word).resolve()}:{word.rpartition(':')[2]}" if is_file_part(word) else word
 
 
-def load_part(word: str) -> Any:
+def load_part(word: str, imported: dict[Path, ModuleType] | None = None) -> Any:
     """What ``FILE.py:NAME`` names.
+
+    Args:
+        imported: modules by file, so that a file of several parts is executed once; it is added to them.
 
     Raises:
         ModelError: the file does not import, or has no such name.
     """
-    name = word.rpartition(":")[2]
-    module = import_file(part_file(word))
-    if not hasattr(module, name):
-        raise ModelError(f"Expected {name} in {part_file(word)}, actual none; write FILE.py:NAME with a name it has.")
-    return getattr(module, name)
+    file, name = part_file(word), word.rpartition(":")[2]
+    modules = {} if imported is None else imported
+    if file not in modules:
+        modules[file] = import_file(file)
+    if not hasattr(modules[file], name):
+        raise ModelError(f"Expected {name!r} in {file}, actual none; write FILE.py:NAME with a name that it has.")
+    return getattr(modules[file], name)
 
 
 def as_features(given: Any) -> Features:
@@ -73,15 +86,29 @@ def as_features(given: Any) -> Features:
     Raises:
         ModelError: something else.
     """
-    made = given() if isinstance(given, type) else given
+    made = _made(given, "features")
     if callable(getattr(made, "build", None)) and isinstance(getattr(made, "name", None), str):
+        methods = ("training", "divergence", "taught_by", "settings")
+        missing = [name for name in methods if not callable(getattr(made, name, None))]
+        if missing:
+            raise ModelError(
+                f"Expected features with {', '.join(methods)}, actual {type(made).__name__} without "
+                f"{', '.join(missing)}; subclass probscene.Features, which has them."
+            )
         return made
-    if callable(getattr(made, "embed", None)) and hasattr(made, "names"):
+    if is_network(made):
         return Fixed(made)
     raise ModelError(
         f"Expected features with a name and build(model), or a network with names and embed(images), actual "
         f"{type(made).__name__}; see probscene.Features."
     )
+
+
+def is_network(given: Any) -> bool:
+    """Whether something has ``names``, at least one, and ``embed``."""
+    names = getattr(given, "names", None)
+    named = isinstance(names, tuple | list) and len(names) > 0 and all(isinstance(name, str) for name in names)
+    return named and callable(getattr(given, "embed", None))
 
 
 def as_divergence(given: Any) -> Divergence:
@@ -90,10 +117,11 @@ def as_divergence(given: Any) -> Divergence:
     Raises:
         ModelError: it cannot be called.
     """
-    made = given() if isinstance(given, type) else given
-    if not callable(made):
+    made = _made(given, "a divergence")
+    if not _takes(made, 2):
         raise ModelError(
-            f"Expected a divergence, called with features (N, D) and (L, D), actual {type(made).__name__}."
+            f"Expected a divergence, called with features (N, D) and (L, D), actual {_called(made)}; see "
+            "probscene.Divergence."
         )
     return cast(Divergence, made)
 
@@ -104,29 +132,70 @@ def as_guide_maker(given: Any) -> GuideMaker:
     Raises:
         ModelError: it cannot be called.
     """
-    if isinstance(given, Policy) or not callable(given):
+    if isinstance(given, Policy) or not _takes(given, 2):
         raise ModelError(
-            f"Expected a class of guides or a function guide(grammar, max_steps), actual {type(given).__name__}; every "
-            "fit makes its own."
+            f"Expected a class of guides or a function, called with the grammar and max_steps, actual {_called(given)};"
+            " every fit makes its own guide."
         )
     return cast(GuideMaker, given)
+
+
+def _made(given: Any, what: str) -> Any:
+    """An object, or one of a class."""
+    if not isinstance(given, type):
+        return given
+    if not _takes(given, 0):
+        raise ModelError(
+            f"Expected {what}, or a class of them that is made without arguments, actual {given.__name__}"
+            f"{inspect.signature(given)}; give defaults, or name an object."
+        )
+    return given()
+
+
+def _takes(given: Any, arguments: int) -> bool:
+    """Whether something can be called with so many arguments."""
+    if not callable(given):
+        return False
+    try:
+        inspect.signature(given).bind(*range(arguments))
+    except TypeError:
+        return False
+    except ValueError:  # some that are built in have no signature
+        return True
+    return True
+
+
+def _called(given: Any) -> str:
+    """Something as a message names it."""
+    name = getattr(given, "__name__", type(given).__name__)
+    return f"{name}{inspect.signature(given)}" if callable(given) else name
 
 
 class CheckedNet:
     """A user's feature network, whose first answer is looked at."""
 
-    def __init__(self, net: FeatureNet):
-        self.net, self.names = net, tuple(net.names)
+    def __init__(self, net: Any, features: Any):
+        if not is_network(net):
+            raise ModelError(
+                f"Expected of {type(features).__name__}.build a network with names, one a feature, and embed(images), "
+                f"actual {type(net).__name__}; see probscene.FeatureNet."
+            )
+        self.net: FeatureNet = net
+        self.names = tuple(net.names)
         self._checked = False
 
     def __getattr__(self, name: str) -> Any:
+        if name == "net":  # of a copy that is not filled yet
+            raise AttributeError(name)
         return getattr(self.net, name)
 
+    @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
         """``(N, D)``, see ``FeatureNet``.
 
         Raises:
             ModelError: something else, or another answer to the same image.
+            ProbsceneError: NaN or infinity.
         """
         found = self.net.embed(images)
         where = f"{type(self.net).__name__}.embed"
@@ -139,7 +208,7 @@ class CheckedNet:
                     "statistics of the batch and no random numbers, and call eval()."
                 )
             self._checked = True
-        return found.detach()
+        return found.float()
 
 
 def inner(net: FeatureNet) -> FeatureNet:
@@ -147,72 +216,55 @@ def inner(net: FeatureNet) -> FeatureNet:
     return net.net if isinstance(net, CheckedNet) else net
 
 
-def state_of(net: FeatureNet) -> dict[str, Tensor]:
-    """What a run keeps of a feature network: a module's state, of anything else nothing."""
-    module = inner(net)
-    return module.state_dict() if isinstance(module, nn.Module) else {}
-
-
-def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
-    """The reverse of ``state_of``; the network is then ready for use.
-
-    Raises:
-        RunError: the state is another network's.
-    """
-    module = inner(net)
-    if not isinstance(module, nn.Module):
-        return
-    try:
-        module.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise RunError(
-            f"Expected the state of a {type(module).__name__}, actual another network's; put the features back as they "
-            "were when the run was begun, or fit again."
-        ) from error
-    module.eval()
-
-
 class CheckedDivergence:
     """A user's divergence, whose answers are looked at."""
 
     def __init__(self, divergence: Divergence):
         self.divergence = divergence
+        self._checked = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
         """``(N,)``, see ``Divergence``.
 
         Raises:
-            ModelError: something else.
+            ModelError: something else, or another answer to the same features.
         """
         cost = self.divergence(generated, real)
         what = getattr(self.divergence, "__name__", None) or f"{type(self.divergence).__name__}.__call__"
         _check_tensor(cost, (len(generated),), what, "one cost a generated scene (N,)")
-        return cost.detach()
+        if not self._checked:
+            if not torch.equal(self.divergence(generated, real), cost):
+                raise ModelError(
+                    f"Expected {what} to give the same costs whenever it is given the same features, actual others; "
+                    "draw no random numbers in it, and keep nothing from call to call."
+                )
+            self._checked = True
+        return cost.detach().float()
 
 
 def check_guide(guide: Any, max_steps: int) -> Guide:
     """A user's guide, run once on its own grammar.
 
     Raises:
-        ModelError: it is no module and policy, or its logits or log-probabilities are of a wrong shape, type or value,
-            or differ between two calls.
+        ModelError: it is none, or its logits or log-probabilities are of a wrong shape, type or value, or differ
+            between two calls.
     """
     name = type(guide).__name__
-    is_guide = isinstance(guide, nn.Module) and isinstance(guide, Policy) and hasattr(guide, "grammar")
-    if not is_guide:
-        raise ModelError(
-            f"Expected a guide that is a torch.nn.Module and a Policy, actual {name}; subclass probscene.Guide."
-        )
-    checked = cast(Guide, guide)
-    if not any(p.requires_grad for p in checked.parameters()):
+    if not isinstance(guide, Guide):
+        raise ModelError(f"Expected a guide, actual {name}; subclass probscene.Guide.")
+    if not any(p.requires_grad for p in guide.parameters()):
         raise ModelError(f"Expected a guide with parameters to learn, actual {name} with none.")
-    with torch.no_grad():
-        derivation, _ = derive_complete(checked.grammar, _Logits(checked, name), 4, max_steps)
-        found = [checked.log_prob(derivation) for _ in range(2)]
+    with torch.no_grad(), pyro.poutine.block():
+        # Complete or not: an untrained guide's scenes may well be endless.
+        derivation = derive(guide.grammar, _Logits(guide, name), 4, max_steps)
+        found = [guide.log_prob(derivation) for _ in range(2)]
     _check_tensor(found[0], (4,), f"{name}.log_prob", "one log-probability a derivation (N,)")
     if not torch.equal(*found):
-        raise ModelError(f"Expected {name}.log_prob to say the same of the same derivations, actual two; call eval().")
-    return checked
+        raise ModelError(
+            f"Expected {name}.log_prob to say the same of the same derivations, actual two different answers; use no "
+            "random numbers in it, such as dropout."
+        )
+    return guide
 
 
 class _Logits(Policy):
@@ -241,4 +293,4 @@ def _check_tensor(found: Any, shape: tuple[int, ...], where: str, what: str) -> 
         actual = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
         raise ModelError(f"Expected of {where} {what}: a float tensor {shape}, actual {actual}.")
     if not torch.isfinite(found).all():
-        raise ProbsceneError(f"Expected finite values of {where}, actual NaN or infinity.")
+        raise ProbsceneError(f"Expected finite values of {where}, actual NaN or infinity; mend it there.")

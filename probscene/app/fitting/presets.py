@@ -1,9 +1,9 @@
 """How long and how to learn: everything that a fit depends on beside the model, the target and the seed."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from probscene.errors import ProbsceneError
+from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
 from probscene.inference.features.base import Features
 from probscene.inference.features.counting.batches import CountSchedule
@@ -118,15 +118,29 @@ class Preset:
         Raises:
             ProbsceneError: an unknown network, or no file named.
         """
-        return self.with_features_of(replace(self, features=features).make_features())
+        made = replace(self, features=features).make_features()
+        return self.with_features_of(made, features if is_file_part(features) else "")
 
     def with_features_of(self, features: Features, word: str = "") -> "Preset":
         """This preset with features that are given.
 
         Args:
             word: what is recorded of them; their name where there is none.
+
+        Raises:
+            ModelError: their settings are not a preset's.
         """
-        return replace(self, features=word or features.name, **features.settings(self))
+        settings = features.settings(self)
+        known = [each.name for each in fields(self)]
+        if not isinstance(settings, dict) or not set(settings) <= set(known):
+            actual = (
+                ", ".join(sorted(set(settings) - set(known))) if isinstance(settings, dict) else type(settings).__name__
+            )
+            raise ModelError(
+                f"Expected of {type(features).__name__}.settings a dict with fields of Preset ({', '.join(known)}), "
+                f"actual {actual}."
+            )
+        return replace(self, features=word or features.name, **settings)
 
     def make_features(self) -> Features:
         """The features that the preset names, with its settings.

@@ -23,15 +23,15 @@ from .parts import (
     CheckedDivergence,
     CheckedNet,
     Parts,
+    as_divergence,
     as_guide_maker,
     check_guide,
     is_file_part,
     load_part,
-    load_state,
     part_file,
 )
 from .presets import Preset
-from .storage import FORMAT, Storage, check_free, read_record
+from .storage import FORMAT, Storage, check_free, load_state, read_record
 
 
 class RunFolder(Storage):
@@ -116,8 +116,7 @@ class RunFolder(Storage):
         """
         if self._model is None:
             reference = self.record["model"]
-            if reference.startswith(IN_MEMORY):
-                raise self._only_in_memory("model", reference)
+            self.check_objects("model")
             self._unchanged(Path(split_reference(reference)[0]), self.record["model_sha256"], "model")
             model = load_model(reference, self.record.get("assets_folder"))
             if not same_assets(model.assets, self.record["assets"]):
@@ -128,14 +127,25 @@ class RunFolder(Storage):
             self._model = model
         return self._model
 
-    @property
-    def in_memory(self) -> str:
-        """Which of model, features, divergence and guide are objects that the folder cannot give back; in words."""
-        record = self.record
-        words = {"model": record["model"], "guide": record.get("guide", {}).get("kind", "")}
-        preset = record.get("preset", {})
-        words |= {"features": preset.get("features", ""), "divergence": preset.get("objective", "")}
-        return ", ".join(name for name, word in words.items() if word.startswith(IN_MEMORY))
+    def check_objects(self, *needed: str) -> None:
+        """See that what was in memory is given again.
+
+        Args:
+            needed: of ``model``, ``features``, ``divergence`` and ``guide``.
+
+        Raises:
+            RunError: one of them is not.
+        """
+        objects = self.objects
+        given = {**vars(self.parts), "model": self._model}
+        missing = [name for name in objects if given[name] is None]
+        if set(missing) & set(needed):
+            named = ", ".join(f"{name} ({objects[name]})" for name in missing)
+            again = ", ".join(f"{name}=..." for name in missing)
+            raise RunError(
+                f"Expected all that the run in {self.path} was begun with, actual its folder, which cannot give back "
+                f"what was in memory: {named}. Open it from Python: probscene.Run.open({str(self.path)!r}, {again})."
+            )
 
     @property
     def target(self) -> Path:
@@ -160,8 +170,7 @@ class RunFolder(Storage):
         word = self.preset.features
         if self.parts.features is not None:
             return self.parts.features
-        if word.startswith(IN_MEMORY):
-            raise self._only_in_memory("features", word)
+        self.check_objects("features")
         self._unchanged_part(word)
         return self.preset.make_features()
 
@@ -173,7 +182,7 @@ class RunFolder(Storage):
             ModelError: a user's own that cannot be built, or that is no network.
         """
         net = self.features.build(self.model)
-        return net if type(net).__module__.startswith("probscene.inference.") else CheckedNet(net)
+        return net if _is_ours(net) else CheckedNet(net, self.features)
 
     def network(self) -> FeatureNet | None:
         """The feature network with its state, once it is trained; None before. Loaded once.
@@ -187,6 +196,10 @@ class RunFolder(Storage):
             load_state(net, tensors)
             self._network = net
         return self._network
+
+    def keep_network(self, net: FeatureNet) -> None:
+        """Take a network, which has its state, as the one that ``network`` gives."""
+        self._network = net
 
     @cached_property
     def feature_names(self) -> tuple[str, ...]:
@@ -202,12 +215,12 @@ class RunFolder(Storage):
         word = self.preset.objective
         if self.parts.divergence is not None:
             chosen: Divergence = CheckedDivergence(self.parts.divergence)
-        elif word.startswith(IN_MEMORY):
-            raise self._only_in_memory("divergence", word)
         else:
+            self.check_objects("divergence")
             self._unchanged_part(word)
             chosen = self.preset.divergence()
-        return self.features.divergence(net, chosen)
+        found = self.features.divergence(net, chosen)
+        return found if _is_ours(found) else CheckedDivergence(as_divergence(found))
 
     def new_guide(self) -> Guide:
         """An untrained guide of the kind and size that the run was begun with; one that names no kind has an LSTM.
@@ -219,8 +232,7 @@ class RunFolder(Storage):
         model = self.model
         settings = {"kind": "lstm", **self.record["guide"]}
         make, kind = self.parts.guide, settings["kind"]
-        if make is None and kind.startswith(IN_MEMORY):
-            raise self._only_in_memory("guide", kind)
+        self.check_objects("guide")
         if make is None and is_file_part(kind):
             self._unchanged_part(kind)
             make = as_guide_maker(load_part(kind))
@@ -257,13 +269,6 @@ class RunFolder(Storage):
         """
         _ = self.guide
 
-    def _only_in_memory(self, what: str, word: str) -> RunError:
-        return RunError(
-            f"Expected the {what} that the run in {self.path} was begun with, actual only its name, "
-            f"{word.removeprefix(IN_MEMORY)}: it was an object in memory. Open the run from Python: "
-            f"Run.open({str(self.path)!r}, {what}=...)."
-        )
-
     def _unchanged_part(self, word: str) -> None:
         if is_file_part(word):
             self._unchanged(part_file(word), self.record.get("parts", {}).get(str(part_file(word))), "part's")
@@ -275,6 +280,11 @@ class RunFolder(Storage):
                 f"Expected the {what} file {file} as it was when {self.path} was fitted, actual a missing or changed "
                 f"file. {kept or 'Put it back, or fit again.'}"
             )
+
+
+def _is_ours(part: Any) -> bool:
+    """Whether a part is the library's own, or what it has checked."""
+    return type(part).__module__.startswith("probscene.")
 
 
 def is_run(path: str) -> bool:

@@ -12,7 +12,7 @@ from typing import Any, TypeGuard
 
 import probscene
 from probscene.dataset import ImageFolder, Images
-from probscene.errors import ModelError, RunError
+from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.image_array import ImageArray
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
@@ -25,7 +25,7 @@ from ..model_check import QUICK, check_model
 from ..modules import file_digest
 from ..progress import Display
 from .fit import check_target, fit, open_target
-from .parts import Parts, is_file_part, part_file
+from .parts import Parts, in_memory, is_file_part, part_file
 from .presets import Preset
 from .run import RunFolder
 from .storage import check_free
@@ -74,8 +74,11 @@ def begin(
         make: the class of the run.
 
     Raises:
-        ProbsceneError: see ``checked_model``, ``open_images``, ``check_target`` and ``RunFolder.create``.
+        ProbsceneError: a number of threads that is not positive; see also ``checked_model``, ``open_images``,
+            ``check_target`` and ``RunFolder.create``.
     """
+    if threads is not None and threads < 1:
+        raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
     check_free(out)
     loaded = checked_model(model, assets)
     images = open_images(target, loaded, skip_bad, show)
@@ -106,10 +109,11 @@ def begin(
 def resume(
     out: Path,
     show: Display,
-    model: str | None = None,
-    target: Path | None = None,
+    model: str | SceneModel | None = None,
+    target: Target | None = None,
     preset: Preset | None = None,
     assets: Path | None = None,
+    parts: Parts | None = None,
     make: type[RunFolder] = RunFolder,
     **settings: Any,
 ) -> tuple[RunFolder, Images | None]:
@@ -117,22 +121,25 @@ def resume(
 
     Args:
         model, target, preset, assets, settings: what the run must have been begun with, where it is not None; the
-            settings are ``seed``, ``skip_bad`` and ``threads``.
+            settings are ``seed``, ``skip_bad`` and ``threads``. A model and images in memory are taken as they are.
+        parts: what the user brought as objects.
         make: the class of the run.
 
     Raises:
         RunError: there is no run, or it was begun with something else.
         DataError: see ``ImageFolder``.
     """
-    run = make.at(out)
+    run = make.at(out, model if isinstance(model, SceneModel) else None, parts)
     given = {
-        "model": None if model is None else lasting_reference(model),
-        "target": None if target is None else str(Path(target).resolve()),
+        "model": in_memory(model.name) if isinstance(model, SceneModel) else model and lasting_reference(model),
+        "target": None if target is None else _lasting_target(target) or "images in memory",
         "assets_folder": None if assets is None else os.path.abspath(assets),
         **settings,
     }
     given = {key: value for key, value in given.items() if value is not None}
     before = {key: run.record.get(key) for key in given}
+    if "target" in before:
+        before["target"] = before["target"] or "images in memory"
     if preset is not None:  # field by field, so that the message names the one that differs
         given |= dataclasses.asdict(preset)
         before |= dataclasses.asdict(run.preset)
@@ -144,6 +151,8 @@ def resume(
             )
     if run.is_finished:
         return run, None
+    if run.record["target"] is None and target is not None:
+        return run, open_images(target, run.model, run.record["skip_bad"], show)
     images = open_target(run, show)
     _say_notes(images, show)
     return run, images

@@ -17,12 +17,14 @@ from typing import Any
 
 import safetensors
 import safetensors.torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from probscene.errors import DataError, RunError
+from probscene.inference.features.base import FeatureNet
 
 from ..files import write_whole
 from ..modules import file_digest
+from .parts import IN_MEMORY, inner
 
 FORMAT = 3  # of the run folder; another number is not read
 KEYS = {"model", "model_sha256", "assets"}  # that every run.json has
@@ -47,6 +49,15 @@ class Storage:
     def is_finished(self) -> bool:
         """Whether the guide is learnt."""
         return (self.path / "guide.safetensors").is_file()
+
+    @property
+    def objects(self) -> dict[str, str]:
+        """Which of model, features, divergence and guide were in memory alone, and what each was called: the folder
+        cannot give them back."""
+        record, preset = self.record, self.record.get("preset", {})
+        words = {"model": record.get("model", ""), "features": preset.get("features", "")}
+        words |= {"divergence": preset.get("objective", ""), "guide": record.get("guide", {}).get("kind", "")}
+        return {name: word[len(IN_MEMORY) :] for name, word in words.items() if word.startswith(IN_MEMORY)}
 
     def read_tensors(self, name: str) -> dict[str, Tensor] | None:
         """The tensors of ``name.safetensors``, or None where there is no such file.
@@ -119,3 +130,28 @@ def save_tensors(file: Path, tensors: dict[str, Tensor]) -> None:
     # As bytes: safetensors' own writing says neither OSError nor why where the disk is full.
     whole = safetensors.torch.save({key: value.detach().contiguous() for key, value in tensors.items()})
     write_whole(file, lambda temporary: temporary.write_bytes(whole))
+
+
+def state_of(net: FeatureNet) -> dict[str, Tensor]:
+    """What a run keeps of a feature network: a module's state, of anything else nothing."""
+    module = inner(net)
+    return module.state_dict() if isinstance(module, nn.Module) else {}
+
+
+def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
+    """The reverse of ``state_of``; the network is then ready for use.
+
+    Raises:
+        RunError: the state is another network's.
+    """
+    module = inner(net)
+    if not isinstance(module, nn.Module):
+        return
+    try:
+        module.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise RunError(
+            f"Expected the state of a {type(module).__name__}, actual another network's; put the features back as they "
+            "were when the run was begun, or fit again."
+        ) from error
+    module.eval()

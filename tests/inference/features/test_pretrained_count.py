@@ -192,12 +192,6 @@ def test_what_is_hidden_or_smaller_than_a_place_is_not_counted(dots, draw_twice)
     assert abs(row + 0.5 - 2.5) <= 0.5 and abs(column + 0.5 - 2.5) <= 0.5
 
 
-def test_training_goes_on_to_the_same_bits(dots, draw_twice, goes_on_to_the_same_bits):
-    goes_on_to_the_same_bits(lambda: training(dots, draw_twice, 8, 3, 8, 4))
-    photographs = draw_twice(6).image
-    goes_on_to_the_same_bits(lambda: training(dots, draw_twice, 8, 1, 8, 4, photographs=photographs))
-
-
 def test_a_loss_that_is_not_finite_is_said(dots, draw_twice):
     with pytest.raises(ProbsceneError, match="finite loss"):
         training(dots, draw_twice, 4, 2, 4, learning_rate=1e30).run()

@@ -1,0 +1,112 @@
+"""Each example of a part of one's own, in a fit of a few seconds: by the command line and from Python."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+import probscene as ps
+from probscene.app.cli import app
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+TABLETOP = EXAMPLES / "tabletop.py"
+SHORT = {
+    "count.steps": 16,
+    "count.images": 4,
+    "count.crops": 4,
+    "width": "4,8,8",
+    "pretrain_derivations": 100,
+    "pretrain_epochs": 1,
+    "batches": 2,
+    "num_scenes": 20,
+}
+FILES = ("features.safetensors", "real.safetensors", "guide.safetensors", "log.jsonl")
+
+
+def probscene(*words):
+    """Call the command line in this process; it must succeed."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory):
+    """Tests neither read nor write the user's cache of feature networks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PROBSCENE_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def call():
+    return probscene
+
+
+@pytest.fixture(scope="session")
+def short():
+    """Settings of a fit that ends soon."""
+    return SHORT
+
+
+@pytest.fixture(scope="session")
+def tables(tmp_path_factory) -> Path:
+    """40 pictures of tables."""
+    folder, truth = tmp_path_factory.mktemp("tables"), ps.load_model(TABLETOP).target(0)
+    ps.generate(truth, 40, folder, format="images", progress=False)
+    return folder / "images"
+
+
+@pytest.fixture(scope="session")
+def both_ways(tmp_path_factory, tables):
+    """Fits of a model by the command line and from Python: ``command`` and ``python``, which have the same bytes.
+
+    ``both_ways(words, options)`` takes the command's further words and the further arguments of ``ps.fit``.
+    """
+
+    def fitted(words, options, model=TABLETOP, target=tables):
+        folder = tmp_path_factory.mktemp("ways")
+        short = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+        common = ["--preset", "quick", "--threads", 1, "--seed", 3, "--no-cache", *short]
+        probscene("fit", model, "--target", target, "--out", folder / "command", *common, *words)
+        fit = ps.fit(
+            model, target, "quick", 3, settings=SHORT, threads=1, cache=False, progress=False,
+            out=folder / "python", **options,
+        )  # fmt: skip
+        for name in FILES:
+            assert (folder / "command" / name).read_bytes() == (fit.path / name).read_bytes(), name
+        return SimpleNamespace(command=folder / "command", python=fit)
+
+    return fitted
+
+
+@pytest.fixture
+def goes_on(tmp_path, tables, monkeypatch):
+    """Checks that a fit with parts of one's own, interrupted in a stage of its log, goes on to the same bytes."""
+
+    def check(stage, **options):
+        from probscene.app.fitting import checkpoints
+
+        class Interrupted(Exception):
+            pass
+
+        def stop(keeper, line):
+            kept(keeper, line)
+            if line is not None and line["stage"] == stage:
+                raise Interrupted
+
+        options = {"preset": "quick", "settings": SHORT, "threads": 1, "cache": False, "progress": False, **options}
+        whole = ps.fit(TABLETOP, tables, out=tmp_path / "whole", **options)
+        kept = checkpoints.Keeper.__call__
+        with monkeypatch.context() as patch:
+            patch.setattr(checkpoints, "SAVE_EVERY", -1.0)
+            patch.setattr(checkpoints.Keeper, "__call__", stop)
+            with pytest.raises(Interrupted):
+                ps.fit(TABLETOP, tables, out=tmp_path / "parts", **options)
+        assert list((tmp_path / "parts").glob("*-checkpoint.safetensors"))
+        again = ps.fit(TABLETOP, tables, out=tmp_path / "parts", resume=True, **options)
+        for name in FILES:
+            assert (whole.path / name).read_bytes() == (again.path / name).read_bytes(), name
+
+    return check
