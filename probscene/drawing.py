@@ -5,6 +5,7 @@ pixel in row i and column j is (j + 0.5, i + 0.5). Axis letters: N scenes, M nod
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,16 +22,26 @@ class Atlas:
         sprites: uint8 arrays ``(h, w, 4)``, RGBA with straight alpha; sizes may differ.
 
     Raises:
-        ModelError: no sprite, or one of another shape or type.
+        ModelError: an array instead of a tuple of them, no sprite, or one of another shape or type.
     """
 
     sprites: tuple[np.ndarray, ...]
 
     def __post_init__(self):
+        if not isinstance(self.sprites, list | tuple):
+            raise ModelError(
+                f"Expected an Atlas of a tuple of arrays, actual {_described(self.sprites)}; write Atlas((sprite,)) "
+                "for one sprite, Atlas(tuple(sprites)) for several."
+            )
         if not self.sprites:
             raise ModelError("Expected at least one sprite in an Atlas, actual none.")
         frozen = []
         for i, sprite in enumerate(self.sprites):
+            if not isinstance(sprite, np.ndarray):
+                raise ModelError(
+                    f"Expected sprite {i} as a numpy array, uint8 (h, w, 4) RGBA, actual {_described(sprite)}; "
+                    "np.asarray(image.convert('RGBA')) makes one of a picture."
+                )
             if sprite.ndim != 3 or sprite.shape[2] != 4 or sprite.dtype != np.uint8 or sprite.size == 0:
                 raise ModelError(
                     f"Expected sprite {i} as uint8 (h, w, 4) RGBA, actual {sprite.dtype} {sprite.shape}; "
@@ -43,6 +54,12 @@ class Atlas:
 
     def __len__(self) -> int:
         return len(self.sprites)
+
+
+def _described(value: Any) -> str:
+    """A value's type, and an array's shape, for messages."""
+    shape = getattr(value, "shape", None)
+    return type(value).__name__ if shape is None else f"{type(value).__name__} {value.dtype} {tuple(shape)}"
 
 
 def disc(size: int = 64) -> np.ndarray:
@@ -79,6 +96,9 @@ class Sprites:
         tint: RGB in 0..1 that multiplies the sprite's colour, ``(3,)`` or ``(N, M, 3)``.
         labelled: whether nodes get an instance id; False for layers that only cover others, such as shadows.
         present: ``(N, M)`` bool, which of them are drawn; all if None.
+
+    Raises:
+        ModelError: an atlas that is none.
     """
 
     kinds: str | tuple[str, ...]
@@ -92,6 +112,13 @@ class Sprites:
     tint: Tensor | tuple[float, float, float] = (1.0, 1.0, 1.0)
     labelled: bool = True
     present: Tensor | None = None
+
+    def __post_init__(self):
+        if not isinstance(self.atlas, Atlas):
+            raise ModelError(
+                f"Expected an Atlas in Sprites({self.kinds!r}), actual {_described(self.atlas)}; write "
+                "Atlas((sprite,)) around a sprite, or Atlas(tuple(sprites)) around several."
+            )
 
     @staticmethod
     def disc(kinds, x, y, radius, tint=(1.0, 1.0, 1.0), labelled: bool = True) -> "Sprites":
@@ -133,12 +160,26 @@ class Drawing:
         kinds: the grammar's object names.
         layers: what to draw, in painter's order.
         background: RGB in 0..1.
+
+    Raises:
+        ModelError: a background that is not three finite numbers.
     """
 
     kind: Tensor
     kinds: tuple[str, ...]
     layers: tuple[Layer, ...]
     background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
+
+    def __post_init__(self):
+        try:
+            rgb = [float(value) for value in self.background]
+        except (TypeError, ValueError):
+            rgb = []
+        if len(rgb) != 3 or not np.isfinite(rgb).all():
+            raise ModelError(
+                f"Expected the background of a drawing as three numbers in 0..1, red, green and blue, actual "
+                f"{self.background!r}; write background=(0.2, 0.2, 0.2)."
+            )
 
     def __len__(self) -> int:
         return self.kind.shape[0]
@@ -156,12 +197,19 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
     """Broadcast a ``Sprites`` to ``present (N, M)`` and check what a renderer relies on.
 
     Raises:
-        ModelError: a tensor that does not broadcast, a sprite index outside the atlas, or a value that is not finite.
+        ModelError: a value that is no number, a tensor that does not broadcast, a sprite index outside the atlas, or a
+            value that is not finite.
     """
     shape = present.shape
 
     def full(name, value, dtype=torch.float32, tail=()):
-        value = torch.as_tensor(value, dtype=dtype).detach()
+        try:
+            value = torch.as_tensor(value, dtype=dtype).detach()
+        except (TypeError, ValueError):
+            raise ModelError(
+                f"Expected Sprites({sprites.kinds!r}).{name} as a number or a tensor, actual {value!r}; draw with "
+                "values of sites, such as x = pyro.sample(...)."
+            ) from None
         try:
             value = value.expand(*shape, *tail)
         except RuntimeError:

@@ -7,8 +7,9 @@ import functools
 import importlib
 import inspect
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import pyro
@@ -114,9 +115,10 @@ class SceneModel:
             it is read when a model is loaded.
 
     Raises:
-        ModelError: a class that the grammar has no object of, groups of no class or of the only one, stuff that is no
-            class or all classes, a canvas that is not two positive numbers, a ``max_steps`` that is not positive, a
-            renderer that cannot be called, a variable of a model without ``with_assets``.
+        ModelError: no ``Grammar``, classes or stuff that are a string, a class that the grammar has no object of,
+            groups of no class or of the only one, stuff that is no class or all classes, a canvas that is not two
+            positive whole numbers, a ``max_steps`` that is not one, a renderer that cannot be called, a variable of a
+            model without ``with_assets``.
     """
 
     name: str
@@ -138,6 +140,18 @@ class SceneModel:
     assets_variable: str = ""
 
     def __post_init__(self):
+        if not isinstance(self.grammar, Grammar):
+            raise ModelError(
+                f"Expected a Grammar in model {self.name!r}, actual {type(self.grammar).__name__}; make one of the "
+                "text: Grammar(text)."
+            )
+        for what in ("classes", "stuff"):
+            value = getattr(self, what)
+            if isinstance(value, str) or not isinstance(value, Sequence):
+                raise ModelError(
+                    f"Expected the {what} of model {self.name!r} as a tuple of names, actual {value!r}; write "
+                    f"{what}=({value if isinstance(value, str) else 'plate'!r},), with the comma."
+                )
         unknown = [c for c in self.classes if c not in self.grammar.kinds]
         if unknown or not self.classes:
             raise ModelError(
@@ -154,10 +168,11 @@ class SceneModel:
                 f"Expected the stuff of model {self.name!r} among its classes {list(self.classes)} and not all of "
                 f"them, actual {list(self.stuff)}."
             )
-        if not isinstance(self.canvas, Sequence) or len(self.canvas) != 2 or min(*self.canvas, self.max_steps) < 1:
+        if not _is_canvas(self.canvas) or not _is_positive(self.max_steps):
             raise ModelError(
                 f"Expected a positive canvas and max_steps in model {self.name!r}, "
-                f"actual canvas {self.canvas} and max_steps {self.max_steps}."
+                f"actual canvas {self.canvas} and max_steps {self.max_steps}; write canvas=(height, width), two whole "
+                "numbers of pixels without the channels, and max_steps as a whole number of rules."
             )
         if self.channels not in (1, 3):
             raise ModelError(f"Expected channels 1 or 3 in model {self.name!r}, actual {self.channels}.")
@@ -229,7 +244,7 @@ def scene_model(
     unknown = sorted(fields.keys() - (SceneModel.__dataclass_fields__.keys() - {"program"}))
     if unknown:
         raise ModelError(f"Expected fields of a SceneModel in scene_model(...), actual {', '.join(unknown)}.")
-    kinds = (classes,) if isinstance(classes, str) else tuple(classes)
+    kinds = (classes,) if isinstance(classes, str) else tuple(classes) if isinstance(classes, Iterable) else classes
 
     def decorated(draw: Callable[[SceneGraph], Drawing | World]) -> SceneModel:
         called = getattr(draw, "__name__", "") if name is None else name
@@ -242,6 +257,14 @@ def scene_model(
         return SceneModel(called, grammar, prior, program, canvas, max_steps, kinds, **fields)
 
     return decorated
+
+
+def _is_canvas(canvas: Any) -> bool:
+    return isinstance(canvas, Sequence) and len(canvas) == 2 and all(map(_is_positive, canvas))
+
+
+def _is_positive(number: Any) -> bool:
+    return isinstance(number, Integral) and int(number) >= 1
 
 
 def _takes_one(draw: Any) -> bool:

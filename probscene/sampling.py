@@ -21,6 +21,7 @@ from .drawing import Drawing
 from .errors import ModelError
 from .model import SceneModel
 from .policy import Policy
+from .program_errors import remedy, told, useful_text
 from .world import World
 
 
@@ -71,8 +72,9 @@ def run_program(
         derivation: complete derivations.
 
     Raises:
-        ModelError: a derivation that is not complete; the program's sites are not what a scene model's must be; it
-            returns no ``Drawing``, or one of other nodes than were derived.
+        ModelError: a derivation that is not complete; the program raises an error, which is told with the line that it
+            comes from; its sites are not what a scene model's must be; it returns no ``Drawing``, or one of other nodes
+            than were derived.
     """
     N = len(derivation)
     sites = derivation.sites()
@@ -83,7 +85,7 @@ def run_program(
             "nonterminals left; draw them with derive_complete."
         )
     known = Given(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
-    with torch.no_grad(), poutine.block(), known:
+    with told(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"].get("value")
@@ -104,7 +106,7 @@ def run_program(
                 f"Expected site {key!r} of model {name!r} inside the scenes plate, shape ({N}, nodes), "
                 f"actual {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
             )
-        logp = site["fn"].log_prob(value)
+        logp = _site_log_prob(name, key, site)
         mask = torch.ones(logp.shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(logp.shape)
         values[key], site_mask[key] = value, mask
         log_prob = log_prob + logp.where(mask, 0.0).sum(-1)
@@ -116,6 +118,16 @@ def run_program(
         drawing,
         torch.zeros(N, dtype=torch.int64) if failures is None else failures,
     )
+
+
+def _site_log_prob(name: str, key: str, site: dict[str, Any]) -> Tensor:
+    try:
+        return site["fn"].log_prob(site["value"])
+    except (ValueError, RuntimeError, NotImplementedError) as error:
+        raise ModelError(
+            f"Expected a log-probability of the values of site {key!r} of model {name!r}, actual "
+            f"{type(error).__name__}: {useful_text(error)}; {remedy(error)}."
+        ) from error
 
 
 def check_nodes(name: str, drawing: Drawing | World, derivation: Derivation) -> None:

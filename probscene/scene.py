@@ -10,6 +10,7 @@ from typing import TypeVar, cast
 
 import pyro
 import torch
+from pyro.poutine.runtime import effectful
 from torch import BoolTensor, Tensor
 
 from .derivation import Derivation
@@ -56,8 +57,7 @@ class SceneGraph:
 
     def of_parent(self, value: Tensor | float, default: float = 0.0) -> Tensor:
         """Each node's parent's entry of ``value (N, M)``; ``default`` where there is no parent."""
-        value = torch.as_tensor(value).expand(self.kind.shape)
-        return value.gather(1, self.parent.clamp(min=0)).where(self.parent >= 0, default)
+        return _of_parent(torch.as_tensor(value).expand(self.kind.shape), self.parent, default)
 
     def rank(self, *kinds: str) -> Tensor:
         """``(N, M)`` int64, how many nodes of these kinds and of the same parent come before a node."""
@@ -108,6 +108,12 @@ class SceneGraph:
                 mask = self.mask(*kinds)
                 found.append(resolve(layer, mask if layer.present is None else mask & layer.present))
         return tuple(found)
+
+
+@effectful(type="of_parent")
+def _of_parent(value: Tensor, parent: Tensor, default: float) -> Tensor:
+    """``SceneGraph.of_parent``; a handler sees that the program has asked."""
+    return value.gather(1, parent.clamp(min=0)).where(parent >= 0, default)
 
 
 def _decorated(layer: Sprites | Meshes, num_scenes: int) -> Tensor:

@@ -7,6 +7,7 @@ hazard h(c) = P(n = c) / P(n >= c).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,13 +42,22 @@ class Ranked:
 
 
 def counts(*probs: float, weights: tuple[float, ...] | None = None) -> Counts:
-    """``counts(.2, .4, .4)``: no repeat with probability .2, one with .4, two with .4; normalised."""
-    return Counts(tuple(map(float, probs)), weights)
+    """``counts(.2, .4, .4)``: no repeat with probability .2, one with .4, two with .4; normalised.
+
+    Raises:
+        GrammarError: something that is no number.
+    """
+    shares = None if weights is None else _numbers("counts(..., weights=", weights)
+    return Counts(_numbers("counts(", probs), shares)
 
 
 def weights(*values: float) -> Weights:
-    """``weights(1, 1, 2)``: the third production twice as likely as either other."""
-    return Weights(tuple(map(float, values)))
+    """``weights(1, 1, 2)``: the third production twice as likely as either other.
+
+    Raises:
+        GrammarError: something that is no number.
+    """
+    return Weights(_numbers("weights(", values))
 
 
 def ranked(*each: Counts | Weights) -> Ranked:
@@ -66,11 +76,12 @@ class StructurePrior(Policy):
         table: ``(V + 1, P, C, K)`` float32 log-probabilities; -inf where impossible.
 
     Raises:
-        GrammarError: a nonterminal that the grammar lacks, a wrong number of weights, a negative or zero total, or
-            ``counts`` of a nonterminal that is not a list.
+        GrammarError: no ``Grammar``, a distribution that is none of the three, a nonterminal that the grammar lacks, a
+            wrong number of weights, a negative or zero total, or ``counts`` of a nonterminal that is not a list.
     """
 
     def __init__(self, grammar: Grammar, **distributions: Counts | Weights | Ranked):
+        _check_types(grammar, distributions)
         self.grammar = grammar
         given = {name: d.each if isinstance(d, Ranked) else (d,) for name, d in distributions.items()}
         if any(not each for each in given.values()):
@@ -158,6 +169,39 @@ def _rule_probs(grammar: Grammar, name: str, distribution: Counts | Weights, C: 
     split = torch.zeros(len(rules), dtype=torch.float64)
     split[recursive > 0] = _normalised(shares, int(recursive.sum()), f"weights of {name}'s recursive productions")
     return stop * (1 - recursive) / (1 - recursive).sum() + (1 - stop) * split
+
+
+def _numbers(call: str, values: Any) -> tuple[float, ...]:
+    """What ``counts`` or ``weights`` was given, as numbers."""
+    actual = ", ".join(map(repr, values)) if isinstance(values, list | tuple) else repr(values)
+    try:
+        if isinstance(values, list | tuple) and not any(isinstance(value, str) for value in values):
+            return tuple(map(float, values))
+    except (TypeError, ValueError):
+        pass
+    alone = "weights=" in call
+    right = "(1, 2)), a tuple of them" if alone else "1, 2), one argument each; unpack a list with a star"
+    raise GrammarError(f"Expected numbers in {call}...), actual {call}{actual}); write {call}{right}.")
+
+
+def _check_types(grammar: Any, distributions: dict[str, Any]) -> None:
+    """See that a ``StructurePrior`` is given a grammar, and distributions of it.
+
+    Raises:
+        GrammarError: it is not.
+    """
+    if not isinstance(grammar, Grammar):
+        raise GrammarError(
+            f"Expected a Grammar in StructurePrior(grammar, ...), actual {type(grammar).__name__}; "
+            "make one of the text first: StructurePrior(Grammar(text), ...)."
+        )
+    for name, given in distributions.items():
+        for each in given.each if isinstance(given, Ranked) else (given,):
+            if not isinstance(each, Counts | Weights):
+                raise GrammarError(
+                    f"Expected counts(...), weights(...) or ranked(...) of them for {name}, actual {each!r}; write "
+                    f"{name}=counts(1, 2) for how long a list is, or weights(1, 2) for how likely each production is."
+                )
 
 
 def _normalised(values: tuple[float, ...], number: int | None, what: str) -> Tensor:

@@ -3,18 +3,18 @@
 import hashlib
 import importlib.util
 import sys
-import traceback
 from pathlib import Path
 from types import ModuleType
 
 from probscene.errors import ModelError, ProbsceneError
+from probscene.program_errors import useful_text, user_place
 
 
 def import_file(path: Path) -> ModuleType:
     """The module of a Python file; its name depends on the path alone.
 
     Raises:
-        ModelError: no such file, or one that does not import: with its own error and line.
+        ModelError: no such file, or one that does not import: with its own error, line and source text.
     """
     path = Path(path)
     if not path.is_file():
@@ -28,12 +28,11 @@ def import_file(path: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except ProbsceneError:
         raise
-    except Exception as error:
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        raise ModelError(
-            f"The file {path} does not import: {type(error).__name__}: {error} "
-            f"({Path(where.filename).name}, line {where.lineno}). Try 'python {path}'."
-        ) from error
+    except (Exception, SystemExit) as error:
+        place = user_place(error, str(path.absolute()))
+        where = f" ({Path(place.file).name}, line {place.line}: '{place.text}')" if place else ""
+        what = f"{type(error).__name__}: {useful_text(error)}"
+        raise ModelError(f"The file {path} does not import: {what}{where}. Try 'python {path}'.") from error
     return module
 
 

@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from probscene.errors import ProbsceneError
+from probscene.program_errors import useful_text
 
 
 @dataclass
@@ -59,9 +60,9 @@ def explained(error: BaseException, words: list[str]) -> tuple[int, str]:
         return error.exit_code, f"probscene: {' '.join(str(error).split())}"
     if isinstance(error, MemoryError):
         return 1, "probscene: The machine is out of memory; close other programs and run the command again."
-    last = (str(error).strip().splitlines() or ["no message"])[-1]
     debug = shlex.join(["probscene", "--debug", *words])
-    return 1, f"probscene: A bug in probscene: {type(error).__name__}: {last}. Please report what this prints: {debug}"
+    what = f"{type(error).__name__}: {useful_text(error)}"
+    return 1, f"probscene: A bug in probscene: {what}. Please report what this prints: {debug}"
 
 
 app = typer.Typer(

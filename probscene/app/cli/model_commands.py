@@ -13,12 +13,11 @@ from .options import Assets, Model, Seed, checked_seed
 
 @app.command()
 def check(model: Model, assets: Assets = None) -> None:
-    """Say whether a model's grammar is sound, how long its derivations are, and what to mend."""
-    from probscene.checks import check
-
+    """Say whether a model's grammar is sound and its program runs, what can be seen of it, and what to mend."""
     from ..loading import load_model
+    from ..model_check import check_model
 
-    report = check(load_model(model, assets))
+    report = check_model(load_model(model, assets))
     print(report)
     if report.faults:
         raise ModelError(f"Expected a model without faults, actual {model} with {len(report.faults)}; mend them first.")

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import probscene
-from probscene.checks import check
 from probscene.dataset import ImageFolder, Images
 from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.image_array import ImageArray
@@ -22,6 +21,7 @@ from probscene.threads import cores
 
 from ..files import write_json
 from ..loading import lasting_reference, load_model
+from ..model_check import QUICK, check_model
 from ..modules import file_digest
 from ..progress import Display
 from .fit import check_target, fit, open_target
@@ -41,10 +41,10 @@ def checked_model(model: str | SceneModel, assets: Path | None = None) -> SceneM
     """A model without faults, drawn with a folder of assets where one is named.
 
     Raises:
-        ModelError: it does not load, or ``check`` finds faults.
+        ModelError: it does not load, or ``check_model`` finds faults.
     """
     loaded = model if isinstance(model, SceneModel) else load_model(model, assets)
-    faults = check(loaded).faults
+    faults = check_model(loaded, *QUICK).faults
     if faults:
         name = loaded.name if isinstance(model, SceneModel) else model
         raise ModelError(f"Expected a model without faults, actual {name}: {' '.join(faults)}")
