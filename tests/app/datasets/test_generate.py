@@ -340,7 +340,7 @@ def test_killed_in_mid_run_it_goes_on_to_the_same_bytes(run, undisturbed, tmp_pa
             os.killpg(process.pid, how)  # as a terminal does: to every process of the group
         else:
             process.send_signal(how)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == -how and "in a worker" not in said
     assert said.count("Traceback") == (how == signal.SIGINT)  # of the parent's KeyboardInterrupt alone
     assert workers and not (out / "provenance.jsonl").exists()
