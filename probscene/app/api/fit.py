@@ -13,6 +13,7 @@ from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features
 from probscene.model import SceneModel
 
+from ..arguments import checked_seed
 from ..fitting import session
 from ..fitting.overrides import override
 from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
@@ -21,7 +22,7 @@ from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
 from ..loading import load_model
 from .calls import display
-from .run import Run, checked_seed, parts_of
+from .run import Run, parts_of
 
 
 def fit(

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from probscene.batch import RenderBatch
-from probscene.errors import ProbsceneError
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features
 from probscene.model import SceneModel
 from probscene.sampling import Scenes, sample
 
+from ..arguments import checked_seed, positive
 from ..chunks import chunk_randomness
 from ..datasets.generate import Dataset
 from ..evaluation.evaluate import Evaluation
@@ -61,7 +61,7 @@ class Run(RunFolder):
         """Scenes with learnt structures; the same for the same seed."""
         guide = self.guide  # is made with random numbers of its own
         with chunk_randomness(checked_seed(seed), 0):
-            return sample(self.model, guide, _positive(num, "scenes"))
+            return sample(self.model, guide, positive(num, "scenes"))
 
     def render(self, num: int, seed: int = 0) -> RenderBatch:
         """``sample``, rendered and labelled."""
@@ -120,20 +120,3 @@ def parts_of(features: Any, divergence: Any, guide: Any) -> Parts:
         None if divergence is None else as_divergence(divergence),
         None if guide is None else as_guide_maker(guide),
     )
-
-
-def _positive(number: int, what: str) -> int:
-    if number < 1:
-        raise ProbsceneError(f"Expected a positive number of {what}, actual {number}.")
-    return number
-
-
-def checked_seed(seed: int) -> int:
-    """A seed of 0 or more.
-
-    Raises:
-        ProbsceneError: it is negative.
-    """
-    if seed < 0:
-        raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
-    return seed

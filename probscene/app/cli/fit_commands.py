@@ -9,8 +9,9 @@ import typer
 import probscene
 from probscene.errors import ProbsceneError
 
+from ..arguments import checked_seed
 from .application import app
-from .options import Assets, Cache, NoCache, PresetName, Seed, checked_seed
+from .options import Assets, Cache, NoCache, PresetName, Seed
 
 
 @app.command()

@@ -7,8 +7,9 @@ import typer
 
 from probscene.errors import ModelError
 
+from ..arguments import checked_seed
 from .application import app
-from .options import Assets, Model, Seed, checked_seed
+from .options import Assets, Model, Seed
 
 
 @app.command()

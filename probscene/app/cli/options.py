@@ -6,8 +6,6 @@ from typing import Annotated
 
 import typer
 
-from probscene.errors import ProbsceneError
-
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, made by 'probscene fit'.")]
 Model = Annotated[str, typer.Argument(metavar="MODEL", help="multi_mnist, aerial2d, driving, or a .py file.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same result.")]
@@ -21,14 +19,3 @@ Cache = Annotated[
 NoCache = Annotated[bool, typer.Option("--no-cache", help="Train the feature network anew, and keep it nowhere else.")]
 MinHeight = Annotated[float, typer.Option(min=0, help="Of objects that KITTI's labels count, pixels of their boxes.")]
 PresetName = StrEnum("PresetName", ["quick", "default", "paper", "street"])
-
-
-def checked_seed(seed: int) -> int:
-    """A seed of 0 or more.
-
-    Raises:
-        ProbsceneError: it is negative.
-    """
-    if seed < 0:
-        raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
-    return seed
