@@ -114,7 +114,7 @@ def evaluate(
 
 
 def compare(
-    runs: Sequence[Path | str],
+    runs: Sequence[RunFolder | Path | str],
     target: Target | None = None,
     labels: Path | str | Labels | None = None,
     out: Path | str | None = None,
@@ -125,7 +125,7 @@ def compare(
     """The prior, several runs of one model and the truth side by side.
 
     Args:
-        runs: their folders.
+        runs: themselves or their folders, which have different names.
         target: the images to judge by; the runs' own where None.
         labels: see ``evaluate``.
         out: the picture to write, a PNG; none where None.
@@ -134,7 +134,7 @@ def compare(
     Raises:
         ProbsceneError: see ``evaluation.compare``.
     """
-    opened = comparing.open_runs([Path(path) for path in runs])
+    opened = comparing.open_runs(runs)
     if out is not None:
         comparison_picture.make_place(Path(out))
     first = next(iter(opened.values()))

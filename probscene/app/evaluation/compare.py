@@ -120,19 +120,20 @@ class Comparison(Evaluation):
         return Row(words, shares, means, {name: total_variation(p, known) for name, p in others.items()})
 
 
-def open_runs(paths: Sequence[Path]) -> dict[str, RunFolder]:
-    """Finished runs of one model, by the names of their folders.
+def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
+    """Finished runs of one model, or their folders, by the names of their folders.
 
     Raises:
         RunError: see ``RunFolder.at``; runs of different models or of the same name, or one that is not finished.
     """
     runs: dict[str, RunFolder] = {}
-    for path in paths:
-        run, name = RunFolder.at(path), path.resolve().name
+    for each in given:
+        run = each if isinstance(each, RunFolder) else RunFolder.at(Path(each))
+        path, name = run.path, run.path.resolve().name
         if name in runs or name in (PRIOR, TRUTH, ESTIMATE):
             raise RunError(
                 f"Expected runs in folders of different names, none of them {PRIOR}, {TRUTH} or {ESTIMATE}, actual "
-                f"another {name!r} at {path}; rename the folder."
+                f"another {name!r} at {path}; rename the folder, or save the run under another name."
             )
         first = next(iter(runs.values()), run)
         if differs := next((key for key in SAME if run.record[key] != first.record[key]), None):

@@ -59,8 +59,11 @@ def test_it_is_reported_and_compared(python_run, tmp_path, target):
     page = python_run.report(tmp_path / "page.html", num=100, scenes=0, progress=False)
     assert page == tmp_path / "page.html" and "<html" in page.read_text(encoding="utf-8")
     second = python_run.save(tmp_path / "second")
-    found = ps.compare([python_run.path, second.path], out=tmp_path / "both.png", num=100, progress=False)
-    assert len(found.runs) == 2 and (tmp_path / "both.png").is_file()
+    found = ps.compare([python_run.path, str(second.path)], out=tmp_path / "both.png", num=100, progress=False)
+    assert list(found.runs) == ["run", "second"] and (tmp_path / "both.png").is_file()
+    assert ps.compare([python_run, second], num=100, progress=False).record() == found.record()
+    with pytest.raises(ps.RunError, match="different names.*save the run under another name"):
+        ps.compare([python_run, python_run], num=100, progress=False)
 
 
 def test_it_is_saved_where_nothing_is_yet(python_run, tmp_path):
