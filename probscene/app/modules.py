@@ -9,6 +9,18 @@ from types import ModuleType
 from probscene.errors import ModelError, ProbsceneError
 from probscene.program_errors import useful_text, user_place
 
+_OWN = "probscene_model_"  # begins the names of these modules
+
+
+def line_of_user(error: BaseException) -> str | None:
+    """The file and line of a user's own, last in the traceback of an error that it raised; None where it has none."""
+    found, trace = None, error.__traceback__
+    while trace is not None:
+        if str(trace.tb_frame.f_globals.get("__name__", "")).startswith(_OWN):
+            found = f"{trace.tb_frame.f_code.co_filename}, line {trace.tb_lineno}"
+        trace = trace.tb_next
+    return found
+
 
 def import_file(path: Path) -> ModuleType:
     """The module of a Python file; its name depends on the path alone.
@@ -19,7 +31,7 @@ def import_file(path: Path) -> ModuleType:
     path = Path(path)
     if not path.is_file():
         raise ModelError(f"Expected a Python file, actual {str(path)!r}, which is not there.")
-    name = "probscene_model_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
+    name = _OWN + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -9,7 +9,7 @@ from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES
 from probscene.inference.objective import BASELINES
 
-from .parts import is_file_part
+from .parts import is_file_part, lasting_word
 from .presets import OBJECTIVES, TRAINED, Preset
 
 CHOICES = {
@@ -52,6 +52,8 @@ def _replaced(value: Any, path: list[str], text: str, key: str) -> Any:
             raise ProbsceneError(f"Expected --set {key}.{fields(inner)[0].name}=..., actual {key!r} alone.")
         return replace(value, **{name: _replaced(inner, rest, text, key)})
     new = _read(text, get_type_hints(type(value))[name], key)
+    if isinstance(new, str):
+        new = lasting_word(new)
     _check(name, new, key)
     return replace(value, **{name: new})
 

@@ -7,6 +7,8 @@ import pytest
 import torch
 
 import probscene as ps
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.presets import QUICK
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), np.uint8)
 
@@ -220,6 +222,8 @@ class Wrong:
 
 def mean(generated, real): return generated.mean()
 
+def broken(generated, real): return real[0, 99]
+
 class Guide(ps.Guide):
     def __init__(self, grammar, max_steps):
         super().__init__(grammar, max_steps)
@@ -237,6 +241,7 @@ WORDS = {
     "arguments": ("--features", "FILE.py:Needs", r"without arguments, actual Needs\(size\)"),
     "features of a wrong shape": ("--features", "FILE.py:Wrong", r"Wrong\.embed .*\(40, 2\), actual .*\(40, 1\)"),
     "one cost": ("--objective", "FILE.py:mean", r"Expected of mean one cost a generated scene"),
+    "an error in it": ("--objective", "FILE.py:broken", r"IndexError in .*part.py, line \d+: index 99 .*--debug"),
     "logits": ("--guide", "FILE.py:Guide", r"Expected of Guide\.step logits \(N, K\)"),
     "syntax": ("--guide", "broken.py:Guide", r"broken.py does not import: SyntaxError"),
 }
@@ -253,5 +258,11 @@ def test_the_command_line_says_it_in_one_line(call, discs, target, tmp_path, nam
     (line,) = [line for line in done.err.splitlines() if line.startswith("probscene: ")]
     assert done.code == 2 and "Traceback" not in done.err
     assert re.search(message, line), line
-    if name not in ("features of a wrong shape", "one cost"):
+    if name not in ("features of a wrong shape", "one cost", "an error in it"):  # which are found in the fit
         assert not (tmp_path / "run").exists()
+
+
+def test_a_file_named_by_a_setting_is_found_from_everywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    preset = override(QUICK, ["guide=part.py:Guide"])
+    assert preset.guide == f"{tmp_path.resolve() / 'part.py'}:Guide"
