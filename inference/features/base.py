@@ -110,10 +110,12 @@ class Features(Protocol):
     Attributes:
         name: in records and messages; another name is another choice.
         resolution: features that differ by less count as equal in the verdict, such as 0.5 of a count.
+        pretrained: whether the network has learnt from photographs; a verdict then does not advise to take such a one.
     """
 
     name: str
     resolution: float = 0.0
+    pretrained: bool = False
 
     def build(self, model: SceneModel) -> FeatureNet:
         """The network, untrained or pretrained; the random numbers it takes are the run's. Called once a fit, and again

@@ -37,6 +37,8 @@ class ProjectedFeatures(Features):
     directions: int = 8
     scenes: int = 150
 
+    pretrained = True
+
     @property
     def name(self) -> str:
         """The network's word, with the whole path of its file."""

@@ -68,6 +68,7 @@ class PretrainedCountFeatures(Features):
     scenes: int = 150
 
     name = COUNT_ON_PRETRAINED
+    pretrained = True
 
     def build(self, model: SceneModel) -> FeatureNet:
         """Pretrained, with untrained heads."""

@@ -61,13 +61,12 @@ def explained(error: BaseException, words: list[str]) -> tuple[int, str]:
     if isinstance(error, MemoryError):
         return 1, "probscene: The machine is out of memory; close other programs and run the command again."
     debug = shlex.join(["probscene", "--debug", *words])
-    what = f"{type(error).__name__}: {useful_text(error)}"
     from ..modules import line_of_user
 
-    own = line_of_user(error)
+    kind, text, own = type(error).__name__, useful_text(error), line_of_user(error)
     if own is not None:
-        return 2, f"probscene: {type(error).__name__} in {own}: {useful_text(error)}. The whole traceback: {debug}"
-    return 1, f"probscene: A bug in probscene: {what}. Please report what this prints: {debug}"
+        return 2, f"probscene: {kind} in {own}: {text}. The whole traceback: {debug}"
+    return 1, f"probscene: A bug in probscene: {kind}: {text}. Please report what this prints: {debug}"
 
 
 app = typer.Typer(

@@ -101,12 +101,9 @@ def report(
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
 ) -> None:
     """Write one self-contained HTML page about a run."""
-    from ..fitting.run import RunFolder
-    from ..progress import Display
-    from ..views.report import report
+    from ..api import calls
 
-    with Display() as show:
-        path = report(RunFolder.at(run), show, out, labels, num, scenes)
+    path = calls.report(run, out, labels, num, scenes)
     print(f"The report is {path}")
 
 
@@ -128,29 +125,13 @@ def compare(
     """Draw the prior, several runs and the truth side by side, and print how far each is from the truth."""
     from rich.console import Console
 
-    from ..evaluation import compare
-    from ..evaluation.labels import read_labels
+    from ..api import calls
     from ..files import make_folder, write_json
-    from ..fitting import fit, session
-    from ..progress import Display
-    from ..views import comparison, tables
+    from ..views import tables
 
-    opened = compare.open_runs(runs)
-    comparison.make_place(out)
-    first = next(iter(opened.values()))
     if json is not None:
         make_folder(json.parent)
-    with Display() as show:
-        images = None
-        if target is not None:
-            images = session.open_images(target, first.model, first.record["skip_bad"], show)
-        elif labels is not None:
-            images = fit.open_target(first, show)
-        truth = None
-        if labels is not None and images is not None:
-            truth = read_labels(labels, first.model, images, min_height=min_height)
-        found = compare.compare(opened, images, truth, show, num)
-        comparison.draw(found, out)
+    found = calls.compare(runs, target, labels, out, num, min_height)
     tables.show_comparison(found, Console(highlight=False))
     print(f"The picture is {out}")
     if json is not None:

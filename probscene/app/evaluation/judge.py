@@ -14,8 +14,6 @@ from torch import Tensor
 from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features.base import FeatureNet
-from probscene.inference.features.counting.choices import PretrainedCountFeatures
-from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.judging.trust import Trust, trust
 from probscene.inference.judging.two_sample import NEEDED
 from probscene.policy import Policy
@@ -119,7 +117,7 @@ def judge(
             resolution=run.features.resolution,
             looks=(seen.numpy(), torch.cat([look for eye in eyes for look in eye.looks]).numpy()),
             seed=seed,
-            pretrained=isinstance(run.features, PretrainedCountFeatures | ProjectedFeatures),
+            pretrained=run.features.pretrained,
         )
     except DataError as error:
         return Judged(None, str(error))

@@ -40,10 +40,6 @@ class Keeper:
         """Write the log to its end."""
         write_text(self.log, "".join(f"{line}\n" for line in self.lines))
 
-    def forget(self) -> None:
-        """Delete the checkpoint of a finished training."""
-        (self.run.path / f"{self.name}.safetensors").unlink(missing_ok=True)
-
     def _save(self) -> None:
         self.finish()
         self.run.write_tensors(self.name, self.training.state())
