@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 from rich.console import Console
 
-from probscene.app.evaluation.labels import write_counts
 from probscene.app.files import make_folder
+from probscene.app.labelling.counts import write_counts
 from probscene.errors import DataError, ProbsceneError
 
 CROP, CAR = 256, 18.0  # pixels: a crop's side and the length of the model's cars

@@ -89,14 +89,33 @@ class Renders(Protocol):
         ...
 
 
+class Labelled(NamedTuple):
+    """A handful of the target's images, K of them, that a person has labelled.
+
+    Attributes:
+        images: ``(K, C, H, W)`` uint8.
+        counts: ``(K, classes)`` int64 objects.
+        classes: the names of those that are labelled, in the model's order.
+    """
+
+    images: Tensor
+    counts: Tensor
+    classes: tuple[str, ...]
+
+
 class Photographs(Protocol):
-    """The target's unlabelled images, for a feature network that looks at them before it is used.
+    """The target's images, for a feature network that looks at them before it is used.
 
     Attributes:
         fingerprint: of the images, SHA-256 hexadecimal.
     """
 
     fingerprint: str
+
+    @property
+    def labelled(self) -> Labelled | None:
+        """Those that are labelled; None where none is."""
+        ...
 
     def some(self, most: int) -> Tensor:
         """At most so many of them, evenly spread, ``(L, C, H, W)`` uint8."""
@@ -111,11 +130,14 @@ class Features(Protocol):
         name: in records and messages; another name is another choice.
         resolution: features that differ by less count as equal in the verdict, such as 0.5 of a count.
         pretrained: whether the network has learnt from photographs; a verdict then does not advise to take such a one.
+        takes_labels: whether ``training`` makes use of ``Photographs.labelled``; with others ``fit --labels`` is an
+            error.
     """
 
     name: str
     resolution: float = 0.0
     pretrained: bool = False
+    takes_labels: bool = False
 
     def build(self, model: SceneModel) -> FeatureNet:
         """The network, untrained or pretrained; the random numbers it takes are the run's. Called once a fit, and again

@@ -22,11 +22,12 @@ from probscene.model import SceneModel
 from .datasets.generate import generate, generate_scenes
 from .evaluation.evaluate import evaluate
 from .evaluation.judge import judge
-from .evaluation.labels import counts_of_dataset, read_labels, write_counts
+from .evaluation.labels import counts_of_dataset, read_labels
 from .files import make_folder, write_json
 from .fitting import session
 from .fitting.presets import QUICK, Preset
 from .fitting.run import RunFolder
+from .labelling.counts import write_counts
 from .loading import load_model
 from .pictures import pixels, side_by_side, write_picture
 from .progress import Display

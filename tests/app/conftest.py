@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from probscene.app.cli import app
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.labels import counts_of_dataset, write_counts
+from probscene.app.evaluation.labels import counts_of_dataset
+from probscene.app.labelling.counts import write_counts
 from probscene.app.loading import load_model
 
 DISCS = Path(__file__).with_name("discs.py")

@@ -41,6 +41,7 @@ def fit(
     threads: int | None = None,
     assets: Path | str | None = None,
     cache: Path | str | bool = True,
+    labels: Path | str | None = None,
     resume: bool = False,
     progress: bool = True,
 ) -> Run:
@@ -66,6 +67,8 @@ def fit(
         assets: a folder that the model is drawn with.
         cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
             folder.
+        labels: of a few of the images, for features that take them: a ``counts.csv``, COCO's ``.json`` or KITTI's
+            folder ``label_2``.
         resume: go on with the run in ``out`` where there is one; the other arguments are those that it was begun with.
         progress: show it, on stderr.
 
@@ -85,8 +88,9 @@ def fit(
     with display(progress) as show:
         try:
             assets_folder = None if assets is None else Path(assets)
+            labels = None if labels is None else Path(labels)
             if resume and (folder / "run.json").exists():
-                begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads}
+                begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
                 run, images = session.resume(folder, show, given, target, chosen, assets_folder, parts, Run, **begun)
             else:
                 run, images = session.begin(
@@ -101,6 +105,7 @@ def fit(
                     assets_folder,
                     parts,
                     Run,
+                    labels,
                 )
             if not run.is_finished:
                 session.carry_out(run, images, show, *_cache(cache))

@@ -44,6 +44,10 @@ def fit(
         str | None,
         typer.Option(metavar="NAME,...", help="Of a model that has several; a guide learns each. All if not given."),
     ] = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="Of a few of the images: a counts.csv, COCO's .json, or KITTI's label_2."),
+    ] = None,
     assets: Assets = None,
     cache: Cache = None,
     no_cache: NoCache = False,
@@ -68,7 +72,7 @@ def fit(
     with Display() as show:
         if resume:
             given = chosen if preset or objective or guide or features or settings else None
-            begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads}
+            begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
             run, images = session.resume(out, show, model, target, given, assets, parts, **begun)
         elif model is None or target is None:
             raise ProbsceneError(
@@ -76,7 +80,7 @@ def fit(
             )
         else:
             run, images = session.begin(
-                model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets, parts
+                model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets, parts, labels=labels
             )
             ctx.obj.words.append("--resume")
         if not run.is_finished:

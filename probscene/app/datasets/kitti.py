@@ -15,8 +15,8 @@ ends exclusive. ``occluded`` goes by the visible fraction over the share within 
 on, 2 below. Where the canvas cuts an object, that share is its box's, not its silhouette's: what only the canvas cuts
 may come out as 1, seldom as 2.
 
-Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``kitti_labels.TYPES``) is
-written as that type. The 2D box is the whole silhouette's, what others cover included, within the image: KITTI's own
+Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``labelling.kitti.TYPES``)
+is written as that type. The 2D box is the whole silhouette's, what others cover included, within the image: KITTI's own
 boxes of hidden cars are as near to their projected 3D boxes as those of free ones, half a pixel. (So its boxes of cars
 are projections, a few pixels wider than a silhouette, which does not reach its 3D box's corners.) Its pixels are P2's,
 the middle of the upper left one is (0, 0): 0.5 less than from the canvas's corner, and no end is beyond the middle of
@@ -38,8 +38,8 @@ from probscene.batch import RenderBatch
 from probscene.errors import ProbsceneError
 from probscene.model import SceneModel
 
+from ..labelling.kitti import TYPES
 from .coco import labelled
-from .kitti_labels import TYPES
 
 MOST = 255  # classes, and instances of a class: 8 bits each
 _UNKNOWN = "-1 -1 -1 -1000 -1000 -1000 -10"

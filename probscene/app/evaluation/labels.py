@@ -1,21 +1,14 @@
-"""The truth that learnt structures are judged by; fitting never reads it. Three kinds:
+"""The truth that learnt structures are judged by. Four kinds:
 
-``counts.csv``, how many objects of each class an image shows: the columns are ``image`` and the model's classes, in any
-order; one row an image, in any order. A class that nobody has labelled has no column, and is not compared.
-
-    image,0,1,2
-    000000.png,0,2,1
+``counts.csv``, how many objects of each class an image shows, see ``labelling.counts``.
 
 ``provenance.jsonl`` as ``generate`` writes it: one line an image with the rules of its structure, which says also what
 hangs below what, and how likely a policy would have derived it.
 
-A folder of KITTI's label files, see ``kitti_labels``.
+COCO's JSON of boxes, see ``labelling.coco``, and a folder of KITTI's label files, see ``labelling.kitti``.
 """
 
-import csv
-import io
 import json
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,8 +21,10 @@ from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
-from ..datasets.kitti_labels import read_kitti
-from ..files import write_text
+from ..labelling.coco import read_coco
+from ..labelling.counts import read_table, text_of
+from ..labelling.kitti import read_kitti
+from ..labelling.naming import NamedImages
 from .structure_counts import Counts, StructureCounts, count
 
 SEEN = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
@@ -59,78 +54,35 @@ class Labels(NamedTuple):
 
 
 def read_labels(path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Labels:
-    """The labels of a target's images, from a ``.jsonl`` of provenance, a CSV of counts or a folder of KITTI's labels.
+    """The labels of a target's images, by the path's kind: a ``.jsonl`` of provenance, a ``.json`` of COCO, a folder of
+    KITTI's labels, else a CSV of counts.
 
-    Rows of files that the target left out as bad are passed over.
+    Entries of files that the target left out as bad are passed over.
 
     Args:
         some: there need not be one for every image; those without are left out.
-        min_height: of an object's box that is counted, pixels of its image; a folder alone has boxes.
+        min_height: of an object's box that is counted, pixels of its image; for labels with boxes.
 
     Raises:
-        DataError: see ``read_counts`` and ``read_kitti``; a line that is none of provenance, or whose rules are not the
-            model's; a least height for what has no boxes.
-    """
-    if Path(path).is_dir():
-        counts, classes, notes = read_kitti(Path(path), model, target, some, min_height)
-        low = min_height * float(np.median(target.scales))
-        return Labels(StructureCounts(counts, {}), classes=classes, notes=(SEEN, *notes), min_height=low)
-    if min_height:
-        raise DataError(f"Expected a folder of KITTI's labels for a least height of objects, actual the file {path}.")
-    if Path(path).suffix != ".jsonl":
-        classes = _labelled(Path(path), model.classes)
-        return Labels(StructureCounts(read_counts(path, classes, target, some), {}), classes=classes)
-    derivation = _read_derivations(Path(path), model, target, some)
-    return Labels(count(model, derivation), derivation)
-
-
-def _labelled(path: Path, classes: tuple[str, ...]) -> tuple[str, ...]:
-    """The classes that have a column; all where none has, or a column is of something else."""
-    header = {field.strip(' "\r') for field in _text(path).partition("\n")[0].split(",")}
-    found = tuple(name for name in classes if name in header)
-    return found if found and header == {"image", *found} else classes
-
-
-def read_counts(path: Path, classes: tuple[str, ...], target: Images, some: bool = False) -> Counts:
-    """The counts ``(L, C)`` of a target's images, in the order of its files.
-
-    Rows of files that the target left out as bad are passed over; with ``some``, so are images without a row.
-
-    Raises:
-        DataError: no such file, other columns, a row of another length, an image that is not there, twice there or
-            without a row, or what is not a count; the first is named.
+        DataError: see ``read_table``, ``read_coco`` and ``read_kitti``; a line that is none of provenance, or whose
+            rules are not the model's; a least height for what has no boxes.
     """
     path = Path(path)
-    try:
-        rows = list(csv.reader(io.StringIO(_text(path)), strict=True))
-    except csv.Error as error:
-        raise DataError(f"Expected a CSV file in UTF-8, actual {path}: {error}.") from error
-    header = [name.strip() for name in rows[0]] if rows else []
-    if sorted(header) != sorted(["image", *classes]):
+    if path.is_dir() or path.suffix == ".json":
+        read = read_kitti if path.is_dir() else read_coco
+        boxes = read(path, model, target, some, min_height)
+        low = min_height * float(np.median(target.scales))
+        notes = (SEEN, *boxes.notes)
+        return Labels(StructureCounts(boxes.counts, {}), classes=boxes.classes, notes=notes, min_height=low)
+    if min_height:
         raise DataError(
-            f"Expected the columns {','.join(['image', *classes])} in {path}, actual {','.join(header) or 'none'}."
+            f"Expected a folder of KITTI's labels or COCO's JSON for a least height of objects, actual the file {path}."
         )
-    named = _Named(path, target, some)
-    for number, fields in enumerate(rows[1:], 2):
-        if not fields:
-            continue
-        where = f"in line {number} of {path}"
-        if len(fields) != len(header):
-            raise DataError(f"Expected {len(header)} fields {where}, actual {len(fields)}.")
-        row = dict(zip(header, fields, strict=True))
-        name = row["image"].strip()
-        if named.wanted(name, where):
-            named.found[name] = [_count(row[c], c, name, where) for c in classes]
-    return np.array(named.ordered(), np.int64)
-
-
-def write_counts(path: Path, names: list[str], counts: Counts, classes: tuple[str, ...]) -> None:
-    """A ``counts.csv`` of ``counts (L, C)``, whole or not at all."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["image", *classes])
-    writer.writerows([name, *row] for name, row in zip(names, counts.tolist(), strict=True))
-    write_text(path, text.getvalue())
+    if path.suffix != ".jsonl":
+        table = read_table(path, model.classes, target, some)
+        return Labels(StructureCounts(table.counts, {}), classes=table.classes, notes=table.notes)
+    derivation = _read_derivations(path, model, target, some)
+    return Labels(count(model, derivation), derivation)
 
 
 def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Counts]:
@@ -143,44 +95,9 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
     return names, count(model, Derivation.of(model.grammar, _padded(rules))).counts
 
 
-class _Named:
-    """What a file of labels says of a target's images, or of some, by name, each exactly once."""
-
-    def __init__(self, path: Path, target: Images, some: bool):
-        self.path, self.target, self.some = path, target, some
-        self.known = {file.name for file in target.paths}
-        self.left_out = {file.name for file in target.bad}
-        self.found: dict[str, Any] = {}
-
-    def wanted(self, name: str, where: str) -> bool:
-        """Whether a row is of an image that is used."""
-        if name in self.left_out:
-            return False
-        if name not in self.known:
-            raise DataError(f"Expected the name of an image in {self.target.path} {where}, actual {name!r}.")
-        if name in self.found:
-            raise DataError(f"Expected one row an image, actual a second one of {name} {where}.")
-        return True
-
-    def ordered(self) -> list[Any]:
-        """In the order of the target's files."""
-        missing = [file.name for file in self.target.paths if file.name not in self.found]
-        if missing and not (self.some and self.found):
-            names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-            raise DataError(
-                f"Expected a row for every image of {self.target.path} in {self.path}, actual none for {names}"
-                f"{'' if self.some else '; if only some are labelled, add --some-labels'}."
-            )
-        return [self.found[name] for name in self.names()]
-
-    def names(self) -> list[str]:
-        """Of the images that it is about, in the order of the target's files."""
-        return [file.name for file in self.target.paths if file.name in self.found]
-
-
 def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool) -> Derivation:
-    named = _Named(path, target, some)
-    for number, text in enumerate(_text(path).split("\n"), 1):
+    named = NamedImages(path, target, some)
+    for number, text in enumerate(text_of(path).split("\n"), 1):
         if not text.strip():
             continue
         where = f"in line {number} of {path}"
@@ -201,7 +118,7 @@ def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool)
     except GrammarError:
         whole = False
     if not whole:
-        names = (name for name, row in zip(named.names(), rules, strict=True) if not _is_whole(model, row))
+        names = (target.paths[i].name for i, row in zip(named.rows(), rules, strict=True) if not _is_whole(model, row))
         raise DataError(f"Expected structures of model {model.name!r} in {path}, actual another of {next(names)}.")
     return derivation
 
@@ -226,21 +143,3 @@ def _padded(rules: Iterable[list[int]]) -> torch.Tensor:
     """``(L, T)`` int64, -1 pads."""
     rows = [torch.tensor(row, dtype=torch.int64) for row in rules]
     return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=-1)
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(f"Expected a file of labels at {path}, actual none: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"Expected a text file in UTF-8, actual {path}: {error}.") from error
-
-
-def _count(text: str, column: str, name: str, where: str) -> int:
-    if not re.fullmatch(r"\s*\+?[0-9]{1,9}\s*", text):
-        raise DataError(
-            f"Expected a count of 0 or more for class {column!r} of {name} {where}, actual {text!r}; write a whole "
-            "number."
-        )
-    return int(text)

@@ -1,8 +1,8 @@
 """The stages of a fit: from a model and unlabelled images to a learnt guide.
 
 Four stages: the feature network on prior renders, features of the target images, the guide's pretraining, and the
-learning of structure. Each goes on after an interruption to the same result. Only the images are read; labels play no
-part.
+learning of structure. Each goes on after an interruption to the same result. Labels play no part, but for a handful
+that a feature network may be given.
 """
 
 import json
@@ -26,6 +26,7 @@ from probscene.sampling import seed_everything
 from probscene.threads import threads
 
 from ..files import write_text
+from ..labelling.few import FewLabels, PartlyLabelled
 from ..progress import Progress
 from .cache import NetworkCache
 from .checkpoints import Keeper
@@ -46,6 +47,7 @@ def fit(
     cache_in: Path | None = None,
     use_cache: bool = True,
     say: Say | None = None,
+    labels: FewLabels | None = None,
 ) -> Guide:
     """Finish a run: take the stages that it lacks.
 
@@ -54,6 +56,7 @@ def fit(
         cache_in: the folder in which trained feature networks are kept; the user's cache where None.
         use_cache: whether to look there at all.
         say: is told where a network came from there.
+        labels: of some of the target's images, for features that take them.
 
     Raises:
         DataError: the target cannot be used: see ``check_target`` and ``check_features``.
@@ -65,7 +68,7 @@ def fit(
     images = cache(lambda: open_target(run, progress) if target is None else target)
     observer = Observer(run.model, run.record["threads"])
     with threads(run.record["threads"]):
-        net = _Network(run, observer, progress, images)
+        net = _Network(run, observer, progress, images, labels)
         net.finish(cache_in, use_cache, say or (lambda text: None))
         run.keep_network(net.net)
         real = _real_features(run, net.net, progress, images)
@@ -79,8 +82,16 @@ def fit(
 class _Network:
     """The run's feature network on its way to being trained."""
 
-    def __init__(self, run: RunFolder, observer: Observer, progress: Progress, target: Callable[[], Images]):
+    def __init__(
+        self,
+        run: RunFolder,
+        observer: Observer,
+        progress: Progress,
+        target: Callable[[], Images],
+        labels: FewLabels | None,
+    ):
         self.run, self.observer, self.progress, self.target = run, observer, progress, target
+        self.photographs = cache(lambda: PartlyLabelled(target(), labels))
         seed_everything(batch_seed(run.record["seed"], 0))
         self.net = run.build_network() if run.built is None else run.built
         run.built = None
@@ -93,7 +104,7 @@ class _Network:
             load_state(net, tensors)
             self._check_taught()
             return
-        training = run.features.training(inner(net), self.observer, self.target, run.record["seed"])
+        training = run.features.training(inner(net), self.observer, self.photographs, run.record["seed"])
         if training is None:
             run.write_tensors("features", state_of(net))
             _ready(net)

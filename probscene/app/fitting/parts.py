@@ -90,7 +90,7 @@ def as_features(given: Any) -> Features:
     if callable(getattr(made, "build", None)) and isinstance(getattr(made, "name", None), str):
         methods = ("training", "divergence", "taught_by", "settings")
         missing = [name for name in methods if not callable(getattr(made, name, None))]
-        missing += [name for name in ("resolution", "pretrained") if not hasattr(made, name)]
+        missing += [name for name in ("resolution", "pretrained", "takes_labels") if not hasattr(made, name)]
         if missing:
             raise ModelError(
                 f"Expected features with {', '.join(methods)}, actual {type(made).__name__} without "

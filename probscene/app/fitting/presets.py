@@ -8,7 +8,7 @@ from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELo
 from probscene.inference.features.base import Features
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.choices import COUNT_ON_PRETRAINED, CountFeatures, PretrainedCountFeatures
-from probscene.inference.features.names import network_name
+from probscene.inference.features.names import PRETRAINED, network_name
 from probscene.inference.features.presence import PresenceFeatures
 from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.guides.lstm import GUIDES
@@ -240,3 +240,9 @@ def preset(name: str) -> Preset:
     if name not in PRESETS:
         raise ProbsceneError(f"Expected a preset among {', '.join(PRESETS)}, actual {name!r}.")
     return PRESETS[name]
+
+
+def takers_of_labels() -> list[str]:
+    """The words for features that can make use of labels."""
+    names = (*TRAINED, *PRETRAINED)
+    return [name for name in names if replace(QUICK, features=name).make_features().takes_labels]

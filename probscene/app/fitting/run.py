@@ -16,6 +16,7 @@ from probscene.model import SceneModel
 from probscene.scenarios import JointGrammar
 
 from ..files import make_folder, write_json, write_whole
+from ..labelling.few import FewLabels
 from ..loading import BUILT_IN, lasting_reference, load_model, same_assets, split_reference
 from ..modules import file_digest
 from .parts import (
@@ -45,12 +46,14 @@ class RunFolder(Storage):
         path: the folder.
         record: the contents of ``run.json``.
         built: the feature network, untrained, where the fit is to begin with one that was built before.
+        few: labels of some of the target's images, where the fit is to begin with such.
     """
 
     def __init__(self, path: Path, record: dict[str, Any], model: SceneModel | None = None, parts: Parts | None = None):
         super().__init__(path, record)
         self.parts, self._model = parts or Parts(), model
         self.built: FeatureNet | None = None
+        self.few: FewLabels | None = None
         self._network: FeatureNet | None = None
 
     @classmethod

@@ -14,19 +14,21 @@ import probscene
 from probscene.dataset import ImageFolder, Images
 from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.image_array import ImageArray
+from probscene.inference.features.base import Features
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 from probscene.threads import cores
 
 from ..files import write_json
+from ..labelling.few import FewLabels, labels_record, read_few
 from ..loading import lasting_reference, load_model
 from ..model_check import QUICK, check_model
 from ..modules import file_digest
 from ..progress import Display
 from .fit import check_target, fit, open_target
 from .parts import Parts, in_memory, is_file_part, part_file
-from .presets import Preset
+from .presets import Preset, takers_of_labels
 from .run import RunFolder
 from .storage import check_free
 
@@ -63,6 +65,7 @@ def begin(
     assets: Path | None = None,
     parts: Parts | None = None,
     make: type[RunFolder] = RunFolder,
+    labels: Path | None = None,
 ) -> tuple[RunFolder, Images]:
     """A new run; nothing is written before the model, the target and every image in it are found to be good.
 
@@ -72,10 +75,11 @@ def begin(
         assets: a folder that the model is drawn with.
         parts: what the user brought as objects.
         make: the class of the run.
+        labels: of some of the target's images, see ``read_few``.
 
     Raises:
-        ProbsceneError: a number of threads that is not positive; see also ``checked_model``, ``open_images``,
-            ``check_target`` and ``RunFolder.create``.
+        ProbsceneError: a number of threads that is not positive, labels for features that take none; see also
+            ``checked_model``, ``open_images``, ``check_target``, ``read_few`` and ``RunFolder.create``.
     """
     if threads is not None and threads < 1:
         raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
@@ -97,12 +101,18 @@ def begin(
         record["parts"] = {str(file): file_digest(file) for file in sorted(files)}
     # Built before the folder is, so that a wrong one leaves none behind.
     run = make(out, record, loaded, parts)
+    few = None
+    if labels is not None:
+        record["labels"] = labels_record(labels)
+        check_takes_labels(run.features)
+        few = read_few(labels, loaded, images)
+        _say_notes(few, show)
     seed_everything(batch_seed(seed, 0))
     net = run.build_network()
     if is_file_part(preset.guide) or (parts is not None and parts.guide is not None):
         run.new_guide()
     run = make.create(out, model, record, assets, loaded, parts)
-    run.built = net
+    run.built, run.few = net, few
     return run, images
 
 
@@ -115,6 +125,7 @@ def resume(
     assets: Path | None = None,
     parts: Parts | None = None,
     make: type[RunFolder] = RunFolder,
+    labels: Path | None = None,
     **settings: Any,
 ) -> tuple[RunFolder, Images | None]:
     """A run that was begun, and its images; no images where the fit is finished.
@@ -124,20 +135,23 @@ def resume(
             settings are ``seed``, ``skip_bad`` and ``threads``. A model and images in memory are taken as they are.
         parts: what the user brought as objects.
         make: the class of the run.
+        labels: those that it was begun with, where they are not None.
 
     Raises:
-        RunError: there is no run, or it was begun with something else.
-        DataError: see ``ImageFolder``.
+        RunError: there is no run, or it was begun with something else, or its labels have changed.
+        DataError: see ``ImageFolder`` and ``read_few``.
     """
     run = make.at(out, model if isinstance(model, SceneModel) else None, parts)
     given = {
         "model": in_memory(model.name) if isinstance(model, SceneModel) else model and lasting_reference(model),
         "target": None if target is None else _lasting_target(target) or "images in memory",
         "assets_folder": None if assets is None else os.path.abspath(assets),
+        "labels": None if labels is None else str(Path(labels).resolve()),
         **settings,
     }
     given = {key: value for key, value in given.items() if value is not None}
-    before = {key: run.record.get(key) for key in given}
+    begun = {**run.record, "labels": run.record.get("labels", {}).get("path")}
+    before = {key: begun.get(key) for key in given}
     if "target" in before:
         before["target"] = before["target"] or "images in memory"
     if preset is not None:  # field by field, so that the message names the one that differs
@@ -152,9 +166,11 @@ def resume(
     if run.is_finished:
         return run, None
     if run.record["target"] is None and target is not None:
-        return run, open_images(target, run.model, run.record["skip_bad"], show)
-    images = open_target(run, show)
-    _say_notes(images, show)
+        images = open_images(target, run.model, run.record["skip_bad"], show)
+    else:
+        images = open_target(run, show)
+        _say_notes(images, show)
+    run.few = _same_labels(run, images)
     return run, images
 
 
@@ -171,7 +187,7 @@ def carry_out(
     """
     before = timing(run)
     try:
-        fit(run, show, target, cache, use_cache, show.say)
+        fit(run, show, target, cache, use_cache, show.say, run.few)
     finally:
         spent = {stage: before.get(stage, 0.0) + show.seconds.get(stage, 0.0) for stage in STAGES}
         write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
@@ -204,9 +220,37 @@ def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display
     return images
 
 
-def _say_notes(images: Images, show: Display) -> None:
-    for note in images.notes:
+def _say_notes(about: Images | FewLabels, show: Display) -> None:
+    for note in about.notes:
         show.say(f"Note: {note}")
+
+
+def check_takes_labels(features: Features) -> None:
+    """See that features can make use of labels.
+
+    Raises:
+        ProbsceneError: they cannot.
+    """
+    if not features.takes_labels:
+        able = " or ".join(f"--features {name}" for name in takers_of_labels())
+        raise ProbsceneError(
+            f"Expected features that labels can calibrate, actual {features.name!r}, which take none; "
+            f"{f'add {able}, or ' if able else ''}leave out the labels."
+        )
+
+
+def _same_labels(run: RunFolder, images: Images) -> FewLabels | None:
+    """The labels that a run was begun with."""
+    kept = run.record.get("labels")
+    if kept is None:
+        return None
+    path = Path(kept["path"])
+    if labels_record(path) != kept:
+        raise RunError(
+            f"Expected the labels in {path} as they were when the run in {run.path} was begun, actual others; put them "
+            "back, or begin a new run."
+        )
+    return read_few(path, run.model, images)
 
 
 def _is_folder(target: Target) -> TypeGuard[Path]:

@@ -12,10 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from probscene.app.evaluation.evaluate import evaluate, network_counts
-from probscene.app.evaluation.labels import Labels, counts_of_dataset, read_counts, write_counts
+from probscene.app.evaluation.labels import Labels, counts_of_dataset
 from probscene.app.evaluation.sources import Source
 from probscene.app.evaluation.structure_counts import StructureCounts, sampled
 from probscene.app.fitting.run import RunFolder
+from probscene.app.labelling.counts import read_table, write_counts
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
@@ -133,13 +134,13 @@ def test_labels_are_read_back_in_any_order_of_rows_and_columns(target, tmp_path,
     images = opened(target.images)
     names = [file.name for file in images.paths]
     write_counts(tmp_path / "c.csv", names, target.counts, CLASSES)
-    assert np.array_equal(read_counts(tmp_path / "c.csv", CLASSES, images), target.counts)
+    assert np.array_equal(read_table(tmp_path / "c.csv", CLASSES, images).counts, target.counts)
     head, *rows = [line.split(",") for line in (tmp_path / "c.csv").read_text().splitlines()]
     rng.shuffle(rows)
     order = rng.sample(range(3), 3)
     text = ("\r\n" if windows else "\n").join(",".join(row[i] for i in order) for row in [head, *rows])
     (tmp_path / "d.csv").write_bytes((b"\xef\xbb\xbf" if bom else b"") + text.encode())
-    assert np.array_equal(read_counts(tmp_path / "d.csv", CLASSES, images), target.counts)
+    assert np.array_equal(read_table(tmp_path / "d.csv", CLASSES, images).counts, target.counts)
 
 
 def changed(line: int, text: str | None):
@@ -152,7 +153,8 @@ def changed(line: int, text: str | None):
 
 LABELS = {
     "no class": (lambda lines: [line.split(",")[0] for line in lines], "image,red,blue"),
-    "another class": (changed(0, "image,red,green"), "image,red,blue", "image,red,green"),
+    "another class": (changed(0, "image,pink,green"), "image,red,blue", "pink, green"),
+    "another case": (changed(0, "image,red,Blue"), "'Blue'", "did you mean 'blue'"),
     "no image column": (changed(0, "name,red,blue"), "image,red,blue"),
     "no header": (changed(0, None), "image,red,blue"),
     "nothing": (lambda lines: [], "actual none"),
@@ -186,17 +188,17 @@ def test_labels_that_are_no_text_or_not_there(target, tmp_path):
     images = opened(target.images)
     (tmp_path / "c.csv").write_bytes(b"image,red,blue\n\xff\xfe")
     with pytest.raises(DataError, match="UTF-8"):
-        read_counts(tmp_path / "c.csv", CLASSES, images)
+        read_table(tmp_path / "c.csv", CLASSES, images)
     for path in (tmp_path, tmp_path / "none.csv"):
         with pytest.raises(DataError, match="Expected a file of labels"):
-            read_counts(path, CLASSES, images)
+            read_table(path, CLASSES, images)
 
 
 def test_rows_of_bad_files_are_passed_over(target, tmp_path):
     shutil.copytree(target.images, tmp_path / "images")
     (tmp_path / "images" / "000005.png").write_bytes(b"bad")
     images = ImageFolder(tmp_path / "images", (64, 64), 3, skip_bad=True)
-    assert np.array_equal(read_counts(target.labels, CLASSES, images), np.delete(target.counts, 5, 0))
+    assert np.array_equal(read_table(target.labels, CLASSES, images).counts, np.delete(target.counts, 5, 0))
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=30))

@@ -11,9 +11,10 @@ from probscene.app.evaluation import judge as verdict
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.judge import judge
 from probscene.app.evaluation.label_agreement import agreement
-from probscene.app.evaluation.labels import counts_of_dataset, read_labels, write_counts
+from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
 from probscene.app.fitting.run import RunFolder
+from probscene.app.labelling.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError

@@ -57,8 +57,11 @@ def test_columns_that_are_no_classes_are_refused(labels, fitted, target):
     assert np.array_equal(read_labels(file, model, images).structures.counts[:, 0], target.counts[:, labels[1]])
     header, *rows = file.read_text().split()
     for columns, part in (
-        ("image,green", "red,blue"), (f"{header},green", "green"), (f"name,{header[6:]}", "name"), ("image", "red,blue")
-    ):  # fmt: skip
+        ("image,green", "red,blue"),
+        (f"{header},{header[6:]}", header),
+        (f"name,{header[6:]}", "name"),
+        ("image", "red,blue"),
+    ):
         file.write_text("\n".join([columns, *rows]))
         with pytest.raises(DataError, match=rf"^Expected the columns image,.*{part}"):
             read_labels(file, model, images)

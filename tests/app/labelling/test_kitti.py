@@ -15,11 +15,11 @@ from PIL import Image
 from pycocotools.coco import COCO
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.datasets.kitti_labels import read_kitti, read_objects
 from probscene.app.evaluation.labels import SEEN, Labels, read_labels
 from probscene.app.evaluation.structure_counts import StructureCounts, sampled
 from probscene.app.evaluation.visible import SHOWN, counted, shown
 from probscene.app.fitting.run import RunFolder
+from probscene.app.labelling.kitti import read_kitti, read_objects
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
@@ -37,7 +37,7 @@ def line(type, height=30.0, left=10.0, top=100.0) -> str:
 def images(folder, names) -> SimpleNamespace:
     """Of an ``ImageFolder``, the paths, the files' sizes, and that nothing is cut."""
     paths = [Path(folder, name) for name in names]
-    alike = {"windows": [None] * len(names), "sizes": [(375, 1242)] * len(names)}
+    alike = {"windows": [None] * len(names), "sizes": [(375, 1242)] * len(names), "canvas": (188, 621)}
     return SimpleNamespace(path=Path(folder), paths=paths, bad={}, **alike)
 
 
@@ -47,7 +47,8 @@ def test_counts_are_those_of_the_lines(tmp_path_factory, frames):
     for i, types in enumerate([*frames, ["Car"]]):  # the last one is of no image
         (folder / f"{i:06d}.txt").write_text("".join(line(type) + "\n" for type in types))
     target = images("x", [f"{i:06d}.{('png', 'jpg')[i % 2]}" for i in range(len(frames))])
-    counts, classes, notes = read_kitti(folder, STREET, target)
+    read = read_kitti(folder, STREET, target)
+    counts, classes, notes = read.counts, read.classes, read.notes
     assert classes == ("car", "pedestrian", "bike", "truck")  # nobody labels trees
     assert counts.tolist() == [[sum(CLASS.get(t) == c for t in types) for c in classes] for types in frames]
     out = Counter(type for types in frames for type in types if type in OTHERS)
@@ -60,8 +61,9 @@ def test_low_objects_are_counted_only_where_not_said_otherwise(tmp_path):
     (tmp_path / "a.txt").write_text("\n".join(line("Car", height) for height in (10, 24.9, 25, 60)))
     (tmp_path / "b.txt").write_text(line("DontCare", 3) + "\r\n\n")
     target = images("x", ["a.png", "b.png"])
-    assert read_kitti(tmp_path, STREET, target)[0][:, 0].tolist() == [4, 0]
-    counts, _, notes = read_kitti(tmp_path, STREET, target, min_height=25)
+    assert read_kitti(tmp_path, STREET, target).counts[:, 0].tolist() == [4, 0]
+    read = read_kitti(tmp_path, STREET, target, min_height=25)
+    counts, notes = read.counts, read.notes
     assert counts[:, 0].tolist() == [2, 0] and "2 objects of less than 25 pixels" in notes[-1]
 
 
@@ -71,7 +73,8 @@ def test_objects_whose_middle_is_cut_away_are_not_counted(tmp_path):
     assert tuple(target.windows[0]) == (50, 0, 200, 400)
     middles = (48, 49.4, 49.5, 150, 249.4, 249.5, 260)  # the upper row's own is 0
     (tmp_path / "a.txt").write_text("\n".join(f"Car 0 0 0 10 {y - 4} 50 {y + 4} {REST}" for y in middles))
-    counts, _, notes = read_kitti(tmp_path, STREET, target)
+    read = read_kitti(tmp_path, STREET, target)
+    counts, notes = read.counts, read.notes
     assert counts[0, 0] == 3
     assert notes == ("4 objects that lie where images are cut are not counted.",)
 
@@ -85,13 +88,13 @@ def test_boxes_of_images_of_another_size_are_refused(tmp_path):
             with pytest.raises(DataError, match=r"image of 1242x375 in .*a\.txt, actual .*of another size"):
                 read_kitti(tmp_path, STREET, target)
         else:
-            assert read_kitti(tmp_path, STREET, target)[0][0, 0] == 2
+            assert read_kitti(tmp_path, STREET, target).counts[0, 0] == 2
 
 
 def test_names_of_the_model_go_first(tmp_path):
     (tmp_path / "a.txt").write_text("\n".join(map(line, ("Pedestrian", "Person_sitting", "Person_sitting"))))
     model = SimpleNamespace(name="m", classes=("person", "Person_Sitting"))
-    assert read_kitti(tmp_path, model, images("x", ["a.png"]))[0].tolist() == [[1, 2]]
+    assert read_kitti(tmp_path, model, images("x", ["a.png"])).counts.tolist() == [[1, 2]]
 
 
 def test_images_without_a_file_are_left_out_only_where_some_are_labelled(tmp_path):
@@ -99,7 +102,7 @@ def test_images_without_a_file_are_left_out_only_where_some_are_labelled(tmp_pat
     target = images("x", ["a.png", "b.png", "c.png"])
     with pytest.raises(DataError, match="actual none named a.txt and 1 more"):
         read_kitti(tmp_path, STREET, target)
-    assert read_kitti(tmp_path, STREET, target, some=True)[0].tolist() == [[1, 0, 0, 0]]
+    assert read_kitti(tmp_path, STREET, target, some=True).counts.tolist() == [[1, 0, 0, 0]]
     (tmp_path / "b.txt").unlink()
     with pytest.raises(DataError, match="actual none named a.txt and 2 more"):
         read_kitti(tmp_path, STREET, target, some=True)
@@ -227,7 +230,8 @@ def test_the_benchmarks_own_labels(data_dir, tmp_path):
         known = {row["frame"]: row for row in csv.DictReader(file)}
     frames = sorted(path.stem for path in (folder / "label_2").iterdir())
     model = SimpleNamespace(name="kitti", classes=("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist"))
-    counts, classes, _ = read_kitti(folder / "label_2", model, images("x", [f"{frame}.jpg" for frame in frames]))
+    read = read_kitti(folder / "label_2", model, images("x", [f"{frame}.jpg" for frame in frames]))
+    counts, classes = read.counts, read.classes
     assert counts.tolist() == [[int(known[frame][name]) for name in classes] for frame in frames]
     (tmp_path / "Kitti" / "raw").mkdir(parents=True)
     (tmp_path / "Kitti" / "raw" / "training").symlink_to(folder)

@@ -13,13 +13,11 @@ from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from probscene.dataset import Images
-from probscene.decoding import Window
 from probscene.errors import DataError
 from probscene.model import SceneModel
+
+from .boxes import Box, Boxes, on_canvas
 
 COLUMNS = (
     "type", "truncated", "occluded", "alpha", "left", "top", "right", "bottom", "height", "width", "length",
@@ -47,15 +45,6 @@ class Object(NamedTuple):
     right: float
     bottom: float
 
-    def on(self, size: tuple[int, int]) -> bool:
-        """Whether any of it lies on an image of a height and width."""
-        return self.left < size[1] and self.right >= 0 and self.top < size[0] and self.bottom >= 0
-
-    def within(self, seen: Window) -> bool:
-        """Whether its middle is in a part of the image."""
-        x, y = (self.left + self.right + 1) / 2 - seen.left, (self.top + self.bottom + 1) / 2 - seen.top
-        return 0 <= x < seen.width and 0 <= y < seen.height
-
 
 def read_objects(file: Path) -> list[Object]:
     """What a label file says, in the order of its lines.
@@ -75,23 +64,21 @@ def read_objects(file: Path) -> list[Object]:
     ]
 
 
-def read_kitti(
-    folder: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0
-) -> tuple[NDArray[np.int64], tuple[str, ...], tuple[str, ...]]:
-    """The counts ``(L, C)`` of a target's images, the C labelled classes in the model's order, and notes.
+def read_kitti(folder: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Boxes:
+    """The boxes of a target's images.
 
     Files of images that are not in the target are not read, which the notes say.
 
     Args:
         some: there need not be one for every image; those without are left out.
-        min_height: of a box that is counted, pixels.
+        min_height: of a box that is kept, pixels.
 
     Raises:
         DataError: see ``read_objects``; an image without a file, an object beside its image, or no type that the model
             has a class for.
     """
-    files = {path: folder / f"{path.stem}.txt" for path in target.paths}
-    found = {path: read_objects(file) for path, file in files.items() if file.is_file()}
+    files = {i: folder / f"{path.stem}.txt" for i, path in enumerate(target.paths)}
+    found = {i: read_objects(file) for i, file in files.items() if file.is_file()}
     missing = [file.name for file in files.values() if not file.is_file()]
     if missing and not (some and found):
         names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
@@ -107,32 +94,17 @@ def read_kitti(
             f"Expected types in {folder} that model {model.name!r} has classes for ({', '.join(model.classes)}), "
             f"actual {', '.join(occurring) or 'no object'}."
         )
-    counts, small, cut = np.zeros((len(found), len(classes)), np.int64), 0, 0
-    images = dict(zip(target.paths, zip(target.sizes, target.windows, strict=True), strict=True))
-    for row, (path, objects) in zip(counts, found.items(), strict=True):
-        size, seen = images[path]
-        for one in objects:
-            name = of_type[one.type]
-            if name is None:
-                continue
-            if not one.on(size):
-                raise DataError(
-                    f"Expected boxes on the image of {size[1]}x{size[0]} in {files[path]}, actual {one.type} from "
-                    f"{one.left:g}, {one.top:g} to {one.right:g}, {one.bottom:g}; give the labels of these images, not "
-                    "of images of another size."
-                )
-            if seen is not None and not one.within(seen):
-                cut += 1
-            elif one.bottom - one.top < min_height:
-                small += 1
-            else:
-                row[classes.index(name)] += 1
-    notes = [*_unread(folder, target), *_notes(occurring, of_type)]
-    if cut:
-        notes.append(f"{cut} objects that lie where images are cut are not counted.")
-    if small:
-        notes.append(f"{small} objects of less than {min_height:g} pixels' height are not counted.")
-    return counts, classes, tuple(notes)
+    boxes = [
+        [_box(one, name, files[i]) for one in objects if (name := of_type[one.type])] for i, objects in found.items()
+    ]
+    notes = (*_unread(folder, target), *_notes(occurring, of_type))
+    return on_canvas(target, list(found), boxes, classes, notes, min_height)
+
+
+def _box(one: Object, name: str, file: Path) -> Box:
+    """Pixels have numbers, and the last one is part of the box."""
+    height = one.bottom - one.top
+    return Box(name, one.left, one.top, one.right + 1, one.bottom + 1, height, f"in {file}")
 
 
 def _object(fields: list[str], where: str) -> Object:

@@ -1,0 +1,1 @@
+"""Labels that people give of a target's images: counts and boxes, read and checked."""

@@ -1,0 +1,124 @@
+"""``counts.csv``: how many objects of each class an image shows.
+
+The columns are ``image`` and classes of the model, in any order; one row an image, in any order, separated by commas,
+semicolons or tabs. A class that nobody has labelled has no column, or an empty one. A row without any count is of an
+image that nobody has labelled.
+
+    image,0,1,2
+    000000.png,0,2,1
+"""
+
+import csv
+import io
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probscene.dataset import Images
+from probscene.errors import DataError
+
+from ..files import write_text
+from .naming import NamedImages, base_name, labelled_classes
+
+
+class Table(NamedTuple):
+    """The counts of K of a target's images.
+
+    Attributes:
+        rows: the K numbers of the images, ascending.
+        counts: ``(K, C)`` int64.
+        classes: the C that are labelled, in the model's order.
+        notes: what a person should know, one sentence each.
+    """
+
+    rows: list[int]
+    counts: NDArray[np.int64]
+    classes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+def read_table(path: Path, classes: tuple[str, ...], target: Images, some: bool = False) -> Table:
+    """The counts of a target's images. Rows of files that the target left out as bad are passed over.
+
+    Args:
+        classes: the model's.
+        some: there need not be a row with counts for every image; those without are left out.
+
+    Raises:
+        DataError: no such file, no column of a class, two of one name, a row of another length or with some of its
+            counts, an image that is not there, twice there or without a row, or what is not a count; the first is
+            named.
+    """
+    path = Path(path)
+    header, lines = _lines(path)
+    expected = f"the columns {','.join(['image', *classes])}"
+    if header.count("image") != 1 or len(set(header)) != len(header):
+        raise DataError(f"Expected {expected} in {path}, actual {','.join(header) or 'none'}.")
+    found, notes = labelled_classes([name for name in header if name != "image"], classes, expected, path)
+    for number, fields in lines:
+        if len(fields) != len(header):
+            raise DataError(f"Expected {len(header)} fields in line {number} of {path}, actual {len(fields)}.")
+    cells = [(number, dict(zip(header, fields, strict=True))) for number, fields in lines]
+    empty = tuple(name for name in found if cells and not any(row[name] for _, row in cells))
+    if empty and len(empty) < len(found):
+        found = tuple(name for name in found if name not in empty)
+        notes += (f"Not labelled, since its column is empty: {', '.join(empty)}.",)
+    named = NamedImages(path, target, some)
+    for number, row in cells:
+        where, name = f"in line {number} of {path}", base_name(row["image"])
+        counted = any(row[c] for c in found)
+        if not (name or counted) or not named.wanted(name, where) or not counted:
+            continue
+        named.found[name] = [_count(row[c], c, name, where) for c in found]
+    rows = named.rows()
+    return Table(rows, np.array(named.ordered(), np.int64).reshape(len(rows), len(found)), found, notes)
+
+
+def write_counts(path: Path, names: list[str], counts: NDArray[np.int64], classes: tuple[str, ...]) -> None:
+    """A ``counts.csv`` of ``counts (L, C)``, whole or not at all."""
+    write_cells(path, [[name, *map(str, row)] for name, row in zip(names, counts.tolist(), strict=True)], classes)
+
+
+def write_cells(path: Path, rows: list[list[str]], classes: tuple[str, ...]) -> None:
+    """A ``counts.csv`` of rows that begin with an image's name, whole or not at all."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([["image", *classes], *rows])
+    write_text(path, text.getvalue())
+
+
+def text_of(path: Path) -> str:
+    """A file of labels.
+
+    Raises:
+        DataError: there is none, or it is no UTF-8.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise DataError(f"Expected a file of labels at {path}, actual none: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"Expected a text file in UTF-8, actual {path}: {error}.") from error
+
+
+def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The header, and the fields of each further row with its number."""
+    text = text_of(path)
+    first = text.partition("\n")[0]
+    try:
+        rows = list(csv.reader(io.StringIO(text), delimiter=max(",;\t", key=first.count), strict=True))
+    except csv.Error as error:
+        raise DataError(f"Expected a CSV file in UTF-8, actual {path}: {error}.") from error
+    rows = [[field.strip() for field in row] for row in rows]
+    return rows[0] if rows else [], [(number, fields) for number, fields in enumerate(rows[1:], 2) if any(fields)]
+
+
+def _count(text: str, column: str, name: str, where: str) -> int:
+    if not re.fullmatch(r"\+?[0-9]{1,9}", text, re.ASCII):
+        remedy = "write a whole number" if text else "write 0 where there is none, or leave the whole row empty"
+        raise DataError(
+            f"Expected a count of 0 or more for class {column!r} of {name} {where}, actual {text!r}; {remedy}."
+        )
+    return int(text)
