@@ -55,11 +55,15 @@ class FeatureNet(Protocol):
 
     def embed(self, images: Tensor) -> Tensor:
         """Features ``(N, D)`` float32, finite, of images ``(N, C, H, W)`` uint8, N >= 0. Renders come with C = 3;
-        target images with C = 1 where the model's colour carries nothing, else 3."""
+        target images with C = 1 where the model's colour carries nothing, else 3.
+
+        A network may have ``embed_photographs`` beside it, which is then called for target images."""
         ...
 
 
 Draw = Callable[[int], Examples]
+Seen = Callable[[int, int], None]
+"""Told how many images have been looked at, and of how many."""
 
 
 class Renders(Protocol):
@@ -130,8 +134,7 @@ class Features(Protocol):
         name: in records and messages; another name is another choice.
         resolution: features that differ by less count as equal in the verdict, such as 0.5 of a count.
         pretrained: whether the network has learnt from photographs; a verdict then does not advise to take such a one.
-        takes_labels: whether ``training`` makes use of ``Photographs.labelled``; with others ``fit --labels`` is an
-            error.
+        takes_labels: whether ``adapt`` makes use of ``Photographs.labelled``; with others ``fit --labels`` is an error.
     """
 
     name: str
@@ -154,6 +157,19 @@ class Features(Protocol):
             seed: of everything random.
         """
         return None
+
+    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
+        """Suit a trained network to the target's images, in place, such as by choosing how counts are read in them.
+
+        Args:
+            photographs: opens the target; a network that learns from it is bound to it, see ``taught_by``.
+            each: is told how many images have been looked at, and of how many.
+
+        Returns:
+            What was found, for JSON; of features that count, under ``"classes"``, a record of each class with
+            ``"readable"``, ``"because"`` and ``"visible"``, the share of an object that counts.
+        """
+        return {}
 
     def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
         """The divergence that suits the network's features, given the fit's own."""
@@ -234,16 +250,26 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
     return x.float() * (1 / (255 * reduce * reduce))
 
 
+def embed_real(net: FeatureNet, images: Tensor) -> Tensor:
+    """Features ``(L, D)`` of target images, which a network may look at in another way than at renders."""
+    return getattr(net, "embed_photographs", net.embed)(images)
+
+
 @torch.no_grad()
-def embed_all(net: FeatureNet, batches: Iterable[Tensor], each: Callable[[int], None] | None = None) -> Tensor:
+def embed_all(
+    net: FeatureNet, batches: Iterable[Tensor], each: Callable[[int], None] | None = None, real: bool = False
+) -> Tensor:
     """Features ``(L, D)`` of a stream of image batches; ``each`` is told how many more images are done.
+
+    Args:
+        real: whether they are the target's images.
 
     Raises:
         ProbsceneError: a feature is not finite.
     """
     out = []
     for images in batches:
-        out.append(net.embed(images))
+        out.append(embed_real(net, images) if real else net.embed(images))
         if each is not None:
             each(len(images))
     features = torch.cat(out)

@@ -96,7 +96,7 @@ class EfficientNetLite(_Frozen):
         size: of the square whose area images enter with, pixels; 224 is what it was trained at.
 
     Attributes:
-        channels: of the maps of ``places``.
+        channels: of the maps of ``pyramid``.
     """
 
     def __init__(self, size: int = 224):
@@ -107,26 +107,26 @@ class EfficientNetLite(_Frozen):
         # Not the first convolution: its three channels stay as the image has them.
         self.net._blocks.to(memory_format=LAST)
         self.net._conv_head.to(memory_format=LAST)
-        # The last of the blocks at each stride: what comes before a block that halves, and what comes last.
-        halving = [i for i, block in enumerate(self.net._blocks) if block._depthwise_conv.stride[0] == 2]
-        self.coarse_from = halving[-1]
-        self.channels = sum(self.net._blocks[i]._project_conv.out_channels for i in (halving[-1] - 1, -1))
+        # The last of the blocks at strides of 8, 16 and 32: what comes before a block that halves, and what comes last.
+        blocks = self.net._blocks
+        halving = [i for i, block in enumerate(blocks) if block._depthwise_conv.stride[0] == 2]
+        self.parts = [blocks[: halving[-2]], blocks[halving[-2] : halving[-1]], blocks[halving[-1] :]]
+        self.channels = tuple(part[-1]._project_conv.out_channels for part in self.parts)
         self.requires_grad_(False).eval()
 
     def pooled(self, x: Tensor) -> Tensor:
         """``(N, 1280)`` of images that have entered."""
         return self.net.extract_features(x).mean((2, 3))
 
-    def places(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Of images that have entered, ``(N, 3, h, w)``: the last maps at a stride of 16 and, brought to the same
-        places, those at 32, ``(N, channels, h / 16, w / 16)``; and ``pooled``, ``(N, 1280)``."""
+    def pyramid(self, x: Tensor) -> tuple[list[Tensor], Tensor]:
+        """Of images that have entered, ``(N, 3, h, w)``: the last maps at strides of 8, 16 and 32, each ``(N, C, h /
+        stride, w / stride)``; and ``pooled``, ``(N, 1280)``."""
         x = self.net._swish(self.net._bn0(self.net._conv_stem(x)))
-        for block in self.net._blocks[: self.coarse_from]:
-            x = block(x)
-        fine = x
-        for block in self.net._blocks[self.coarse_from :]:
-            x = block(x)
-        maps = torch.cat([fine, F.interpolate(x, fine.shape[2:], mode="bilinear")], 1)
+        maps = []
+        for part in self.parts:
+            for block in part:
+                x = block(x)
+            maps.append(x)
         return maps, self.net._swish(self.net._bn1(self.net._conv_head(x))).mean((2, 3))
 
     @torch.no_grad()

@@ -387,7 +387,7 @@ def test_a_bug_is_one_line_and_a_traceback_on_demand(call, discs, tmp_path, monk
 CHILD = """
 import os, signal, sys
 from probscene.app import cli, files
-from probscene.app.fitting import checkpoints
+from probscene.app.fitting import storage as checkpoints
 
 kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
 checkpoints.SAVE_EVERY = 0.0

@@ -65,7 +65,6 @@ class NetworkCache:
             "parts": record.get("parts", {}),
             "seed": record["seed"],
             "target": target,
-            "labels": record.get("labels", {}).get("sha256", ""),
         }
         self.key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 

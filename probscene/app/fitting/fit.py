@@ -7,7 +7,7 @@ that a feature network may be given.
 
 import json
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -22,6 +22,7 @@ from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
 from probscene.inference.training import Training, batch_seed
+from probscene.policy import Policy
 from probscene.sampling import seed_everything
 from probscene.threads import threads
 
@@ -29,12 +30,12 @@ from ..files import write_text
 from ..labelling.few import FewLabels, PartlyLabelled
 from ..progress import Progress
 from .cache import NetworkCache
-from .checkpoints import Keeper
 from .observer import RENDERED_AT_ONCE, Observer
+from .outcome import conclude
 from .parts import inner
 from .run import RunFolder
 from .scene_features import fingerprint
-from .storage import load_state, state_of
+from .storage import Keeper, load_state, state_of
 
 Say = Callable[[str], None]
 """Told a sentence that a person should know."""
@@ -48,7 +49,7 @@ def fit(
     use_cache: bool = True,
     say: Say | None = None,
     labels: FewLabels | None = None,
-) -> Guide:
+) -> Policy:
     """Finish a run: take the stages that it lacks.
 
     Args:
@@ -74,9 +75,11 @@ def fit(
         real = _real_features(run, net.net, progress, images)
     with threads(1):  # the guide's tensors are tiny: a second thread only waits
         guide = _learn(run, observer, net.net, real, progress)
-    run.write_tensors("guide", guide.state_dict())
+        said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
-    return guide
+    if said and say is not None:
+        say(said)
+    return run.guide
 
 
 class _Network:
@@ -105,10 +108,20 @@ class _Network:
             self._check_taught()
             return
         training = run.features.training(inner(net), self.observer, self.photographs, run.record["seed"])
-        if training is None:
-            run.write_tensors("features", state_of(net))
-            _ready(net)
-            return
+        if training is not None:
+            self._finish(training, folder, use_cache, say)
+        _ready(net)
+        found = run.features.adapt(inner(net), self.photographs, partial(self.progress, "readings"))
+        if found:
+            run.write_readings(found)
+            for name, line in found.get("classes", {}).items():
+                say(f"{name}: {line['because']}.")
+        run.write_tensors("features", state_of(net))
+        (run.path / "features-checkpoint.safetensors").unlink(missing_ok=True)
+
+    def _finish(self, training: Training, folder: Path | None, use_cache: bool, say: Say) -> None:
+        """Load what was trained before from the cache, else train."""
+        run, net = self.run, self.net
         taught = run.features.taught_by(inner(net))
         kept = NetworkCache(run, inner(net), folder, taught) if use_cache else None
         cached = None if kept is None else kept.load()
@@ -120,9 +133,6 @@ class _Network:
             lines = self._train(training)
             if kept is not None:
                 kept.save(state_of(net), lines)
-        run.write_tensors("features", state_of(net))
-        (run.path / "features-checkpoint.safetensors").unlink(missing_ok=True)
-        _ready(net)
 
     def _train(self, training: Training) -> list[str]:
         keep = Keeper(self.run, "features", training)
@@ -174,7 +184,9 @@ def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: 
         progress("target", done, views * len(images), "")
 
     check_target(images)
-    features, *others = (embed_all(net, images.batches(RENDERED_AT_ONCE, view), each) for view in range(views))
+    features, *others = (
+        embed_all(net, images.batches(RENDERED_AT_ONCE, view), each, real=True) for view in range(views)
+    )
     check_features(features)
     kept = {"features": features, "fingerprint": fingerprint(images)}
     run.write_tensors("real", kept | ({"views": torch.cat(others)} if others else {}))

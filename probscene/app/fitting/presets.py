@@ -7,8 +7,9 @@ from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
 from probscene.inference.features.base import Features
 from probscene.inference.features.counting.batches import CountSchedule
-from probscene.inference.features.counting.choices import COUNT_ON_PRETRAINED, CountFeatures, PretrainedCountFeatures
+from probscene.inference.features.counting.choices import CountFeatures
 from probscene.inference.features.names import PRETRAINED, network_name
+from probscene.inference.features.photographs.choices import COUNT_ON_PRETRAINED, PretrainedCountFeatures
 from probscene.inference.features.presence import PresenceFeatures
 from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.guides.lstm import GUIDES

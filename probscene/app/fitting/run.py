@@ -13,6 +13,7 @@ from probscene.inference.guides.base import Guide
 from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.model import SceneModel
+from probscene.policy import Policy
 from probscene.scenarios import JointGrammar
 
 from ..files import make_folder, write_json, write_whole
@@ -33,6 +34,9 @@ from .parts import (
 )
 from .presets import Preset
 from .storage import FORMAT, Storage, check_free, load_state, read_record
+
+
+PRIOR_KEPT = "prior_kept"  # the only tensor of a guide that was given up
 
 
 class RunFolder(Storage):
@@ -248,8 +252,8 @@ class RunFolder(Storage):
         return made if make is None else check_guide(made, model.max_steps)
 
     @cached_property
-    def guide(self) -> Guide:
-        """The learnt guide.
+    def guide(self) -> Policy:
+        """The learnt guide; the model's prior where what was learnt is farther from the target, see ``outcome``.
 
         Raises:
             RunError: the fit is not finished, or the file does not hold this run's guide.
@@ -257,6 +261,8 @@ class RunFolder(Storage):
         tensors = self.read_tensors("guide")
         if tensors is None:
             raise RunError(f"Expected a finished fit in {self.path}, actual an unfinished one; go on with --resume.")
+        if PRIOR_KEPT in tensors:
+            return self.model.prior
         guide = self.new_guide()
         try:
             guide.load_state_dict(tensors)

@@ -72,7 +72,7 @@ def features_in(run: RunFolder, images: Images, net: FeatureNet, each: Each | No
         ProbsceneError: a feature is not finite.
     """
     with threads(run.record["threads"]):
-        return embed_all(net, images.batches(RENDERED_AT_ONCE), each)
+        return embed_all(net, images.batches(RENDERED_AT_ONCE), each, real=True)
 
 
 def own_net(run: RunFolder) -> FeatureNet:

@@ -33,7 +33,7 @@ from .run import RunFolder
 from .storage import check_free
 
 TIMING = "timing.json"
-STAGES = ("reading", "features", "target", "pretraining", "structure")
+STAGES = ("reading", "features", "readings", "target", "pretraining", "structure", "outcome")
 
 Target = Path | str | Sequence[Path | str] | Any
 """A folder, a list of files, an array or a dataset of images, see ``open_images``."""

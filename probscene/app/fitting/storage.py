@@ -4,6 +4,8 @@
     model.py               a copy of the model's file, where it is not a built-in one
     guide.safetensors      the learnt guide; there once the fit is finished
     features.safetensors   the feature network
+    readings.json          how its features are read in the target's images, where they are suited to them
+    outcome.json           how far prior and learnt scenes are from the target, and which are kept
     real.safetensors       features of the target images
     log.jsonl              one line an update
     checkpoint.safetensors what ``--resume`` goes on from
@@ -12,6 +14,7 @@ All are written aside and renamed.
 """
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +24,15 @@ from torch import Tensor, nn
 
 from probscene.errors import DataError, RunError
 from probscene.inference.features.base import FeatureNet
+from probscene.inference.training import Training
 
-from ..files import write_whole
+from ..files import write_json, write_text, write_whole
 from ..modules import file_digest
 from .parts import IN_MEMORY, inner
 
-FORMAT = 3  # of the run folder; another number is not read
+FORMAT = 4  # of the run folder; another number is not read
+READINGS, OUTCOME = "readings.json", "outcome.json"
+SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
 KEYS = {"model", "model_sha256", "assets"}  # that every run.json has
 
 
@@ -59,6 +65,33 @@ class Storage:
         words |= {"divergence": preset.get("objective", ""), "guide": record.get("guide", {}).get("kind", "")}
         return {name: word[len(IN_MEMORY) :] for name, word in words.items() if word.startswith(IN_MEMORY)}
 
+    @property
+    def readings(self) -> dict[str, Any]:
+        """What the features found when they were suited to the target's images, see ``Features.adapt``; empty where
+        they are as they were trained."""
+        return self._read_json(READINGS)
+
+    def write_readings(self, found: dict[str, Any]) -> None:
+        """Keep what ``readings`` gives."""
+        write_json(self.path / READINGS, found)
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """How far prior and learnt scenes are from the target, and which are kept; empty for runs of earlier
+        versions."""
+        return self._read_json(OUTCOME)
+
+    def write_outcome(self, found: dict[str, Any]) -> None:
+        """Keep what ``outcome`` gives."""
+        write_json(self.path / OUTCOME, found)
+
+    def _read_json(self, name: str) -> dict[str, Any]:
+        file = self.path / name
+        try:
+            return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        except ValueError as error:
+            raise RunError(f"Expected JSON in {file}, actual a damaged file ({error}); fit again.") from error
+
     def read_tensors(self, name: str) -> dict[str, Tensor] | None:
         """The tensors of ``name.safetensors``, or None where there is no such file.
 
@@ -71,6 +104,43 @@ class Storage:
     def write_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write ``name.safetensors``, whole or not at all."""
         save_tensors(self.path / f"{name}.safetensors", tensors)
+
+
+class Keeper:
+    """Checkpoints of one training, at most every ``SAVE_EVERY`` seconds, with the lines of the log that belong to them.
+
+    The log is written before the checkpoint, and lines past the checkpoint are dropped when a run goes on.
+    """
+
+    def __init__(self, run: Storage, name: str, training: Training):
+        self.run, self.name, self.training = run, f"{name}-checkpoint", training
+        self.log = run.path / "log.jsonl"
+        self.lines = self.log.read_text(encoding="utf-8").splitlines() if self.log.exists() else []
+        self.saved = time.monotonic()
+        tensors = run.read_tensors(self.name)
+        if tensors is not None:
+            training.restore(tensors)
+        stage = {"features": "features", "guide": "structure"}[name]
+        self.lines = [line for line in self.lines if not self._is_past(json.loads(line), stage)]
+
+    def __call__(self, line: dict[str, float | str] | None) -> None:
+        """After some steps; ``line`` is what the log has of them, None for nothing."""
+        if line is not None:
+            self.lines.append(json.dumps(line))
+        if time.monotonic() - self.saved > SAVE_EVERY:
+            self._save()
+            self.saved = time.monotonic()
+
+    def finish(self) -> None:
+        """Write the log to its end."""
+        write_text(self.log, "".join(f"{line}\n" for line in self.lines))
+
+    def _save(self) -> None:
+        self.finish()
+        self.run.write_tensors(self.name, self.training.state())
+
+    def _is_past(self, line: dict, stage: str) -> bool:
+        return line["stage"] == stage and line.get("step", line.get("batch", 0)) > self.training.done
 
 
 def check_free(path: Path) -> None:

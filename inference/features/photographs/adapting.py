@@ -1,0 +1,103 @@
+"""Suiting a ``PretrainedCountNet`` to photographs: a rule for each class, and which features are compared.
+
+Axis letters: L photographs, K labelled images, S shares, R rules, C classes, d directions.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..base import Photographs, Seen
+from .heads import PLACE, SMALLEST, PretrainedCountNet
+from .readability import Read, Reading, with_labels, without_labels
+from .reading import RULES, SHARES
+
+LOOKED_AT_ONCE = 64  # images
+AMONG = 1.0  # standard deviations of renders, in a direction, that photographs may lie from their mean
+
+
+def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Seen) -> dict[str, Any]:
+    """Choose rules, shares and what is compared, in place.
+
+    Args:
+        net: with trained heads.
+        most: photographs that are looked at, beside the labelled ones.
+        each: see ``Features.adapt``.
+
+    Returns:
+        ``"classes"``: a record of each; ``"directions"``: which are compared.
+    """
+    images, labelled = photographs.some(most), photographs.labelled
+    marked = images[:0] if labelled is None else labelled.images
+    total = len(images) + len(marked)
+    whole, by_head, directions = _look(net, images, 0, total, each)
+    of_labelled = _look(net, marked, len(images), total, each)[0] if len(marked) else whole[:0]
+    read = Read(whole, of_labelled, by_head, net.held_read, net.held_true)
+    counts = {} if labelled is None else dict(zip(labelled.classes, labelled.counts.T, strict=True))
+    records: dict[str, Any] = {}
+    for c, name in enumerate(net.classes):
+        if net.size[c] < SMALLEST:
+            found = without_labels(read, c)._replace(readable=False, because=_too_small(net, c))
+        elif name in counts:
+            found = with_labels(read, c, counts[name])
+        else:
+            found = without_labels(read, c)
+        _keep(net, c, found)
+        records[name] = _record(net, c, found)
+    usual, spread = net.usual
+    among = (directions.mean(0) - usual).abs() <= AMONG * spread
+    net.compared[len(net.classes) :] = among
+    net.taught_by.copy_(torch.tensor(list(bytes.fromhex(photographs.fingerprint)), dtype=torch.uint8))
+    return {"classes": records, "directions": among.tolist()}
+
+
+def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: Seen) -> tuple[Tensor, Tensor, Tensor]:
+    """Readings ``(L, S, R, C)``, those of each head ``(heads, L, R, C)`` and directions ``(L, d)``."""
+    parts = []
+    for some in images.split(LOOKED_AT_ONCE):
+        maps, pooled = net.look(some)
+        parts.append((*net.readings(maps), (pooled - net.projected_mean) @ net.projected_weight))
+        done += len(some)
+        each(done, total)
+    whole, by_head, directions = zip(*parts, strict=True)
+    return torch.cat(whole), torch.cat(by_head, 1), torch.cat(directions)
+
+
+def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:
+    net.rules[1, c], net.share[c] = found.rule, found.share
+    if found.share:
+        error = (net.held_read[:, found.share, :, c] - net.held_true[:, found.share, None, c]).abs().mean(0)
+        net.rules[0, c] = error.argmin()
+    net.steps[c] = torch.inf
+    net.steps[c, : len(found.steps)] = torch.tensor(found.steps)
+    net.compared[net.order.index(c)] = found.readable
+
+
+def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:
+    """For JSON."""
+    return {
+        "readable": found.readable,
+        "because": found.because,
+        "by": found.by,
+        "rule": str(RULES[found.rule]),
+        "visible": SHARES[found.share],
+        "mean": found.mean,
+        "disagreement": found.disagreement,
+        "change": found.change,
+        "skill": found.skill,
+        "error": found.error if found.error == found.error else None,
+        "pixels": float(net.size[c]) * PLACE,
+    }
+
+
+def _too_small(net: PretrainedCountNet, c: int) -> str:
+    pixels, needed = float(net.size[c]) * PLACE, SMALLEST * PLACE
+    height, width = net.canvas
+    entering = net.frozen[0].entering(height, width)
+    scale = needed / pixels * 1.1
+    if entering[0] >= 0.9 * height:
+        remedy = f"a canvas of at least {round(height * scale)} x {round(width * scale)} pixels shows it"
+    else:
+        remedy = "cut the photographs into parts"
+    return f"not readable, {pixels:.1f} pixels of what the network sees where {needed:.1f} are needed: {remedy}"

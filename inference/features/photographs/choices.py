@@ -1,0 +1,81 @@
+"""The choice of features that count in photographs."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+from probscene.model import SceneModel
+
+from ...divergence import Blockwise, Divergence
+from ...training import Training, batch_seed
+from ..base import FeatureNet, Features, Photographs, Renders, Seen
+from ..counting.choices import slow_settings
+
+if TYPE_CHECKING:
+    from .heads import PretrainedCountNet
+
+COUNT_ON_PRETRAINED = "count=efficientnet"
+
+
+@dataclass(frozen=True)
+class PretrainedCountFeatures(Features):
+    """``PretrainedCountNet``: heads trained on renders; how they are read in photographs is chosen by the photographs,
+    and by a few labels where there are such.
+
+    Args:
+        pairs: structures that are drawn twice.
+        epochs: of the heads.
+        photographs: images of the target, at most, by which rules are chosen.
+        directions: of the projection that stands beside the counts.
+        scenes: in a batch of the fit, for which the unit of the counts is chosen.
+    """
+
+    pairs: int = 1000
+    epochs: int = 8
+    photographs: int = 500
+    directions: int = 8
+    scenes: int = 150
+
+    name = COUNT_ON_PRETRAINED
+    pretrained = True
+    takes_labels = True
+
+    def build(self, model: SceneModel) -> FeatureNet:
+        """Pretrained, with untrained heads."""
+        from .heads import PretrainedCountNet  # torchvision takes seconds to import
+
+        return PretrainedCountNet(model.classes, self.directions, model.canvas, model.stuff, self.scenes)
+
+    def training(
+        self, net: FeatureNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
+    ) -> Training:
+        """On renders of what guides are pretrained on: of the prior's few cars a head would learn that there are few,
+        and in photographs it must read many."""
+        from .training import PretrainedCountTraining
+
+        heads, seed = cast("PretrainedCountNet", net), batch_seed(seed, 1)
+        return PretrainedCountTraining(heads, renders.draw_twice, self.pairs, self.epochs, seed=seed)
+
+    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
+        """Choose how each class is read, and which directions lie among the renders'."""
+        from .adapting import adapt
+
+        return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, each)
+
+    def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
+        """Of things as chosen, of stuff none, of directions without marginals: photographs often lie beyond all renders
+        in one, where what is nearest is not what has as many cars."""
+        joint = replace(cast(Any, chosen), marginal_variance=None) if hasattr(chosen, "marginal_variance") else chosen
+        return Blockwise(cast("PretrainedCountNet", net).blocks, (chosen, None, joint))
+
+    def taught_by(self, net: FeatureNet) -> str:
+        """The images by which rules were chosen."""
+        return cast("PretrainedCountNet", net).taught_by_fingerprint
+
+    def settings(self, preset: Any) -> dict[str, Any]:
+        """Photographs' counts are noisy, and few: a prior, where there is one, holds them more. Those of things do lie
+        among the renders', and a bounded objective bears their marginals. After 40 batches costs still fall."""
+        weight = max(preset.prior_kl_weight, 0.1) if preset.prior_kl_weight else 0.0
+        single = 0.25 if preset.objective == "js" else None
+        few = {"marginal_variance": single, "pairs": 1000, "prior_kl_weight": weight, "batches": 60}
+        return slow_settings(preset) | few

@@ -1,0 +1,83 @@
+"""Rules by which counts are read from the probabilities that a network gives to the places of an image.
+
+On renders nearly any rule counts right. In photographs a network gives too little probability to some objects that are
+there and a little to many that are not, and by how much differs from class to class, so that each class needs a rule
+of its own. Axis letters: N images, C classes, h w places, R rules.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+class Rule(NamedTuple):
+    """One way to read counts.
+
+    Attributes:
+        name: ``"sum"``, ``"soft"`` or ``"peaks"``.
+        window: the side, in places, of the square in which an object's probability is summed.
+        nothing: of which probability on something is counted.
+        whole: from which probability on an object counts as one, with a smooth transition; for ``"soft"`` alone.
+    """
+
+    name: str
+    window: int = 3
+    nothing: float = 0.0
+    whole: float = 0.0
+
+    def __str__(self) -> str:
+        if self.name == "sum":
+            return "the sum of probabilities"
+        around = f"in {self.window} x {self.window} places"
+        if self.name == "peaks":
+            return f"peaks above {self.nothing:g} {around}"
+        return f"objects from {self.nothing:g} to {self.whole:g} {around}"
+
+
+SHARES = (0.25, 0.6, 0.9)  # an object counts if at least so much of it is visible
+THRESHOLDS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.8)
+SOFT = ((0.03, 0.2), (0.05, 0.3), (0.1, 0.5), (0.2, 0.7), (0.4, 0.8), (0.6, 1.0))
+PEAKS = tuple(Rule("peaks", 3, threshold) for threshold in THRESHOLDS)
+RULES = (Rule("sum"), *(Rule("soft", window, *limits) for window in (3, 5) for limits in SOFT), *PEAKS)
+
+
+def read(probability: Tensor, rule: Rule) -> Tensor:
+    """Counts ``(N, C)`` by one rule.
+
+    Args:
+        probability: ``(N, C, h, w)``, that a place is the middle of an object.
+    """
+    if rule.name == "sum":
+        return probability.sum((2, 3))
+    mass = rule.window**2 * F.avg_pool2d(probability, rule.window, 1, rule.window // 2)
+    if rule.name == "peaks":
+        top = F.max_pool2d(mass, 3, 1, 1) == mass
+        return (top & (mass > rule.nothing)).float().sum((2, 3))
+    part = ((mass - rule.nothing) / (rule.whole - rule.nothing)).clamp(0, 1)
+    whole = (1 / mass.clamp(min=rule.nothing)).clamp(min=1.0)
+    return (probability * part.square() * (3 - 2 * part) * whole).sum((2, 3))
+
+
+def read_all(probability: Tensor) -> Tensor:
+    """Counts ``(N, R, C)`` by every rule of ``RULES``."""
+    return torch.stack([read(probability, rule) for rule in RULES], 1)
+
+
+def read_each(probability: Tensor, rules: Tensor) -> Tensor:
+    """Counts ``(N, C)``, each class by its own rule.
+
+    Args:
+        rules: ``(C,)`` int64, of ``RULES``.
+    """
+    counts = probability.new_zeros(probability.shape[:2])
+    for rule in rules.unique().tolist():
+        which = rules == rule
+        counts[:, which] = read(probability[:, which], RULES[rule])
+    return counts
+
+
+def by_steps(counts: Tensor, steps: Tensor) -> Tensor:
+    """How many of the ``steps (C, K)`` each count of ``(N, C)`` reaches; as it is where the first step is infinite."""
+    return torch.where(steps[:, 0].isinf(), counts, (counts[..., None] >= steps).sum(-1).float())

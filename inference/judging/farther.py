@@ -1,0 +1,61 @@
+"""Is one sample farther from the real one than another, beyond chance?
+
+Axis letters: N, P generated, L real, D features, R resamples.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from .two_sample import Features
+
+RESAMPLES, SURE = 200, 0.9
+EXAMINED = 1000  # rows of each sample
+
+
+class Farther(NamedTuple):
+    """Two distances from the same real sample.
+
+    Attributes:
+        one, other: energy distances.
+        share: of the resamples in which one is the larger.
+    """
+
+    one: float
+    other: float
+    share: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether one is the larger beyond chance."""
+        return self.one > self.other and self.share >= SURE
+
+
+def farther(one: Features, other: Features, real: Features, seed: int = 0) -> Farther:
+    """Energy distances of two samples ``(N, D)`` and ``(P, D)`` from ``real (L, D)``, and the bootstrap's doubt."""
+    rng = np.random.default_rng(seed)
+    one, other, real = (x if len(x) <= EXAMINED else x[rng.permutation(len(x))[:EXAMINED]] for x in (one, other, real))
+    kernels = [(cdist(x, real), cdist(x, x)) for x in (one, other)]
+    within = cdist(real, real)
+    whole = [np.ones(len(x)) / len(x) for x in (one, other, real)]
+    found = [_energy(*kernels[i], within, whole[i], whole[2]) for i in (0, 1)]
+    larger = 0
+    for _ in range(RESAMPLES):
+        weights = [rng.multinomial(len(x), x) / len(x) for x in whole]
+        drawn = [_energy(*kernels[i], within, weights[i], weights[2]) for i in (0, 1)]
+        larger += drawn[0] > drawn[1]
+    return Farther(*(float(np.sqrt(max(0.0, value))) for value in found), larger / RESAMPLES)
+
+
+def _energy(
+    across: NDArray[np.floating],
+    theirs: NDArray[np.floating],
+    within: NDArray[np.floating],
+    weight: NDArray[np.floating],
+    of_real: NDArray[np.floating],
+) -> float:
+    """Squared, of weighted samples; a pair of an image and its copy is left out of neither side, so that both compared
+    distances are off by the same."""
+    return float(2 * weight @ across @ of_real - weight @ theirs @ weight - of_real @ within @ of_real)
