@@ -130,6 +130,17 @@ class EfficientNetLite(_Frozen):
         return maps, self.net._swish(self.net._bn1(self.net._conv_head(x))).mean((2, 3))
 
     @torch.no_grad()
+    def looks(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Of ``(N, 1 or 3, H, W)`` uint8 images: ``pooled``, and means and deviations of the finest maps, which
+        tell textures more than what is shown, ``(N, 80)``."""
+        whole, texture = [], []
+        for some in images.split(AT_ONCE):
+            maps, pooled = self.pyramid(self.enter(some))
+            whole.append(pooled)
+            texture.append(torch.cat([maps[0].mean((2, 3)), maps[0].std((2, 3))], 1))
+        return torch.cat(whole), torch.cat(texture)
+
+    @torch.no_grad()
     def logits(self, images: Tensor) -> Tensor:
         """``(N, 1000)`` of ImageNet's classes, for ``(N, 1 or 3, H, W)`` uint8 images."""
         return self.net._fc(self.embed(images))

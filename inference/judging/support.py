@@ -84,6 +84,20 @@ def fidelity(generated: ArrayLike, real: ArrayLike, k: int = 5) -> Fidelity:
     )
 
 
+def told_apart(one: Features, other: Features) -> float:
+    """How often the nearest neighbour of an image, among all others of both sides, is of its own side: about 0.5 for
+    two samples of one distribution of equal size, 1 where every image shows where it comes from.
+
+    Args:
+        one, other: ``(N, D)`` each.
+    """
+    both = np.concatenate([one, other])
+    distances = cdist(both, both)
+    np.fill_diagonal(distances, np.inf)
+    side = np.arange(len(both)) < len(one)
+    return float((side[distances.argmin(1)] == side).mean())
+
+
 def foreign(real: Features, scenes: Features) -> Mask:
     """``(L,)`` whether an image is farther from its nearest scene than two random scenes are from one another (their
     median): the scenes' own spread says what a large distance is."""

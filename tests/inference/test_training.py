@@ -15,9 +15,9 @@ from probscene.errors import ProbsceneError
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.features.counting.pretrained import PretrainedCountNet
-from probscene.inference.features.counting.pretrained_training import PretrainedCountTraining
 from probscene.inference.features.counting.training import CountTraining
+from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.photographs.training import PretrainedCountTraining
 from probscene.inference.features.presence import PresenceNet, PresenceTraining
 from probscene.inference.features.projected import ProjectionTraining
 from probscene.inference.features.projection import Projected
@@ -55,9 +55,8 @@ def presence(dots, small):
 
 
 def pretrained_counting(dots, small):
-    net = PretrainedCountNet(dots.classes, 2, dots.canvas, sizes=(160, 160))
-    renders = Observer(dots, 1)
-    return PretrainedCountTraining(net, renders.draw_twice, 8, 2, 8, 4, seed=1, photographs=renders.draw(5).image), net
+    net = PretrainedCountNet(dots.classes, 2, dots.canvas, held=8, sizes=(160, 160))
+    return PretrainedCountTraining(net, Observer(dots, 1).draw_twice, 8, 2, 4, seed=1), net
 
 
 def projection(dots, small):

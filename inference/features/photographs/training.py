@@ -19,11 +19,11 @@ from probscene.sampling import seed_everything
 
 from ...training import Report, batch_seed, check_finite, restore_training, training_state
 from ..base import Draw, Examples
-from ..projection import discriminant
 from ..counting.batches import STRIDE, cells
 from ..counting.training import relative_count_loss
-from .looks import photographed
+from ..projection import discriminant
 from .heads import SMALLEST, Maps, PretrainedCountNet
+from .looks import photographed
 from .readability import rules_for_renders
 from .reading import SHARES
 

@@ -17,7 +17,7 @@ from ..arguments import checked_seed
 from ..fitting import session
 from ..fitting.overrides import override
 from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
-from ..fitting.presets import Preset
+from ..fitting.presets import FOR_PHOTOGRAPHS, FOR_RENDERS, Preset
 from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
 from ..loading import load_model
@@ -53,8 +53,9 @@ def fit(
             or a torch dataset of images; see ``ImageFolder`` and ``ImageArray``.
         preset: how long and how to learn: ``"quick"``, ``"default"``, ``"street"``, ``"paper"``, or a ``Preset``.
         seed: of everything random.
-        features: another feature network: a word as on the command line, ``FILE.py:NAME``, or an object, see
-            ``Features`` and ``FeatureNet``.
+        features: the feature network: a word as on the command line, ``FILE.py:NAME``, or an object, see ``Features``
+            and ``FeatureNet``. Where None, the preset's; of a target that looks unlike renders, or with labels,
+            ``"count=efficientnet"`` instead of ``"count"``.
         divergence: what is descended: ``"kde"``, ``"js"``, ``"witness"``, ``"mmd"``, ``FILE.py:NAME``, or a
             ``Divergence``.
         guide: what learns: ``"lstm"``, ``"pcfg"``, ``"grammar-vae"``, ``FILE.py:NAME``, or what makes a guide of a
@@ -77,6 +78,7 @@ def fit(
             stays, and ``resume=True`` goes on with it.
     """
     chosen, parts = chosen_preset(preset, features, divergence, guide, settings)
+    other = preset_for_photographs(preset, features, divergence, guide, settings)
     if renderer is not None:
         loaded = model if isinstance(model, SceneModel) else load_model(str(model), assets)
         model = replace(loaded, renderer=renderer)
@@ -91,7 +93,9 @@ def fit(
             labels = None if labels is None else Path(labels)
             if resume and (folder / "run.json").exists():
                 begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
-                run, images = session.resume(folder, show, given, target, chosen, assets_folder, parts, Run, **begun)
+                run, images = session.resume(
+                    folder, show, given, target, chosen, assets_folder, parts, Run, photographs=other, **begun
+                )
             else:
                 run, images = session.begin(
                     given,
@@ -106,6 +110,7 @@ def fit(
                     parts,
                     Run,
                     labels,
+                    other,
                 )
             if not run.is_finished:
                 session.carry_out(run, images, show, *_cache(cache))
@@ -146,6 +151,22 @@ def chosen_preset(
         chosen = chosen.with_features(of_features)
     words = [f"{key}={_word(value)}" for key, value in settings.items()] if isinstance(settings, Mapping) else settings
     return override(chosen, list(words)), own
+
+
+def preset_for_photographs(
+    preset: str | Preset,
+    features: str | Features | FeatureNet | None,
+    divergence: str | Divergence | None,
+    guide: str | GuideMaker | None,
+    settings: Mapping[str, Any] | Sequence[str],
+) -> Preset | None:
+    """The preset for a target that looks unlike renders; None where features were chosen, or the preset's are not those
+    for renders. Arguments as of ``fit``."""
+    chosen = preset if isinstance(preset, Preset) else preset_of(preset)
+    if features is not None or chosen.features != FOR_RENDERS:
+        return None
+    made = chosen_preset(preset, FOR_PHOTOGRAPHS, divergence, guide, settings)[0]
+    return made if made.features == FOR_PHOTOGRAPHS else None
 
 
 def _part(given: Any, imported: dict[Path, ModuleType]) -> Any:

@@ -54,7 +54,7 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Learn which structures occur in a folder of unlabelled images."""
-    from ..api.fit import chosen_preset
+    from ..api.fit import chosen_preset, preset_for_photographs
     from ..fitting import session
     from ..loading import split_reference
     from ..progress import Display
@@ -63,6 +63,7 @@ def fit(
         checked_seed(seed)
     name = str(preset or PresetName.default)
     chosen, parts = chosen_preset(name, features, objective, guide, settings or [])
+    other = preset_for_photographs(name, features, objective, guide, settings or [])
     if scenarios is not None:
         if model is None:
             raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")
@@ -73,14 +74,25 @@ def fit(
         if resume:
             given = chosen if preset or objective or guide or features or settings else None
             begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
-            run, images = session.resume(out, show, model, target, given, assets, parts, **begun)
+            run, images = session.resume(out, show, model, target, given, assets, parts, photographs=other, **begun)
         elif model is None or target is None:
             raise ProbsceneError(
                 "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
             )
         else:
             run, images = session.begin(
-                model, target, out, chosen, seed or 0, bool(skip_bad), threads, show, assets, parts, labels=labels
+                model,
+                target,
+                out,
+                chosen,
+                seed or 0,
+                bool(skip_bad),
+                threads,
+                show,
+                assets,
+                parts,
+                labels=labels,
+                photographs=other,
             )
             ctx.obj.words.append("--resume")
         if not run.is_finished:

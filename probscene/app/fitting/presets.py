@@ -16,7 +16,8 @@ from probscene.inference.guides.lstm import GUIDES
 
 from .parts import CheckedDivergence, as_divergence, as_features, is_file_part, load_part
 
-TRAINED = ("count", COUNT_ON_PRETRAINED, "presence")  # on the prior's renders
+FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
+TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, "presence")  # on the prior's renders
 _RENAMED = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
 OBJECTIVES = ("kde", "js", "witness", "mmd")
 

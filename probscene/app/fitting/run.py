@@ -35,7 +35,6 @@ from .parts import (
 from .presets import Preset
 from .storage import FORMAT, Storage, check_free, load_state, read_record
 
-
 PRIOR_KEPT = "prior_kept"  # the only tensor of a guide that was given up
 
 

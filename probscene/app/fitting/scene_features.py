@@ -6,6 +6,7 @@ Axis letters: N scenes, L images, D features, C H W.
 
 from collections.abc import Callable, Iterator
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,14 +14,19 @@ from probscene.dataset import Images
 from probscene.errors import RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
+from probscene.inference.judging.support import told_apart
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.sampling import sample
 from probscene.threads import threads
 
-from ..chunks import CHUNK, as_written, draw_chunk
+from ..chunks import CHUNK, as_written, chunk_randomness, draw_chunk
 from ..loading import renderer_for
 from .observer import RENDERED_AT_ONCE
 from .run import RunFolder
+
+ASKED = 24  # renders, and as many of the target's images, that are asked where they come from
+UNLIKE = 0.95  # how often they show it, from which on they are told apart
 
 Each = Callable[[int], None]
 """Told how many more images are done."""
@@ -47,6 +53,20 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
     for chunk, first in enumerate(range(0, num, CHUNK)):
         scenes = draw_chunk(model, policy, seed, chunk)
         yield as_written(model, render(scenes.drawing[: num - first]).image)
+
+
+def unlike(model: SceneModel, target: Images) -> float:
+    """How surely the target's images are told from the model's renders: see ``told_apart``, by EfficientNet-Lite's
+    pooled features and by the texture in its finest maps, whichever tells less. Other structures do not tell images
+    apart so well as a camera does."""
+    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
+
+    with threads(1), chunk_randomness(0, 0):
+        drawn = renderer_for(model)(sample(model, model.pretraining_policy, ASKED).drawing).image
+    rows = np.linspace(0, len(target) - 1, min(ASKED, len(target))).astype(int)
+    sides = (as_written(model, drawn), torch.stack([target.load(row) for row in rows]))
+    looks = [EfficientNetLite().looks(images) for images in sides]
+    return min(told_apart(one.double().numpy(), other.double().numpy()) for one, other in zip(*looks, strict=True))
 
 
 def features_of(

@@ -30,6 +30,7 @@ from .fit import check_target, fit, open_target
 from .parts import Parts, in_memory, is_file_part, part_file
 from .presets import Preset, takers_of_labels
 from .run import RunFolder
+from .scene_features import UNLIKE, unlike
 from .storage import check_free
 
 TIMING = "timing.json"
@@ -66,6 +67,7 @@ def begin(
     parts: Parts | None = None,
     make: type[RunFolder] = RunFolder,
     labels: Path | None = None,
+    photographs: Preset | None = None,
 ) -> tuple[RunFolder, Images]:
     """A new run; nothing is written before the model, the target and every image in it are found to be good.
 
@@ -76,6 +78,7 @@ def begin(
         parts: what the user brought as objects.
         make: the class of the run.
         labels: of some of the target's images, see ``read_few``.
+        photographs: the preset to take instead where there are labels, or the target looks unlike renders.
 
     Raises:
         ProbsceneError: a number of threads that is not positive, labels for features that take none; see also
@@ -87,6 +90,8 @@ def begin(
     loaded = checked_model(model, assets)
     images = open_images(target, loaded, skip_bad, show)
     check_target(images)
+    if photographs is not None:
+        preset = _suited(preset, photographs, loaded, images, labels is not None, show)
     files = {part_file(word) for word in (preset.features, preset.objective, preset.guide) if is_file_part(word)}
     record = {
         "version": probscene.__version__,
@@ -126,6 +131,7 @@ def resume(
     parts: Parts | None = None,
     make: type[RunFolder] = RunFolder,
     labels: Path | None = None,
+    photographs: Preset | None = None,
     **settings: Any,
 ) -> tuple[RunFolder, Images | None]:
     """A run that was begun, and its images; no images where the fit is finished.
@@ -136,6 +142,7 @@ def resume(
         parts: what the user brought as objects.
         make: the class of the run.
         labels: those that it was begun with, where they are not None.
+        photographs: another preset that it may have been begun with, see ``begin``.
 
     Raises:
         RunError: there is no run, or it was begun with something else, or its labels have changed.
@@ -154,6 +161,8 @@ def resume(
     before = {key: begun.get(key) for key in given}
     if "target" in before:
         before["target"] = before["target"] or "images in memory"
+    if photographs is not None and preset is not None and run.preset.features == photographs.features:
+        preset = photographs
     if preset is not None:  # field by field, so that the message names the one that differs
         given |= dataclasses.asdict(preset)
         before |= dataclasses.asdict(run.preset)
@@ -191,6 +200,23 @@ def carry_out(
     finally:
         spent = {stage: before.get(stage, 0.0) + show.seconds.get(stage, 0.0) for stage in STAGES}
         write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
+
+
+def _suited(
+    preset: Preset, photographs: Preset, model: SceneModel, images: Images, labelled: bool, show: Display
+) -> Preset:
+    """The preset for renders or that for photographs; which, and why, is said where it is the latter."""
+    if labelled:
+        return photographs
+    told = unlike(model, images)
+    if told < UNLIKE:
+        return preset
+    show.say(
+        f"Note: the target's images look unlike the model's renders ({told:.0%} of both are told apart), so features "
+        f"that count in photographs are taken; --features {preset.features} keeps the others, --features "
+        f"{photographs.features} says so from the start."
+    )
+    return photographs
 
 
 def timing(run: RunFolder) -> dict[str, float]:

@@ -1,0 +1,163 @@
+"""Counts read from probabilities, and which readings are believed: against slow sums, and made-up heads."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from probscene.inference.features.photographs.readability import (
+    AGREE,
+    Read,
+    rules_for_renders,
+    with_labels,
+    without_labels,
+)
+from probscene.inference.features.photographs.reading import (
+    PEAKS,
+    RULES,
+    SHARES,
+    Rule,
+    by_steps,
+    read,
+    read_all,
+    read_each,
+)
+
+MAPS = arrays(np.float64, (2, 6, 7), elements=st.floats(0, 1)).map(lambda x: torch.from_numpy(x / (1 + x.sum(0))))
+PEAK = RULES.index(PEAKS[1])
+
+
+def slowly(image: np.ndarray, rule: Rule) -> float:
+    """A count, place by place."""
+    if rule.name == "sum":
+        return float(image.sum())
+    h, w, reach = *image.shape, rule.window // 2
+    mass = np.array(
+        [
+            [image[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].sum() for x in range(w)]
+            for y in range(h)
+        ]
+    )
+    if rule.name == "peaks":
+        around = [mass[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].max() for y in range(h) for x in range(w)]
+        return float(((mass.ravel() >= np.array(around)) & (mass.ravel() > rule.nothing)).sum())
+    part = np.clip((mass - rule.nothing) / (rule.whole - rule.nothing), 0, 1)
+    return float((image * part**2 * (3 - 2 * part) * np.maximum(1 / np.maximum(mass, rule.nothing), 1)).sum())
+
+
+@given(MAPS, st.sampled_from([rule for rule in RULES if rule.name != "peaks"]))
+def test_a_rule_is_its_sum_place_by_place(maps, rule):
+    assert read(maps[None], rule)[0].tolist() == pytest.approx([slowly(each.numpy(), rule) for each in maps], abs=1e-9)
+
+
+@pytest.mark.parametrize("rule", PEAKS, ids=str)
+def test_peaks_are_the_places_that_hold_most_around(rule):
+    maps = torch.rand(3, 9, 11, generator=torch.manual_seed(0)).double() ** 6
+    assert read(maps[None], rule)[0].tolist() == [slowly(each.numpy(), rule) for each in maps]
+
+
+def test_an_object_is_taken_to_whole():
+    """Spread over four places it counts as none, as a part or as one; beyond that what there is counts."""
+    rule = Rule("soft", 3, 0.1, 0.5)
+    for probability, least, most in (
+        (0.0, 0, 0),
+        (0.1, 0, 1e-6),
+        (0.3, 0.5 - 1e-5, 0.5 + 1e-5),
+        (1.0, 1, 1),
+        (2.0, 2, 2),
+    ):
+        maps = torch.zeros(1, 1, 9, 9)
+        maps[0, 0, :2, 3:5] = probability * torch.tensor([[0.1, 0.2], [0.3, 0.4]])
+        assert least - 1e-5 <= read(maps, rule).item() <= most + 1e-5
+    grain = torch.full((1, 1, 30, 30), 0.01)  # a little everywhere
+    assert grain.sum() == pytest.approx(9, rel=1e-4) and read(grain, rule).sum() == 0
+
+
+def test_each_class_has_its_own_rule():
+    maps = torch.rand(4, 3, 8, 8, generator=torch.manual_seed(1)) * 0.2
+    rules = torch.tensor([5, 0, PEAK])
+    every = read_all(maps)
+    assert torch.allclose(read_each(maps, rules), torch.stack([every[:, r, c] for c, r in enumerate(rules)], 1))
+
+
+def test_steps_are_reached_or_not():
+    steps = torch.tensor([[math.inf, math.inf], [0.5, 2.0]])
+    counts = torch.tensor([[3.3, 0.4], [0.0, 0.5], [1.0, 7.0]])
+    assert torch.equal(by_steps(counts, steps), torch.tensor([[3.3, 0.0], [0.0, 1.0], [1.0, 2.0]]))
+
+
+def test_renders_are_read_by_what_errs_least():
+    true = torch.tensor([[1.0, 2.0], [3.0, 0.0]])
+    read = torch.stack([true + 1, true * torch.tensor([1.0, 0.5]), true + torch.tensor([0.4, 0.1])], 1)
+    assert rules_for_renders(read, true).tolist() == [1, 2]
+
+
+def made(true: np.ndarray, seen: np.ndarray, apart: float = 0.02, ramp: float = 0.0, seed: int = 0) -> Read:
+    """What heads read of one class: ``seen (L,)`` by each rule, but for noise of ``apart`` between heads and a level
+    that changes by ``ramp`` from one threshold to the next; on renders the truth."""
+    rng = np.random.default_rng(seed)
+    R, S, L = len(RULES), len(SHARES), len(seen)
+    level = np.ones(R)
+    for start in (1, 7, 13):
+        level[start : start + 6] = (1 + ramp) ** -np.arange(6)
+    whole = torch.from_numpy(np.broadcast_to((seen[:, None] * level)[:, None, :, None], (L, S, R, 1)).copy()).float()
+    heads = torch.stack([whole[:, 0] + apart * torch.from_numpy(rng.normal(size=(L, R, 1))).float() for _ in range(4)])
+    drawn = torch.from_numpy(rng.integers(0, 6, (50, S, 1))).float()
+    return Read(whole, whole[: len(true)], heads, drawn[:, :, None].expand(-1, -1, R, -1), drawn)
+
+
+COUNTS = np.random.default_rng(5).integers(0, 5, 60).astype(float)
+
+
+def test_heads_that_agree_are_believed():
+    found = without_labels(made(COUNTS, COUNTS), 0)
+    assert found.readable and found.by == "agreement" and found.mean == pytest.approx(COUNTS.mean(), rel=1e-4)
+    assert found.because.startswith("readable, ") and found.disagreement < AGREE
+
+
+@pytest.mark.parametrize("spoilt", [{"apart": 1.0}, {"ramp": 0.8}], ids=str)
+def test_heads_that_differ_or_thresholds_that_change_the_mean_are_not(spoilt):
+    found = without_labels(made(COUNTS, COUNTS, **spoilt), 0)
+    assert not found.readable and found.because.startswith("not readable, ") and "label ten images" in found.because
+
+
+def test_what_cannot_count_renders_is_not_believed():
+    read = made(COUNTS, COUNTS)
+    assert not without_labels(read._replace(renders=torch.ones_like(read.renders)), 0).readable
+
+
+def test_labels_choose_the_rule_that_reads_them():
+    """Of a level that doubles from threshold to threshold, one is right."""
+    read = made(COUNTS[:10], 8 * COUNTS, ramp=1.0)
+    found = with_labels(read, 0, torch.from_numpy(COUNTS[:10]))
+    assert found.readable and found.by == "labels" and found.error < 0.1
+    assert found.mean == pytest.approx(COUNTS.mean(), rel=0.1)
+
+
+def test_the_labels_histogram_is_learnt_where_nothing_reads_them():
+    rng = np.random.default_rng(1)
+    read = made(COUNTS[:10], rng.permutation(COUNTS) * 3, apart=2.0)
+    labels = torch.tensor([0.0, 1, 1, 1, 1, 1, 1, 2, 2, 1])
+    found = with_labels(read, 0, labels)
+    counts = by_steps(read.photographs[:, found.share, found.rule], torch.tensor([found.steps]))
+    assert found.readable and found.by == "histogram" and found.error > 0
+    assert counts.mean().item() == pytest.approx(labels.mean().item(), abs=0.35)
+
+
+def test_labels_that_do_not_go_with_what_is_seen_are_not_used():
+    """Half of the objects, and not those of the fuller images: not all are labelled."""
+    labels = torch.from_numpy(np.random.default_rng(3).permutation(COUNTS[:12]) / 2).round()
+    found = with_labels(made(COUNTS[:12], 3 * COUNTS + 4), 0, labels)
+    assert found.readable and found.by == "agreement" and "do not go with" in found.because
+    assert found.mean == pytest.approx(3 * COUNTS.mean() + 4, rel=1e-3)
+
+
+@pytest.mark.parametrize("labels", [torch.zeros(10), torch.tensor([1.0, 2, 0])], ids=["no object", "too few"])
+def test_labels_that_choose_nothing_are_said(labels):
+    read = made(COUNTS[: len(labels)], COUNTS)
+    found = with_labels(read, 0, labels)
+    assert found.by == "agreement" and found.because != without_labels(read, 0).because
