@@ -1,6 +1,6 @@
-"""Suiting a ``PretrainedCountNet`` to photographs: a rule for each class, and which features are compared.
+"""Suiting a ``PretrainedCountNet`` to photographs: a rule for each class, and which classes are compared.
 
-Axis letters: L photographs, K labelled images, S shares, R rules, C classes, d directions.
+Axis letters: L photographs, K labelled images, S shares, R rules, C classes.
 """
 
 from typing import Any
@@ -14,7 +14,6 @@ from .readability import Read, Reading, with_labels, without_labels
 from .reading import RULES, SHARES
 
 LOOKED_AT_ONCE = 64  # images
-AMONG = 1.0  # standard deviations of renders, in a direction, that photographs may lie from their mean
 
 
 def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Seen) -> dict[str, Any]:
@@ -26,12 +25,12 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
         each: see ``Features.adapt``.
 
     Returns:
-        ``"classes"``: a record of each; ``"directions"``: which are compared.
+        ``"classes"``: a record of each.
     """
     images, labelled = photographs.some(most), photographs.labelled
     marked = images[:0] if labelled is None else labelled.images
     total = len(images) + len(marked)
-    whole, by_head, directions = _look(net, images, 0, total, each)
+    whole, by_head = _look(net, images, 0, total, each)
     of_labelled = _look(net, marked, len(images), total, each)[0] if len(marked) else whole[:0]
     read = Read(whole, of_labelled, by_head, net.held_read, net.held_true)
     counts = {} if labelled is None else dict(zip(labelled.classes, labelled.counts.T, strict=True))
@@ -45,23 +44,19 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
             found = without_labels(read, c)
         _keep(net, c, found)
         records[name] = _record(net, c, found)
-    usual, spread = net.usual
-    among = (directions.mean(0) - usual).abs() <= AMONG * spread
-    net.compared[len(net.classes) :] = among
     net.taught_by.copy_(torch.tensor(list(bytes.fromhex(photographs.fingerprint)), dtype=torch.uint8))
-    return {"classes": records, "directions": among.tolist()}
+    return {"classes": records}
 
 
-def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: Seen) -> tuple[Tensor, Tensor, Tensor]:
-    """Readings ``(L, S, R, C)``, those of each head ``(heads, L, R, C)`` and directions ``(L, d)``."""
+def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: Seen) -> tuple[Tensor, Tensor]:
+    """Readings ``(L, S, R, C)``, and those of each head ``(heads, L, R, C)``."""
     parts = []
     for some in images.split(LOOKED_AT_ONCE):
-        maps, pooled = net.look(some)
-        parts.append((*net.readings(maps), (pooled - net.projected_mean) @ net.projected_weight))
+        parts.append(net.readings(net.look(some)))
         done += len(some)
         each(done, total)
-    whole, by_head, directions = zip(*parts, strict=True)
-    return torch.cat(whole), torch.cat(by_head, 1), torch.cat(directions)
+    whole, by_head = zip(*parts, strict=True)
+    return torch.cat(whole), torch.cat(by_head, 1)
 
 
 def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:

@@ -1,7 +1,7 @@
 """The choice of features that count in photographs."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from probscene.model import SceneModel
@@ -26,14 +26,12 @@ class PretrainedCountFeatures(Features):
         pairs: structures that are drawn twice.
         epochs: of the heads.
         photographs: images of the target, at most, by which rules are chosen.
-        directions: of the projection that stands beside the counts.
         scenes: in a batch of the fit, for which the unit of the counts is chosen.
     """
 
     pairs: int = 1000
     epochs: int = 8
     photographs: int = 500
-    directions: int = 8
     scenes: int = 150
 
     name = COUNT_ON_PRETRAINED
@@ -44,7 +42,7 @@ class PretrainedCountFeatures(Features):
         """Pretrained, with untrained heads."""
         from .heads import PretrainedCountNet  # torchvision takes seconds to import
 
-        return PretrainedCountNet(model.classes, self.directions, model.canvas, model.stuff, self.scenes)
+        return PretrainedCountNet(model.classes, model.canvas, model.stuff, self.scenes)
 
     def training(
         self, net: FeatureNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
@@ -57,16 +55,14 @@ class PretrainedCountFeatures(Features):
         return PretrainedCountTraining(heads, renders.draw_twice, self.pairs, self.epochs, seed=seed)
 
     def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
-        """Choose how each class is read, and which directions lie among the renders'."""
+        """Choose how each class is read."""
         from .adapting import adapt
 
         return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, each)
 
     def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
-        """Of things as chosen, of stuff none, of directions without marginals: photographs often lie beyond all renders
-        in one, where what is nearest is not what has as many cars."""
-        joint = replace(cast(Any, chosen), marginal_variance=None) if hasattr(chosen, "marginal_variance") else chosen
-        return Blockwise(cast("PretrainedCountNet", net).blocks, (chosen, None, joint))
+        """Of things as chosen, of stuff none."""
+        return Blockwise(cast("PretrainedCountNet", net).blocks, (chosen, None))
 
     def taught_by(self, net: FeatureNet) -> str:
         """The images by which rules were chosen."""

@@ -1,4 +1,4 @@
-"""Counts read from the maps of a network that was trained on photographs, and what else structure moves in them.
+"""Counts read from the maps of a network that was trained on photographs.
 
 A count network that is trained on renders alone learns what renders look like, and counts less well in photographs. The
 frozen maps of a pretrained network change less between the two. Only small heads are trained on them
@@ -8,13 +8,12 @@ agree on renders disagree about photographs, so the mean of several is taken. Th
 class. How counts are read from the places is a choice for each class (``reading``), one for renders and one for
 photographs (``readability``).
 
-The directions of ``projection`` come from the same pass: counts say nothing about how a wood differs from five single
-trees. The unit of the counts is the bandwidth of their density, as it is for the projection's directions: how many
-kernels away one object more is depends on how well objects can be counted. Things and directions are blocks with a
-density each (``Blockwise``). Stuff is counted so that it is not mistaken for things, and is not compared: in
-photographs a wood has no definite number of trees (``docs/results.md`` has what happens if it is).
+Renders need not be read: their labels say how much of each object can be seen. The unit of a count is the bandwidth
+of a density of all counts, each in its standard deviations. Things and stuff are blocks (``Blockwise``): stuff is
+counted so that it is not mistaken for things, and is not compared, as in photographs a wood has no definite number of
+trees (``docs/results.md`` has what happens if it is).
 
-Axis letters: N images, C classes, h w places, P pooled features, d directions, S shares.
+Axis letters: N images, C classes, h w places, S shares, V renders that nothing is trained on.
 """
 
 import math
@@ -24,13 +23,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ..base import Examples
 from ..pretrained import AT_ONCE, EfficientNetLite
-from ..projection import Projection, bandwidth
+from ..projection import bandwidth
+from .readability import rules_for_renders
 from .reading import RULES, SHARES, by_steps, read_all, read_each
 
 SIZES = 224, 342  # least and largest square whose area images enter with; a frame of 621 x 188 enters as 608 x 192
 PLACE = 8  # pixels of what enters
 SMALLEST = 2 / 3  # places that the longer side of an object spans; what is smaller is not counted
+LEAST_SPREAD, LEAST_UNIT = 0.3, 0.3  # objects
 HEADS, HIDDEN = 4, 32
 MOST = 200  # objects of a class that labels may count
 DROPPED = 0.2  # of the channels, so that none is relied upon
@@ -39,19 +41,18 @@ Maps = list[Tensor]
 
 
 class PretrainedCountNet(nn.Module):
-    """A ``FeatureNet``: counts of things, counts of stuff and directions, D = classes + d, in bandwidths.
+    """A ``FeatureNet``: counts of things, then counts of stuff, D = C, in bandwidths.
 
     Args:
         classes: the kinds that are counted.
-        directions: d.
         canvas: height and width of the images, which enter in about that size.
         stuff: those of the classes that are no things, see ``SceneModel``.
         held: renders on which nothing is trained and rules are tried, V.
         sizes: see ``SIZES``.
 
     Attributes:
-        unit: ``(D,)``, what 1 in each feature stands for: objects, or the projection's own unit.
-        blocks: how many features are counts of things, counts of stuff, and directions.
+        unit: ``(D,)``, how many objects 1 in each feature stands for.
+        blocks: how many features are counts of things and counts of stuff.
         taught_by: fingerprint of the images whose rules were chosen, ``(32,)`` uint8; zeros for none.
         rules: ``(2, C)`` of ``RULES``, by which renders and photographs are read.
         share: ``(C,)`` of ``SHARES``.
@@ -59,7 +60,6 @@ class PretrainedCountNet(nn.Module):
         compared: ``(D,)``, whether a feature is; those that are not are 0.
         held_read, held_true: ``(V, S, R, C)`` and ``(V, S, C)``, what is read in those renders, and their counts.
         size: ``(C,)``, places that the longer side of such an object spans, the median; infinite where none was drawn.
-        usual: ``(2, d)``, mean and standard deviation of the directions in those renders.
     """
 
     unit: Tensor
@@ -71,14 +71,10 @@ class PretrainedCountNet(nn.Module):
     held_read: Tensor
     held_true: Tensor
     size: Tensor
-    usual: Tensor
-    projected_mean: Tensor
-    projected_weight: Tensor
 
     def __init__(
         self,
         classes: tuple[str, ...],
-        directions: int,
         canvas: tuple[int, int],
         stuff: tuple[str, ...] = (),
         held: int = 150,
@@ -90,9 +86,8 @@ class PretrainedCountNet(nn.Module):
         self.classes, self.canvas, self.stuff = classes, canvas, stuff
         self.order = sorted(range(len(classes)), key=lambda i: classes[i] in stuff)  # of the classes in the features
         things = sum(name not in stuff for name in classes)
-        self.blocks = things, len(classes) - things, directions
-        counted = (classes[i] for i in self.order)
-        self.names = (*counted, *(f"direction_{i}" for i in range(1, directions + 1)))
+        self.blocks = things, len(classes) - things
+        self.names = tuple(classes[i] for i in self.order)
         C = len(classes)
         for i, channels in enumerate(frozen.channels):
             self.register_buffer(f"mean_{i}", torch.zeros(channels, 1, 1))
@@ -106,9 +101,6 @@ class PretrainedCountNet(nn.Module):
         self.register_buffer("held_read", torch.zeros(held, len(SHARES), len(RULES), C))
         self.register_buffer("held_true", torch.zeros(held, len(SHARES), C))
         self.register_buffer("size", torch.zeros(C))
-        self.register_buffer("usual", torch.zeros(2, directions))
-        self.register_buffer("projected_mean", torch.zeros(len(frozen.names)))
-        self.register_buffer("projected_weight", torch.zeros(len(frozen.names), directions))
         self.heads = nn.ModuleList(_Head(frozen.channels, (1 + C) * len(SHARES)) for _ in range(HEADS))
 
     @property
@@ -137,30 +129,46 @@ class PretrainedCountNet(nn.Module):
             cast(_Head, head).out.bias.copy_(target.float().mean((0, 3, 4)).flatten().clamp(min=1e-6).log())
 
     @torch.no_grad()
-    def finish(self, projection: Projection, directions: Tensor, rules: Tensor, maps: Maps) -> None:
-        """Take over a projection of pooled features and the rules by which renders are read, and choose the unit of the
-        counts by the things in maps of renders that nothing was trained on, as many as a batch of the fit has.
+    def finish(self, read: Tensor, true: Tensor, sizes: Tensor) -> None:
+        """Take over what is read in renders that nothing was trained on, as many as a batch of the fit has: the rules
+        by which renders are read, and the units.
 
         Args:
-            directions: ``(V, d)`` of those renders.
-            rules: ``(C,)``.
-            maps: of those renders.
+            read: ``(V, S, R, C)``.
+            true: ``(V, S, C)`` their counts.
+            sizes: ``(C,)``, see ``size``.
         """
-        self.usual.copy_(torch.stack([directions.mean(0), directions.std(0)]))
-        self.projected_mean.copy_(projection.mean)
-        self.projected_weight.copy_(projection.weight)
-        self.rules.copy_(rules.expand(2, -1))
+        self.held_read.copy_(read)
+        self.held_true.copy_(true)
+        self.size.copy_(sizes)
+        self.rules.copy_(rules_for_renders(read[:, 0], true[:, 0]).expand(2, -1))
         things = self.order[: self.blocks[0]]
-        self.unit[: len(self.order)] = bandwidth(self.counts(maps)[:, things])
+        spread = true[:, 0].std(0).clamp(min=LEAST_SPREAD)
+        one = bandwidth((true[:, 0] / spread)[:, things]) if things else 1.0
+        self.unit.copy_((one * spread).clamp(min=LEAST_UNIT)[self.order])
 
     @torch.no_grad()
-    def look(self, images: Tensor) -> tuple[Maps, Tensor]:
-        """Maps and pooled features ``(N, P)`` of ``(N, 1 or 3, H, W)`` uint8 images."""
+    def look(self, images: Tensor) -> Maps:
+        """Maps of ``(N, 1 or 3, H, W)`` uint8 images."""
         net = self.frozen[0]
-        parts = [net.pyramid(net.enter(some)) for some in images.split(AT_ONCE)]
-        return [torch.cat(part) for part in zip(*(maps for maps, _ in parts), strict=True)], torch.cat(
-            [pooled for _, pooled in parts]
-        )
+        parts = [net.pyramid(net.enter(some))[0] for some in images.split(AT_ONCE)]
+        return [torch.cat(part) for part in zip(*parts, strict=True)]
+
+    def seen(self, drawn: Examples, share: float) -> Tensor:
+        """Classes ``(N, M)`` of renders' objects that are visible by at least a share and not too small; -1 of others.
+
+        Args:
+            drawn: their labels.
+        """
+        height, width = self.places()
+        places = torch.tensor([width / self.canvas[1], height / self.canvas[0]])
+        small = (drawn.size * places).amax(-1) < SMALLEST
+        return drawn.label.masked_fill((drawn.visible < share) | small, -1)
+
+    def true_counts(self, drawn: Examples) -> Tensor:
+        """Of renders, by their labels, for each share ``(N, S, C)``."""
+        number = torch.arange(len(self.classes))
+        return torch.stack([(self.seen(drawn, share)[..., None] == number).sum(1) for share in SHARES], 1).float()
 
     def normal(self, maps: Maps) -> Maps:
         """Maps in their channels' scales, float32."""
@@ -200,8 +208,12 @@ class PretrainedCountNet(nn.Module):
             parts.append(by_steps(counts, self.steps) if photographs else counts)
         return torch.cat(parts)
 
+    def embed_drawn(self, drawn: Examples) -> Tensor:
+        """``(N, D)`` features of renders by their labels."""
+        return self._features(self.true_counts(drawn)[:, self.share, torch.arange(len(self.share))])
+
     def embed(self, images: Tensor) -> Tensor:
-        """``(N, D)`` features of renders ``(N, 1 or 3, H, W)`` uint8."""
+        """``(N, D)`` features of renders ``(N, 1 or 3, H, W)`` uint8, read."""
         return self._embed(images, False)
 
     def embed_photographs(self, images: Tensor) -> Tensor:
@@ -210,13 +222,11 @@ class PretrainedCountNet(nn.Module):
 
     @torch.no_grad()
     def _embed(self, images: Tensor, photographs: bool) -> Tensor:
-        out = [torch.zeros(0, len(self.names))]
-        for some in images.split(AT_ONCE):
-            maps, pooled = self.look(some)
-            directions = (pooled - self.projected_mean) @ self.projected_weight
-            counts = self.counts(maps, photographs)[:, self.order]
-            out.append(torch.cat([counts, directions], 1) / self.unit * self.compared)
-        return torch.cat(out)
+        parts = [self.counts(self.look(some), photographs) for some in images.split(AT_ONCE)]
+        return self._features(torch.cat(parts) if parts else torch.zeros(0, len(self.classes)))
+
+    def _features(self, counts: Tensor) -> Tensor:
+        return counts[:, self.order] / self.unit * self.compared
 
 
 class _Head(nn.Module):

@@ -54,13 +54,14 @@ class Observer:
         observe, scenes = self.observe(net), sample(self.model, self.model.pretraining_policy, num)
         return observe(scenes), observe(run_program(self.model, scenes.derivation))
 
-    def _labelled(self, scenes: Scenes) -> Examples:
+    def _labelled(self, scenes: Scenes, rows: slice = slice(None)) -> Examples:
         groups, grammar = self.model.groups, self.model.grammar
         group, along = None, "y"
         if groups is not None:
-            group = group_of(scenes.derivation.kind, scenes.derivation.parent, grammar.kind(groups.kind))
+            derivation = scenes.derivation[rows]
+            group = group_of(derivation.kind, derivation.parent, grammar.kind(groups.kind))
             along = groups.along
-        drawn = examples(self.render(scenes.drawing), self.classes, group, along)
+        drawn = examples(self.render(scenes.drawing[rows]), self.classes, group, along)
         return drawn._replace(image=self._as_read(drawn.image))
 
     def object_size(self, num: int = 64) -> float:
@@ -76,12 +77,18 @@ class Observer:
 
         Args:
             draws_per_structure: parameters are drawn so many times for each structure, and the drawing in which the
-                least visible object shows most is kept: what covers an object says nothing about its structure.
+                least visible object shows most is kept: what covers an object says nothing about its structure. A
+                network that goes by labels counts what can be seen, of one drawing.
         """
+
+        embed_drawn = getattr(net, "embed_drawn", None)
 
         def features(scenes: Scenes) -> Tensor:
             with threads(self.threads):
                 starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
+                if embed_drawn is not None:
+                    parts = (self._labelled(scenes, slice(i, i + RENDERED_AT_ONCE)) for i in starts)
+                    return torch.cat([embed_drawn(some) for some in parts])
                 images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
                 return torch.cat([net.embed(self._as_read(some)) for some in images])
 

@@ -157,7 +157,7 @@ class Preset:
             "count": lambda: CountFeatures(self.count, self.width, self.blocks),
             "presence": lambda: PresenceFeatures(self.presence_images, self.presence_epochs),
             COUNT_ON_PRETRAINED: lambda: PretrainedCountFeatures(
-                self.pairs, self.head_epochs, self.photographs, self.directions, self.num_scenes
+                self.pairs, self.head_epochs, self.photographs, self.num_scenes
             ),
         }
         if self.features not in made:
