@@ -86,6 +86,7 @@ class RunFolder(Storage):
             digest = None if file is None else file_digest(file)
         make_folder(path)
         about = {"format": FORMAT, "model": reference, "model_sha256": digest, "assets": loaded.assets}
+        about["within_support"] = True
         if assets is not None:
             about["assets_folder"] = os.path.abspath(assets)
         run = cls(path, record | about, loaded, parts)
@@ -241,8 +242,11 @@ class RunFolder(Storage):
         elif make is not None:
             made = make(model.grammar, model.max_steps)
         else:
-            return make_guide(grammar=model.grammar, max_steps=model.max_steps, **settings)
-        return made if make is None else check_guide(made, model.max_steps)
+            made = make_guide(grammar=model.grammar, max_steps=model.max_steps, **settings)
+        made = made if make is None else check_guide(made, model.max_steps)
+        if self.record.get("within_support"):  # runs of before have none, and stay as they were
+            made.bind(model.support)
+        return made
 
     @cached_property
     def guide(self) -> Guide:
