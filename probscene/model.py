@@ -197,7 +197,7 @@ class SceneModel:
 
     @functools.cached_property
     def support(self) -> Support | None:
-        """What its prior and its policy of pretraining hold possible; None where one of them is no ``StructurePrior``."""
+        """What its prior or its policy of pretraining may derive; None where one of them is no ``StructurePrior``."""
         return Support.of(self.grammar, (self.prior, self.pretraining_policy))
 
     def __call__(self, num_scenes: int, structure: Policy | None = None) -> Drawing | World:

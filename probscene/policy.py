@@ -54,8 +54,8 @@ class Policy:
 
 
 def masked(grammar: Grammar, logits: Tensor, frontier: Frontier, support: "Support | None" = None) -> Tensor:
-    """Logits ``(..., K)`` with the rules masked that do not expand the symbol of ``frontier (...)`` (section 3.2), or that
-    are outside a support."""
+    """Logits ``(..., K)`` with the rules masked that do not expand the symbol of ``frontier (...)`` (section 3.2), or
+    that are outside a support."""
     return torch.where(_allowed(grammar, frontier, support), logits, MASKED)
 
 

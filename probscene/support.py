@@ -1,9 +1,9 @@
 """What a model declares possible: which rules may be taken in which state of a derivation.
 
-A structure prior gives some rules probability 0: a list of ``counts(1, 1, 1)`` never goes on after two repeats. What the
-prior or the policy of pretraining can do in a state that it can reach is possible, and a guide that is bound to a
-``Support`` takes no other rule (``Policy.support``). The states are those of the table of a ``StructurePrior``; no state
-that can be reached is without a rule. Where all weights of a list are above 0 and none are counted, nothing declares a
+A structure prior gives some rules probability 0: a list of ``counts(1, 1, 1)`` never goes on after two repeats. What
+the prior or the policy of pretraining can do in a state that it can reach is possible, and a guide that is bound to a
+``Support`` takes no other rule (``Policy.support``). The states are those of the table of a ``StructurePrior``; no
+state that can be reached is without a rule. A list of ``weights(...)`` above 0 may always go on: nothing declares a
 longest, and nothing is masked.
 
 T_max needs no mask: a derivation that is longer is drawn again, of the prior as of the guide.
@@ -56,7 +56,8 @@ class Support:
             state = torch.tensor([(t.symbol, t.parent_repeat, t.repeat) for t in process.types])[process.owner]
             possible[state[:, 0], state[:, 1], state[:, 2], torch.from_numpy(process.rule)] = True
         never = ~possible.any(-1, keepdim=True)  # nothing reaches it; a mask of nothing would be NaN
-        return Support(grammar, possible | (never & grammar.legal[:, None, None]))
+        written = torch.stack([_grown(table, P, C) > -torch.inf for table in tables]).any(0)
+        return Support(grammar, possible | (never & written))
 
     def allowed(self, frontier: Frontier) -> Tensor:
         """``(..., K)`` bool, the rules that may be taken from ``frontier (...)``."""
@@ -81,8 +82,8 @@ class Support:
         return Support(grammar, torch.cat([self.possible[symbol : symbol + V, :, :, rule : rule + K], end]))
 
     def widened(self, symbol: int, longest: int | None = None, rank: int | None = None) -> "Support":
-        """With more for one nonterminal: all its rules in every state; or, where a longest is given, a list that goes on
-        for so many repeats, below its own end as before.
+        """With more for one nonterminal: all its rules in every state; or, where a longest is given, a list that goes
+        on for so many repeats, and below its end so far as before.
 
         Args:
             rank: of the list around, where the list is to be longer in that alone.
@@ -97,10 +98,13 @@ class Support:
         again = (self.grammar.children == symbol).any(1) & legal
         for p in range(possible.shape[1]) if rank is None else [rank]:
             here = possible[symbol, p]  # (C, K)
-            own = int((here & again).any(1).sum())  # a list that ends goes on at 0, 1, ..., own - 1
+            ends = (~(here & again).any(1)).nonzero().flatten()
+            if not len(ends):
+                continue  # it has no end
+            own = int(ends[0])
             here[own:longest] |= (here[:own] & again).any(0) if own else again
-            here[longest:] &= ~again
             here[own:] |= legal & ~again
+            here[longest:] &= ~again
         return Support(self.grammar, possible)
 
 

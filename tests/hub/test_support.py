@@ -76,7 +76,9 @@ def test_samples_stay_within_it_and_their_traces_have_the_same_log_prob(prior, k
         data = {**drawn.sites(), "z": torch.full((50, 1), z)}
         trace = poutine.trace(poutine.condition(guide, data=data)).get_trace(50)
         trace.compute_log_prob()
-        each.append(torch.cat([s["log_prob"] for n, s in trace.nodes.items() if n == "z" or n[:5] == "rule_"], 1).sum(1))
+        each.append(
+            torch.cat([s["log_prob"] for n, s in trace.nodes.items() if n == "z" or n[:5] == "rule_"], 1).sum(1)
+        )
     torch.testing.assert_close(torch.stack(each).logsumexp(0), guide.log_prob(drawn), rtol=1e-4, atol=1e-4)
 
 
@@ -138,13 +140,13 @@ def test_a_list_can_be_given_more_room():
     items = LISTS.nonterminals.index("Items")
 
     def found(support):
-        return sorted(set(EVERY.counts(3)[possible(support.uniform(), EVERY)].sum(1).tolist()))
+        return sorted(set(EVERY.counts(4)[possible(support.uniform(), EVERY)].sum(1).tolist()))
 
     assert found(support) == [2]  # the background and one
     assert found(support.widened(items, 3)) == [2, 3, 4]
-    assert found(support.widened(items)) == list(range(1, 8))
+    assert found(support.widened(items)) == list(range(1, 9))
     many = found(support.widened(LISTS.nonterminals.index("Item")))
-    assert many[0] == 2 and len(many) > 5  # now an x with its things, which no weights end
+    assert many[0] == 2 and len(many) > 5  # now an x with its things, whose number nothing bounds
 
 
 def test_scenarios_have_their_own_parts():

@@ -1,0 +1,112 @@
+"""Lists that have a longest: what the prior says of their lengths, and how long those of derivations are.
+
+A list is a nonterminal that repeats itself, ``Plates -> Plate Plates | ε``; its length is how often it has. Where
+``counts(...)`` end, or a weight is 0, there is a longest (``Support``). Lists in which nothing declares one are not
+among them. Axis letters: N scenes, T steps, L lists.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .branching import Branching
+from .derivation import Derivation
+from .grammar import Grammar
+from .structure import StructurePrior
+from .support import Support
+
+
+class ListBounds(NamedTuple):
+    """A list that has a longest.
+
+    Attributes:
+        symbol: the nonterminal.
+        rank: of the list around, which alone it is about; None where all ranks have the same bounds.
+        shortest: under the prior.
+        prior: the longest under the prior.
+        longest: the longest that is possible, as of pretraining; not less.
+    """
+
+    symbol: int
+    rank: int | None
+    shortest: int
+    prior: int
+    longest: int
+
+
+class Lengths(NamedTuple):
+    """Lists of derivations.
+
+    Attributes:
+        rank: ``(L,)`` int64 of the list around, ``Frontier.parent_repeat``.
+        length: ``(L,)`` int64.
+    """
+
+    rank: NDArray[np.int64]
+    length: NDArray[np.int64]
+
+    def of(self, bounds: ListBounds, ranks: int) -> NDArray[np.int64]:
+        """The lengths that bounds are about; the last of ``ranks`` is also for all later ones."""
+        return self.length if bounds.rank is None else self.length[self.rank.clip(max=ranks - 1) == bounds.rank]
+
+
+def is_list(grammar: Grammar, symbol: int) -> bool:
+    """Whether each production of a nonterminal goes on once with the same, or ends, and both are there."""
+    again = (grammar.children[grammar.legal[symbol]] == symbol).sum(1).tolist()
+    return sorted(set(again)) == [0, 1]
+
+
+def bounded_lists(grammar: Grammar, prior: StructurePrior, support: Support) -> list[ListBounds]:
+    """The lists that have a longest, in the grammar's order, then by rank."""
+    found = []
+    every = [Branching(grammar, policy) for policy in (prior, support.uniform())]
+    for symbol in (v for v in range(len(grammar.nonterminals)) if is_list(grammar, v)):
+        own, possible = (_ends(process, symbol) for process in every)
+        bounds = []
+        for rank, (_, longest) in sorted(possible.items()):
+            shortest, most = own.get(min(rank, prior.table.shape[1] - 1), (0, 0))
+            if math.isfinite(longest) and math.isfinite(most):
+                bounds.append(ListBounds(symbol, rank, int(shortest), int(most), int(longest)))
+        if len({each[2:] for each in bounds}) == 1 and len(bounds) == len(possible):
+            bounds = [bounds[0]._replace(rank=None)]
+        found += bounds
+    return found
+
+
+def lengths(grammar: Grammar, derivation: Derivation, symbol: int) -> Lengths:
+    """All lists of a nonterminal that derivations have ended."""
+    rules, frontier = derivation.rules, derivation.frontier
+    again = (grammar.children[rules.clamp(min=0)] == symbol).any(-1)
+    ended = (frontier.symbol == symbol) & (rules >= 0) & ~again
+    return Lengths(frontier.parent_repeat[ended].numpy(), frontier.repeat[ended].numpy())
+
+
+def share_from(process: Branching, bounds: ListBounds, length: int) -> float:
+    """The share of a prior's lists that have at least so many repeats, T_max apart; 0 where it has none."""
+    total = reached = 0.0
+    for production, visits in enumerate(process.visits):
+        kind = process.types[process.owner[production]]
+        ends = (process.grammar.children[process.rule[production]] != bounds.symbol).all()
+        if kind.symbol == bounds.symbol and bounds.rank in (None, kind.parent_repeat) and ends:
+            total += visits
+            reached += visits * (kind.repeat >= length)
+    return float(reached / total) if total and math.isfinite(total) else 0.0
+
+
+def _ends(process: Branching, symbol: int) -> dict[int, tuple[float, float]]:
+    """Shortest and longest by rank; an infinite longest where there is none."""
+    found: dict[int, tuple[float, float]] = {}
+    for i, kind in enumerate(process.types):
+        if kind.symbol != symbol:
+            continue
+        own = process.owner == i
+        again = (process.grammar.children[process.rule[own]] == symbol).any(1).numpy()
+        shortest, longest = found.get(kind.parent_repeat, (math.inf, 0.0))
+        if not again.all():
+            shortest = min(shortest, kind.repeat)
+        if (process.children[own] == i).any():  # the last state of the table, which leads back to itself
+            longest = math.inf
+        found[kind.parent_repeat] = shortest, max(longest, kind.repeat)
+    return found
