@@ -2,7 +2,7 @@
 
 By Parikh's theorem the counts of a grammar's derivations are those that some numbers of uses of its productions give,
 if as many nonterminals are produced as are expanded, the start once, and all that is used hangs together with the start
-[1]. States of a ``Support`` stand in for nonterminals. The last condition is added where a solution breaks it, as a cut.
+[1]. States of a ``Support`` stand in for nonterminals. The last condition is added as a cut where a solution breaks it.
 
 References:
     [1] Verma, Seidl, Schwentick, *On the complexity of equational Horn clauses*, CADE 2005, section 4.

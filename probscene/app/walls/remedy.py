@@ -1,0 +1,54 @@
+"""What to write in a model so that a list has more room."""
+
+from probscene.branching import Branching
+from probscene.enumeration import shortest_lengths
+from probscene.grammar import Grammar
+from probscene.lists import ListBounds
+from probscene.model import SceneModel
+from probscene.scenarios import JointGrammar
+from probscene.structure import StructurePrior
+
+KEPT = 0.999 - 1e-6  # share of derivations that the longest of a prior's covers
+FOLLOWED = 1000  # rules
+
+
+def called(grammar: Grammar, symbol: int) -> str:
+    """A nonterminal as its model writes it; with its scenario, where there are several."""
+    name = grammar.nonterminals[symbol]
+    if isinstance(grammar, JointGrammar):
+        own, _, scenario = name.partition("-")
+        return f"{own} of scenario {scenario!r}" if scenario else name
+    return name
+
+
+def more_room(model: SceneModel, bounds: ListBounds, longest: int, shortest: int | None = None) -> str:
+    """The change of the prior's line for a list up to ``longest``, and of T_max where that is too short for it."""
+    least = bounds.shortest if shortest is None else min(shortest, bounds.shortest)
+    name, _, scenario = called(model.grammar, bounds.symbol).partition(" of ")
+    zeros = f"*[0] * {least}, " if least else ""
+    line = f"counts({zeros}*[1] * {longest - least + 1})"
+    where = f" in {scenario}" if scenario else ""
+    if bounds.rank is not None:
+        said = f"{name}=ranked(...){where} with counts(...) up to {longest} at rank {bounds.rank + 1}, such as {line}"
+    else:
+        said = f"{name}=counts(...){where} up to {longest}, such as {name}={line}"
+    steps = steps_for(model, bounds, longest)
+    return said + (f", and max_steps={steps}" if steps > model.max_steps else "")
+
+
+def steps_for(model: SceneModel, bounds: ListBounds, longest: int) -> int:
+    """The T_max that leaves a longer list as much room as the prior's longest has now."""
+    grammar, prior = model.grammar, model.prior
+    now = 0
+    if isinstance(prior, StructurePrior):
+        process = Branching(grammar, prior)
+        ends = process.spectral_radius < 1
+        now = len(process.lengths(model.max_steps, KEPT, FOLLOWED if ends else 0)) - 1
+        now = min(now, int(min(process.longest(), FOLLOWED)))
+    fewest = shortest_lengths(grammar)
+    each = [
+        1 + sum(fewest[v] for v in row if v >= 0 and v != bounds.symbol)
+        for row in grammar.children[grammar.legal[bounds.symbol]].tolist()
+        if bounds.symbol in row
+    ]
+    return now + max(each) * max(0, longest - bounds.prior)
