@@ -1,7 +1,8 @@
 """Lists that a fit has filled up to their end, or beyond what the prior has: the prior is too short for the target.
 
 A list piles up where the guide gives its longest clearly more than prior and pretraining do. Where the network counts
-what its elements are, and sees longer ones in next to no image, that is the target's own longest, and nothing is said.
+what its elements are, and sees longer ones in next to no image, that is the target's own longest, and nothing is said;
+where it sees them often, something is said whatever the guide does.
 
 Axis letters: N scenes, L images.
 """
@@ -31,6 +32,7 @@ SCENES = 2000  # of the guide
 CLEARLY = 0.1  # share of lists that the guide has at the end beyond the prior's, and half as much again
 BEYOND = 0.05  # share of lists beyond the prior's longest, in addition to that of pretraining
 SEEN = 0.05  # share of images in which the network sees longer lists
+OFTEN = 0.2  # the same where the guide does not fill its own, as one that cannot count
 WANTED = 0.99  # quantile of the lengths that it sees
 MARGIN = 0.1  # of that, for the list's new length
 FIRST_TRY = 1.5  # times the list's length, where nothing is seen of it
@@ -67,7 +69,7 @@ class Piled:
         what = "are longer than" if self.past else "have length"
         end = "the prior's longest" if self.past else "the longest that the model allows"
         text = f"{which}: {_percent(self.learnt)} of the learnt lists {what} {self.longest}, {end}"
-        text += f" ({_percent(self.declared)} {'in pretraining' if self.past else 'before learning'})"
+        text += f" ({_percent(self.declared)} {'in pretraining' if self.past else 'in the prior'})"
         if self.seen is not None:
             text += f", and the network counts more in {_percent(self.seen)} of the images"
         guess = "" if self.seen else " as a first try"
@@ -112,9 +114,11 @@ def piled(model: SceneModel, guide: Policy, read: Source | None, seed: int = 0) 
         past = float((learnt > bounds.prior).mean())
         if bounds.longest > bounds.prior and past > declared(bounds.prior + 1) + BEYOND:
             found.append(_piled(model, bounds, True, past, declared(bounds.prior + 1), learnt, seen))
-        elif at > max(own + CLEARLY, 1.5 * own):
+        else:
             one = _piled(model, bounds, False, at, own, learnt, seen)
-            found += [] if one.seen is not None and one.seen < SEEN else [one]
+            full = at > max(own + CLEARLY, 1.5 * own)
+            if full if one.seen is None else one.seen >= (SEEN if full else OFTEN):
+                found.append(one)
     return tuple(found)
 
 

@@ -63,6 +63,9 @@ def test_an_end_that_is_the_targets_own_is_not_named():
     seen = Source.of(np.array([[2, 1, 2]] * 30))
     assert piled(blood(), learnt(Platelets=counts(0, 1, 9)), seen) == ()
     assert piled(blood(), PRIOR, None) == ()  # nothing was learnt
+    longer = Source.of(np.array([[2, 1, 7]] * 10 + [[2, 1, 1]] * 20))
+    (found,) = piled(blood(), PRIOR, longer)  # nor could it be
+    assert found.name == "Platelets" and found.length == 8
 
 
 def test_a_prior_whose_lists_are_mostly_at_their_end_is_no_finding():
