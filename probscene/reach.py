@@ -11,6 +11,7 @@ Axis letters: I states, E productions of states, S sets of kinds.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,7 @@ class Reach:
     def __init__(self, grammar: Grammar, support: Support, max_steps: int | None, kinds: Sequence[Sequence[int]]):
         self.process = process = Branching(grammar, support.uniform())
         size, uses = len(process.types), len(process.owner)
+        self.uses = uses
         owner, each = process.owner, np.arange(uses)
         made, child = (process.children < size).nonzero(), process.children[process.children < size]
         expanded = coo_matrix((np.ones(uses), (owner, each)), (size, uses))
@@ -64,12 +66,12 @@ class Reach:
         Args:
             at_least: whether there may be more objects.
         """
-        low = np.where(counts < 0, 0, counts)
-        high = np.where((counts < 0) | at_least, np.inf, counts)
-        return self._extreme(np.ones(self.flow.shape[1]), 1, LinearConstraint(self.counts, low, high))
+        low: Any = np.where(counts < 0, 0, counts)
+        high: Any = np.where((counts < 0) | at_least, np.inf, counts)
+        return self._extreme(np.ones(self.uses), 1, LinearConstraint(self.counts, low, high))
 
     def _extreme(self, cost: NDArray[np.float64], sign: int, more: LinearConstraint | None = None) -> float:
-        uses = self.flow.shape[1]
+        uses = self.uses
         while True:
             constraints = [
                 LinearConstraint(self.flow, self.start, self.start),

@@ -5,7 +5,7 @@ labels, so are numbers that only cannot go together. Axis letters: L images, C c
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,11 +93,12 @@ def inexpressible(
 
 
 class _Room(NamedTuple):
-    """A list that is to be longer, and the fewest rules of a scene that needs it."""
+    """A list that is to have other lengths, and the fewest rules of a scene that needs it."""
 
     bounds: ListBounds
+    shortest: int
     longest: int
-    rules: int
+    rules: int = 0
 
 
 class _Walls:
@@ -118,35 +119,41 @@ class _Walls:
         return Reach(self.grammar, support, max_steps, self.kinds)
 
     def found(self) -> tuple[Inexpressible, ...]:
-        reach, cases, bad = self.reach(self.support, self.model.max_steps), [], np.zeros(len(self.numbers), bool)
+        reach, bad = self.reach(self.support, self.model.max_steps), np.zeros(len(self.numbers), bool)
+        cases: list[tuple[Inexpressible, str | _Room]] = []
         for s, what in enumerate([*self.classes, ALL][: len(self.kinds)]):
             number, own = self.numbers[:, s], s < len(self.classes)
             for side in (MORE, FEWER):
                 if side == FEWER and self.visible:
                     continue
                 limit = reach.most(s) if side == MORE else reach.least(s)
+                if not np.isfinite(limit):
+                    continue
                 rows = (number > limit if side == MORE else number < limit) & (own | ~bad)
                 if rows.sum() > (0 if self.labelled else SEEN * len(rows)):
-                    cases.append((what, side, int(limit), rows, self.remedy(s, side, int(limit))))
+                    case = self.finding(what, side, int(limit), rows)
+                    cases.append((case, self.remedy(s, side, int(limit))))
                 bad |= rows
-        rooms = [case[-1] for case in cases if isinstance(case[-1], _Room)]
-        out = [self.finding(*case[:-1], self.said(case[-1], rooms)) for case in cases]
+        rooms = [remedy for _, remedy in cases if isinstance(remedy, _Room)]
+        out = [replace(case, remedy=self.said(remedy, rooms)) for case, remedy in cases]
         if self.labelled and len(self.classes) > 1:
             out += self.together(reach, ~bad)
         return tuple(out)
 
-    def finding(self, what: str, side: str, limit: int | None, rows: NDArray[np.bool_], remedy: str) -> Inexpressible:
+    def finding(
+        self, what: str, side: str, limit: int | None, rows: NDArray[np.bool_], remedy: str = ""
+    ) -> Inexpressible:
         which = np.flatnonzero(rows).tolist()
         names = tuple(self.names[i] for i in which) if self.names else ()
         return Inexpressible(what, side, limit, len(rows), tuple(which), names, self.labelled, remedy)
 
     def said(self, remedy: "str | _Room", rooms: "list[_Room]") -> str:
-        """A remedy in words: of a list with as much room as any of the remedies gives it."""
+        """A remedy in words; a list gets as much room as all of the remedies give it."""
         if isinstance(remedy, str):
             return remedy
         same = [room for room in rooms if room.bounds == remedy.bounds]
         longest, rules = max(room.longest for room in same), max(room.rules for room in same)
-        text = more_room(self.model, remedy.bounds, longest)
+        text = more_room(self.model, remedy.bounds, longest, min(room.shortest for room in same))
         enough = max(self.model.max_steps, steps_for(self.model, remedy.bounds, longest))
         return text + (f", and max_steps={rules}" if rules > enough else "")
 
@@ -175,12 +182,10 @@ class _Walls:
                 longest = self.shortest_that(lets, bounds, need)
                 if longest is not None:
                     reach = self.reach(self.support.widened(bounds.symbol, longest, bounds.rank))
-                    return _Room(bounds, longest, int(reach.fewest_rules(wanted, True)))
+                    return _Room(bounds, bounds.shortest, longest, int(reach.fewest_rules(wanted, True)))
             elif lets(self.support.widened(bounds.symbol)):
                 kinds, more = element_kinds(grammar, bounds.symbol, self.kinds[s])
-                shortest = max(0, need - more) if kinds else 0
-                line = more_room(self.model, bounds, bounds.prior, shortest)
-                return line.replace(" up to ", f" from {shortest} up to ", 1)
+                return _Room(bounds, max(0, need - more) if kinds else 0, bounds.prior)
         for v in range(len(grammar.nonterminals)):
             if lets(self.support.widened(v)) and (never := self.never(v)):
                 return f"give {called(grammar, v)} a weight above 0 for {never} in the prior"

@@ -22,7 +22,11 @@ def called(grammar: Grammar, symbol: int) -> str:
 
 
 def more_room(model: SceneModel, bounds: ListBounds, longest: int, shortest: int | None = None) -> str:
-    """The change of the prior's line for a list up to ``longest``, and of T_max where that is too short for it."""
+    """The change of the prior's line for a list up to ``longest``, and of T_max where that is too short for it.
+
+    Args:
+        shortest: where it is to be less than the prior's.
+    """
     least = bounds.shortest if shortest is None else min(shortest, bounds.shortest)
     name, _, scenario = called(model.grammar, bounds.symbol).partition(" of ")
     zeros = f"*[0] * {least}, " if least else ""
@@ -31,7 +35,8 @@ def more_room(model: SceneModel, bounds: ListBounds, longest: int, shortest: int
     if bounds.rank is not None:
         said = f"{name}=ranked(...){where} with counts(...) up to {longest} at rank {bounds.rank + 1}, such as {line}"
     else:
-        said = f"{name}=counts(...){where} up to {longest}, such as {name}={line}"
+        lower = f" from {least}" if least < bounds.shortest else ""
+        said = f"{name}=counts(...){where}{lower} up to {longest}, such as {name}={line}"
     steps = steps_for(model, bounds, longest)
     return said + (f", and max_steps={steps}" if steps > model.max_steps else "")
 
