@@ -15,9 +15,10 @@ FOLLOWED = 1000  # rules
 def called(grammar: Grammar, symbol: int) -> str:
     """A nonterminal as its model writes it; with its scenario, where there are several."""
     name = grammar.nonterminals[symbol]
-    if isinstance(grammar, JointGrammar):
-        own, _, scenario = name.partition("-")
-        return f"{own} of scenario {scenario!r}" if scenario else name
+    if isinstance(grammar, JointGrammar) and symbol:
+        number = sum(first <= symbol for first in grammar.first_symbol) - 1
+        scenario = list(grammar.parts)[number]
+        return f"{name.removesuffix(f'-{scenario}')} of scenario {scenario!r}"
     return name
 
 

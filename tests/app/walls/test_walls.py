@@ -16,12 +16,14 @@ from probscene.app.evaluation.structure_counts import StructureCounts
 from probscene.app.fitting.run import RunFolder
 from probscene.app.walls.inexpressible import FEWER, MORE, TOGETHER, inexpressible
 from probscene.app.walls.piled import piled, read_lengths
+from probscene.app.walls.remedy import called, more_room
 from probscene.dataset import ImageFolder
 from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
 from probscene.lists import bounded_lists
 from probscene.model import Groups, SceneModel
 from probscene.relations import PerParent
+from probscene.scenarios import join
 from probscene.structure import StructurePrior, counts, ranked, weights
 
 BLOOD = Grammar("""
@@ -178,6 +180,14 @@ def test_who_is_out_of_reach_is_who_no_derivation_counts(most, data):
     numbers = np.array(data.draw(st.lists(st.tuples(*[st.integers(0, 8)] * 3), min_size=1, max_size=12)))
     rows = {row for found in inexpressible(model, Source.of(numbers), CLASSES, True) for row in found.rows}
     assert rows == {i for i, row in enumerate(numbers.tolist()) if tuple(row) not in known}
+
+
+def test_a_scenarios_list_is_named_with_its_scenario():
+    model = join("both", {"day": blood(), "night-shift": blood()})
+    name = model.grammar.nonterminals.index("Platelets-night-shift")
+    assert called(model.grammar, name) == "Platelets of scenario 'night-shift'"
+    (bounds,) = (b for b in bounded_lists(model.grammar, model.prior, model.support) if b.symbol == name)
+    assert more_room(model, bounds, 5).startswith("Platelets=counts(...) in scenario 'night-shift' up to 5, such as Pl")
 
 
 def test_an_evaluation_says_both(fitted, target, discs):
