@@ -146,13 +146,10 @@ def hangs_below(grammar: Grammar, symbol: int, kind: int) -> bool:
 
 def share_from(process: Branching, bounds: ListBounds, length: int) -> float:
     """The share of a prior's lists that have at least so many repeats, T_max apart; 0 where it has none."""
-    total = reached = 0.0
-    for production, visits in enumerate(process.visits):
-        kind = process.types[process.owner[production]]
-        ends = (process.grammar.children[process.rule[production]] != bounds.symbol).all()
-        if kind.symbol == bounds.symbol and bounds.rank in (None, kind.parent_repeat) and ends:
-            total += visits
-            reached += visits * (kind.repeat >= length)
+    symbol, repeat, rank = np.array(process.types)[process.owner].T
+    ends = ~(process.grammar.children.numpy()[process.rule] == bounds.symbol).any(1)
+    own = ends & (symbol == bounds.symbol) & ((rank == bounds.rank) | (bounds.rank is None))
+    total, reached = process.visits[own].sum(), process.visits[own & (repeat >= length)].sum()
     return float(reached / total) if total and math.isfinite(total) else 0.0
 
 

@@ -26,7 +26,7 @@ from ..fitting.fit import Progress
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..walls.inexpressible import Inexpressible, inexpressible
-from ..walls.piled import Piled, piled
+from ..walls.piled import Piled, piled, sentences
 from .estimate import estimated
 from .image_distances import IMAGES, Distances, image_distances
 from .labels import Labels
@@ -65,12 +65,12 @@ class Evaluation:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the model is too narrow for, with what to change."""
-        return tuple(f"Warning: {found}" for found in (*self.piled, *self.inexpressible))
+        return (*sentences(self.piled), *(f"Warning: {found}" for found in self.inexpressible))
 
     @property
     def walls(self) -> str:
         """The same in one sentence; empty where there is nothing."""
-        short = ", ".join(dict.fromkeys(found.name for found in self.piled))
+        short = ", ".join(dict.fromkeys(found.name for found in self.piled if not found.past))
         images = len({row for found in self.inexpressible for row in found.rows})
         said = [f"lists pile up at their longest ({short})"] if short else []
         said += [f"{images} images have numbers of objects that the model cannot have"] if images else []

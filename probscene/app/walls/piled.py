@@ -8,6 +8,7 @@ Axis letters: N scenes, L images.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,11 +65,15 @@ class Piled:
     length: int
     remedy: str
 
+    @property
+    def which(self) -> str:
+        """The name, and the rank where it is about one."""
+        return self.name if self.rank is None else f"{self.name} at rank {self.rank + 1}"
+
     def __str__(self) -> str:
-        which = self.name if self.rank is None else f"{self.name} at rank {self.rank + 1}"
         what = "are longer than" if self.past else "have length"
         end = "the prior's longest" if self.past else "the longest that the model allows"
-        text = f"{which}: {_percent(self.learnt)} of the learnt lists {what} {self.longest}, {end}"
+        text = f"{self.which}: {_percent(self.learnt)} of the learnt lists {what} {self.longest}, {end}"
         text += f" ({_percent(self.declared)} {'in pretraining' if self.past else 'in the prior'})"
         if self.seen is not None:
             text += f", and the network counts more in {_percent(self.seen)} of the images"
@@ -78,6 +83,21 @@ class Piled:
     def record(self) -> dict[str, Any]:
         """For JSON."""
         return {**vars(self), "sentence": str(self)}
+
+
+def sentences(found: Iterable[Piled]) -> list[str]:
+    """What to say of them: a warning for each list at its end, and one note for all those that are past the prior's."""
+    found = list(found)
+    out = [f"Warning: {each}" for each in found if not each.past]
+    past = [f"{each.which} up to {each.length} ({_percent(each.learnt)} are longer)" for each in found if each.past]
+    if len(past) == 1:
+        return [*out, *(f"Note: {each}" for each in found if each.past)]
+    if past:
+        out.append(
+            "Note: learnt lists are longer than the prior's longest, as pretraining allows; if the images have such, the "
+            f"prior should, too: {', '.join(past)}."
+        )
+    return out
 
 
 def piled(model: SceneModel, guide: Policy, read: Source | None, seed: int = 0) -> tuple[Piled, ...]:

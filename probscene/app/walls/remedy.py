@@ -1,5 +1,7 @@
 """What to write in a model so that a list has more room."""
 
+from functools import lru_cache
+
 from probscene.branching import Branching
 from probscene.enumeration import shortest_lengths
 from probscene.grammar import Grammar
@@ -45,12 +47,7 @@ def more_room(model: SceneModel, bounds: ListBounds, longest: int, shortest: int
 def steps_for(model: SceneModel, bounds: ListBounds, longest: int) -> int:
     """The T_max that leaves a longer list as much room as the prior's longest has now."""
     grammar, prior = model.grammar, model.prior
-    now = 0
-    if isinstance(prior, StructurePrior):
-        process = Branching(grammar, prior)
-        ends = process.spectral_radius < 1
-        now = len(process.lengths(model.max_steps, KEPT, FOLLOWED if ends else 0)) - 1
-        now = min(now, int(min(process.longest(), FOLLOWED)))
+    now = _longest_kept(grammar, prior, model.max_steps) if isinstance(prior, StructurePrior) else 0
     fewest = shortest_lengths(grammar)
     each = [
         1 + sum(fewest[v] for v in row if v >= 0 and v != bounds.symbol)
@@ -58,3 +55,12 @@ def steps_for(model: SceneModel, bounds: ListBounds, longest: int) -> int:
         if bounds.symbol in row
     ]
     return now + max(each) * max(0, longest - bounds.prior)
+
+
+@lru_cache(maxsize=4)
+def _longest_kept(grammar: Grammar, prior: StructurePrior, max_steps: int) -> int:
+    """The fewest rules that nearly all of a prior's derivations keep to."""
+    process = Branching(grammar, prior)
+    known = process.lengths(max_steps, KEPT, FOLLOWED if process.spectral_radius < 1 else 0)
+    enough = (known.cumsum() >= KEPT).nonzero()[0]
+    return int(enough[0]) if len(enough) else len(known) - 1

@@ -3,13 +3,13 @@
 from ..evaluation.evaluate import network_counts
 from ..fitting.run import RunFolder
 from ..progress import Display
-from .piled import Piled, piled
+from .piled import Piled, piled, sentences
 
 
 def tell(run: RunFolder, show: Display) -> None:
     """Warn of each list that a finished run has filled up to its end."""
-    for found in too_short(run, show):
-        show.say(f"Warning: {found}")
+    for text in sentences(too_short(run, show)):
+        show.say(text)
 
 
 def too_short(run: RunFolder, show: Display) -> tuple[Piled, ...]:

@@ -15,7 +15,7 @@ from probscene.app.evaluation.sources import Source
 from probscene.app.evaluation.structure_counts import StructureCounts
 from probscene.app.fitting.run import RunFolder
 from probscene.app.walls.inexpressible import FEWER, MORE, TOGETHER, inexpressible
-from probscene.app.walls.piled import piled, read_lengths
+from probscene.app.walls.piled import piled, read_lengths, sentences
 from probscene.app.walls.remedy import called, more_room
 from probscene.dataset import ImageFolder
 from probscene.enumeration import enumerate_derivations
@@ -81,9 +81,12 @@ def test_a_prior_whose_lists_are_mostly_at_their_end_is_no_finding():
 def test_lists_beyond_the_prior_within_pretraining_are_named():
     more = StructurePrior(BLOOD, Reds=counts(0, 0, 1, 1), Whites=counts(1, 1), Platelets=counts(3, 3, 3, *[0.25] * 4))
     (found,) = piled(blood(pretraining=more), learnt(Platelets=counts(0, 0, 1, 1, 1)), None)
-    assert (
-        found.past and found.longest == 2 and found.length == 4 and "longer than 2, the prior's longest" in str(found)
-    )
+    assert found.past and (found.longest, found.length) == (2, 4)
+    assert "longer than 2, the prior's longest" in str(found)
+    assert sentences([found]) == [f"Note: {found}"]
+    other = replace(found, name="Reds", past=False)
+    first, second = sentences([found, other, found])
+    assert first == f"Warning: {other}" and second.count("Platelets up to 4 (") == 2
 
 
 def test_a_list_without_an_end_and_a_policy_that_is_no_table_are_left_alone():
