@@ -34,7 +34,7 @@ CLASSES = tuple("0123456789")
 MOST = 10
 PRIOR = StructurePrior(GRAMMAR, Digits=counts(*[1] * (MOST + 1)))
 CANVAS = 256
-MAX_STEPS = 32  # up to 15 digits: the guide may go beyond the prior
+MAX_STEPS = 32  # up to 15 digits, more than the longest of the prior
 TURN = math.radians(30)
 MARGIN = math.ceil(SIZE / 2 * (math.cos(TURN) + math.sin(TURN)))  # a turned glyph stays on the canvas
 

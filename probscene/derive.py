@@ -68,7 +68,8 @@ def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) ->
         nonlocal memory
         logits, memory = policy.step(memory, frontier, previous)
         active = frontier.symbol < len(grammar.nonterminals)
-        rule = dist.Categorical(logits=masked(grammar, logits, frontier.symbol).unsqueeze(-2), validate_args=False)
+        allowed = masked(grammar, logits, frontier, policy.support)
+        rule = dist.Categorical(logits=allowed.unsqueeze(-2), validate_args=False)
         value = pyro.sample(f"rule_{t}", rule.mask(active.unsqueeze(-1))).squeeze(-1)
         return value.where(active, -1)
 

@@ -21,6 +21,7 @@ from .errors import ModelError
 from .grammar import Grammar
 from .policy import Policy
 from .scene import SceneGraph
+from .support import Support
 from .world import World
 
 
@@ -193,6 +194,11 @@ class SceneModel:
     def pretraining_policy(self) -> Policy:
         """What a guide is pretrained on."""
         return self.prior if self.pretraining is None else self.pretraining
+
+    @functools.cached_property
+    def support(self) -> Support | None:
+        """What its prior or its policy of pretraining may derive; None where one of them is no ``StructurePrior``."""
+        return Support.of(self.grammar, (self.prior, self.pretraining_policy))
 
     def __call__(self, num_scenes: int, structure: Policy | None = None) -> Drawing | World:
         """Run the program; under the prior where no structure policy is given."""

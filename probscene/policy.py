@@ -3,13 +3,16 @@
 Axis letters: N scenes, T steps, K rules, V nonterminals.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from .derivation import Derivation, Frontier
 from .grammar import Grammar
+
+if TYPE_CHECKING:
+    from .support import Support
 
 MASKED = -1e9  # finite, so that a masked logit has no gradient that is NaN
 
@@ -18,9 +21,13 @@ class Policy:
     """A distribution over derivations: logits over all K rules at every step; ``derive`` masks the illegal ones.
 
     Subclasses give ``start`` and ``step``, and may give a faster ``logits``.
+
+    Attributes:
+        support: the rules that it may take, masked like illegal ones; all legal ones where None.
     """
 
     grammar: Grammar
+    support: "Support | None" = None
 
     def start(self, num_scenes: int) -> Any:
         """The memory before the first step."""
@@ -43,16 +50,25 @@ class Policy:
     def log_prob(self, derivation: Derivation) -> Tensor:
         """``log q(T)``, ``(N,)``: the sum over steps of the masked log-probability of each rule (section 3.2; a product
         of probabilities, where the paper prints a sum)."""
-        return rule_log_probs(self.grammar, self.logits(derivation), derivation).sum(1)
+        return rule_log_probs(self.grammar, self.logits(derivation), derivation, self.support).sum(1)
 
 
-def masked(grammar: Grammar, logits: Tensor, symbol: Tensor) -> Tensor:
-    """Logits ``(..., K)`` with the rules that do not expand ``symbol (...)`` masked (section 3.2)."""
-    return torch.where(grammar.legal[symbol], logits, MASKED)
+def masked(grammar: Grammar, logits: Tensor, frontier: Frontier, support: "Support | None" = None) -> Tensor:
+    """Logits ``(..., K)`` with the rules masked that do not expand the symbol of ``frontier (...)`` (section 3.2), or
+    that are outside a support."""
+    return torch.where(_allowed(grammar, frontier, support), logits, MASKED)
 
 
-def rule_log_probs(grammar: Grammar, logits: Tensor, derivation: Derivation) -> Tensor:
-    """Log-probability ``(N, T)`` of each chosen rule; 0 on padding."""
-    logp = torch.log_softmax(masked(grammar, logits, derivation.frontier.symbol), -1)
-    rules = derivation.rules
-    return logp.gather(-1, rules.clamp(min=0).unsqueeze(-1)).squeeze(-1).masked_fill(rules < 0, 0.0)
+def rule_log_probs(
+    grammar: Grammar, logits: Tensor, derivation: Derivation, support: "Support | None" = None
+) -> Tensor:
+    """Log-probability ``(N, T)`` of each chosen rule; 0 on padding, -inf outside the support."""
+    rules, chosen = derivation.rules, derivation.rules.clamp(min=0).unsqueeze(-1)
+    logp = torch.log_softmax(masked(grammar, logits, derivation.frontier, support), -1).gather(-1, chosen).squeeze(-1)
+    if support is not None:
+        logp = logp.masked_fill(~support.allowed(derivation.frontier).gather(-1, chosen).squeeze(-1), -torch.inf)
+    return logp.masked_fill(rules < 0, 0.0)
+
+
+def _allowed(grammar: Grammar, frontier: Frontier, support: "Support | None") -> Tensor:
+    return grammar.legal[frontier.symbol] if support is None else support.allowed(frontier)

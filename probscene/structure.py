@@ -126,9 +126,14 @@ class StructurePrior(Policy):
             own = prior.table[:-1]
             own = own[:, torch.arange(P).clamp(max=own.shape[1] - 1)][:, :, torch.arange(C).clamp(max=own.shape[2] - 1)]
             table[v : v + own.shape[0], :, :, k : k + own.shape[3]] = own
-        joint = StructurePrior.__new__(StructurePrior)
-        joint.grammar, joint.table = grammar, table
-        return joint
+        return StructurePrior.of_table(grammar, table)
+
+    @staticmethod
+    def of_table(grammar: Grammar, table: Tensor) -> "StructurePrior":
+        """The prior of a ``table`` as it is."""
+        prior = StructurePrior.__new__(StructurePrior)
+        prior.grammar, prior.table = grammar, table
+        return prior
 
     def step(self, memory: None, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, None]:
         """Log-probabilities ``(N, K)``; there is no memory."""

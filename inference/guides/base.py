@@ -15,6 +15,7 @@ from probscene.derivation import Derivation
 from probscene.derive import derive
 from probscene.grammar import Grammar
 from probscene.policy import Policy, rule_log_probs
+from probscene.support import Support
 
 
 class Guide(nn.Module, Policy):
@@ -34,6 +35,10 @@ class Guide(nn.Module, Policy):
         pyro.module("guide", self)
         with pyro.plate("scenes", num_scenes, dim=-2):
             return derive(self.grammar, self, num_scenes, self.max_steps)
+
+    def bind(self, support: Support | None) -> None:
+        """Take no rule outside ``support`` from now on, such as ``SceneModel.support``; None unbinds."""
+        self.support = support
 
     def strata(self, derivation: Derivation) -> Tensor:
         """``(N,)`` int64: scenes whose costs have a baseline together; all, unless there is a guide a scenario."""
@@ -59,8 +64,8 @@ class LatentGuide(Guide):
 
     def log_prob_each(self, derivation: Derivation) -> Tensor:
         """``log q(T|z)``, ``(Z, N)``."""
-        each = range(len(self.latents))
-        return torch.stack([rule_log_probs(self.grammar, self.logits(derivation, z), derivation).sum(1) for z in each])
+        each = (self.logits(derivation, z) for z in range(len(self.latents)))
+        return torch.stack([rule_log_probs(self.grammar, one, derivation, self.support).sum(1) for one in each])
 
     def log_prob(self, derivation: Derivation) -> Tensor:
         """``log q(T)``, ``(N,)``, marginal over the latent vectors."""

@@ -63,11 +63,17 @@ class GrammarVAE(LatentGuide):
         rules = derivation.rules
         T = self._steps(rules.shape[1])
         logits = self._unroll(self.latents)[:, :T]  # (Z, T, K)
-        legal = self.grammar.legal[: len(self.grammar.nonterminals)]
-        total = logits.unsqueeze(2).where(legal, -torch.inf).logsumexp(-1)  # (Z, T, V)
-        logp = logits - total[..., self.grammar.lhs]
-        chosen = logp[:, torch.arange(T), rules.clamp(min=0)]  # (Z, N, T)
-        return chosen.masked_fill(rules < 0, 0.0).sum(-1)
+        every, chosen = torch.arange(T), rules.clamp(min=0)
+        if self.support is None:
+            legal = self.grammar.legal[: len(self.grammar.nonterminals)]
+            total = logits.unsqueeze(2).where(legal, -torch.inf).logsumexp(-1)  # (Z, T, V)
+            logp = (logits - total[..., self.grammar.lhs])[:, every, chosen]  # (Z, N, T)
+        else:
+            allowed, row = self.support.rows, self.support.rows_of(derivation.frontier)
+            total = logits.unsqueeze(2).where(allowed, -torch.inf).logsumexp(-1)  # (Z, T, U)
+            logp = logits[:, every, chosen] - total[:, every, row]
+            logp = logp.masked_fill(~allowed[row, chosen], -torch.inf)
+        return logp.masked_fill(rules < 0, 0.0).sum(-1)
 
     def _unroll(self, latents: Tensor) -> Tensor:
         x = torch.relu(self.dense(latents)).unsqueeze(1).expand(-1, self.max_steps, -1)

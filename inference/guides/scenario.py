@@ -3,12 +3,14 @@ them, and each guide is scored on its own scenes."""
 
 from collections.abc import Callable
 from functools import partial
+from typing import cast
 
 from torch import Tensor, nn
 
 from probscene.derivation import Derivation, Frontier
 from probscene.grammar import Grammar
 from probscene.scenarios import JointGrammar, Mixture
+from probscene.support import Support
 
 from .base import Guide
 from .lstm import make_guide
@@ -41,6 +43,14 @@ class ScenarioGuide(Guide):
         guides = [make(part, max_steps - 1) for part in grammar.parts.values()]
         self.guides = nn.ModuleList(guides)
         self.mixture = Mixture(grammar, guides, weights)
+
+    def bind(self, support: Support | None) -> None:
+        """Bind it to the joint grammar's support, and each scenario's own guide to its part."""
+        super().bind(support)
+        grammar = self.grammar
+        parts = zip(grammar.parts.values(), grammar.first_symbol, grammar.first_rule, strict=True)
+        for guide, part in zip(self.guides, parts, strict=True):
+            cast(Guide, guide).bind(None if support is None else support.part(*part))
 
     def start(self, num_scenes: int) -> list:
         """The memories of all guides."""

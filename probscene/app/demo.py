@@ -33,6 +33,7 @@ from .pictures import pixels, side_by_side, write_picture
 from .progress import Display
 from .views import report, tables
 from .views.preview import scenes
+from .walls.warn import tell
 
 SAMPLES = 16  # images a grid
 
@@ -69,6 +70,7 @@ def demo(
         run, opened = _begun(model, target, out / "run", preset, seed, threads, show)
         if not run.is_finished:
             session.carry_out(run, opened, show, cache, use_cache)
+            tell(run, show)
         generate(run, num, out / "dataset", seed, progress=show.stage("generating"))
         if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
             _judge(run, opened or session.open_images(target, loaded, False, show), out, show)

@@ -21,6 +21,7 @@ from ..fitting.presets import FOR_PHOTOGRAPHS, FOR_RENDERS, Preset
 from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
 from ..loading import load_model
+from ..walls.warn import tell
 from .calls import display
 from .run import Run, parts_of
 
@@ -114,6 +115,7 @@ def fit(
                 )
             if not run.is_finished:
                 session.carry_out(run, images, show, *_cache(cache))
+                tell(run, show)
         except BaseException:
             if temporary is not None:
                 shutil.rmtree(temporary, ignore_errors=True)

@@ -58,6 +58,7 @@ def fit(
     from ..fitting import session
     from ..loading import split_reference
     from ..progress import Display
+    from ..walls.warn import tell
 
     if seed is not None:
         checked_seed(seed)
@@ -97,6 +98,7 @@ def fit(
             ctx.obj.words.append("--resume")
         if not run.is_finished:
             session.carry_out(run, images, show, cache, not no_cache)
+            tell(run, show)
     print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")
 
 

@@ -25,6 +25,8 @@ from probscene.inference.judging.tally import Tally
 from ..fitting.fit import Progress
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
+from ..walls.inexpressible import Inexpressible, inexpressible
+from ..walls.piled import Piled, piled, sentences
 from .estimate import estimated
 from .image_distances import IMAGES, Distances, image_distances
 from .labels import Labels
@@ -46,6 +48,8 @@ class Evaluation:
         likelihoods: of the truth's structures under ``prior`` and ``learnt``, where they are known.
         images: FID and KID by the features' name; see ``image_distances``.
         notes: of the labels.
+        piled: the lists that are too short for what was learnt.
+        inexpressible: the images that the model cannot have, by the labels, else by the estimate.
     """
 
     run: RunFolder
@@ -55,6 +59,22 @@ class Evaluation:
     likelihoods: dict[str, Likelihood] = field(default_factory=dict)
     images: dict[str, Distances] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    piled: tuple[Piled, ...] = ()
+    inexpressible: tuple[Inexpressible, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the model is too narrow for, with what to change."""
+        return (*sentences(self.piled), *(f"Warning: {found}" for found in self.inexpressible))
+
+    @property
+    def walls(self) -> str:
+        """The same in one sentence; empty where there is nothing."""
+        short = ", ".join(dict.fromkeys(found.name for found in self.piled if not found.past))
+        images = len({row for found in self.inexpressible for row in found.rows})
+        said = [f"lists pile up at their longest ({short})"] if short else []
+        said += [f"{images} images have numbers of objects that the model cannot have"] if images else []
+        return f"Mind the prior: {' and '.join(said)}; the warnings say what to change." if said else ""
 
     def distance(self, a: str, b: str) -> dict[str, Any]:
         """How far source ``a`` is from ``b``: total variation of the number of objects and of the pooled class shares,
@@ -99,6 +119,10 @@ class Evaluation:
             "classes": list(self.classes),
             "notes": list(self.notes),
             "distances": self.distances(),
+            "walls": {
+                "lists": [found.record() for found in self.piled],
+                "images": [found.record() for found in self.inexpressible],
+            },
             "sources": {name: self._source(source) for name, source in self.sources.items()},
             "log_prob": {name: _plain(found) for name, found in self.likelihoods.items()},
             "images": {
@@ -175,7 +199,26 @@ def evaluate(
         sources["estimate"] = estimate.only(columns)
     path = run.target if target is None else target.path
     classes, notes = tuple(run.model.classes[c] for c in columns), () if truth is None else truth.notes
-    return Evaluation(run, path, classes, sources, likelihoods, compared, notes)
+    short = piled(run.model, run.guide, estimate, seed)
+    beyond = _inexpressible(run, classes, sources, truth, target)
+    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond)
+
+
+def _inexpressible(
+    run: RunFolder, classes: tuple[str, ...], sources: dict[str, Source], truth: Labels | None, target: Images | None
+) -> tuple[Inexpressible, ...]:
+    """By the labels, else by the estimate of the classes whose instances can be counted."""
+    by = next((name for name in ("truth", "estimate") if name in sources), None)
+    if by is None:
+        return ()
+    source = sources[by]
+    if by == "estimate":
+        columns = [c for c, name in enumerate(classes) if name not in run.model.stuff]
+        classes, source = tuple(classes[c] for c in columns), source.only(columns)
+    names = [] if target is None else [file.name for file in target.paths]
+    names = names if len(names) == len(source.counts) else []
+    visible = truth is not None and truth.min_height is not None
+    return inexpressible(run.model, source, classes, by == "truth", names, visible)
 
 
 def network_counts(run: RunFolder, target: Images | None, progress: Progress) -> Source | None:

@@ -46,6 +46,7 @@ class Judged:
         generated_unmatched: the generated scenes farthest from any real image, ``(H, W, 3)``.
         names: the files of ``real_unmatched``.
         agreement: with the labels, where there are such.
+        walls: what the model is too narrow for, one sentence, where that is known.
     """
 
     trust: Trust | None
@@ -54,6 +55,7 @@ class Judged:
     generated_unmatched: tuple[Pixels, ...] = ()
     names: tuple[str, ...] = ()
     agreement: Agreement | None = None
+    walls: str = ""
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
@@ -127,7 +129,8 @@ def judge(
     by_labels = None
     if evaluation is not None and "truth" in evaluation.sources:
         by_labels = agreement(evaluation.sources["learnt"], evaluation.sources["truth"], evaluation.classes)
-    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels)
+    walls = "" if evaluation is None else evaluation.walls
+    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls)
 
 
 class _Eyes:

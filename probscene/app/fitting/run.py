@@ -91,7 +91,8 @@ class RunFolder(Storage):
             file = None if name in BUILT_IN else Path(name)
             digest = None if file is None else file_digest(file)
         make_folder(path)
-        about = {"format": FORMAT, "model": reference, "model_sha256": digest, "assets": loaded.assets}
+        about: dict[str, Any] = {"format": FORMAT, "model": reference, "model_sha256": digest}
+        about |= {"assets": loaded.assets, "within_support": True}
         if assets is not None:
             about["assets_folder"] = os.path.abspath(assets)
         run = cls(path, record | about, loaded, parts)
@@ -191,11 +192,7 @@ class RunFolder(Storage):
         return net if _is_ours(net) else CheckedNet(net, self.features)
 
     def network(self) -> FeatureNet | None:
-        """The feature network with its state, once it is trained; None before. Loaded once.
-
-        Raises:
-            RunError: the file does not hold this network's state.
-        """
+        """The feature network with its state, once it is trained; None before. Loaded once, see ``load_state``."""
         tensors = self.read_tensors("features") if self._network is None else None
         if tensors is not None:
             net = self.build_network()
@@ -247,8 +244,11 @@ class RunFolder(Storage):
         elif make is not None:
             made = make(model.grammar, model.max_steps)
         else:
-            return make_guide(grammar=model.grammar, max_steps=model.max_steps, **settings)
-        return made if make is None else check_guide(made, model.max_steps)
+            made = make_guide(grammar=model.grammar, max_steps=model.max_steps, **settings)
+        made = made if make is None else check_guide(made, model.max_steps)
+        if self.record.get("within_support"):  # runs of before have none, and stay as they were
+            made.bind(model.support)
+        return made
 
     @cached_property
     def guide(self) -> Policy:

@@ -30,7 +30,7 @@ from ..files import write_json, write_text, write_whole
 from ..modules import file_digest
 from .parts import IN_MEMORY, inner
 
-FORMAT = 4  # of the run folder; another number is not read
+FORMAT = 3  # of the run folder; another number is not read
 READINGS, OUTCOME = "readings.json", "outcome.json"
 SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
 KEYS = {"model", "model_sha256", "assets"}  # that every run.json has

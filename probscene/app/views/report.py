@@ -135,10 +135,11 @@ def _headline(evaluation: Evaluation) -> str:
         for key, what in (("number", "number of objects"), ("classes", "classes")):
             prior, learnt = (_figure(found[a][key]) for a in ("prior", "learnt"))
             rows.append(f'<div class="card">{what}, {to}<b>{prior} → {learnt}</b></div>')
+    walls = "".join(f"<p>{html.escape(text)}</p>" for text in evaluation.warnings)
     if not rows:
-        return "<p>There are neither labels nor an estimate to compare with.</p>"
+        return f"<p>There are neither labels nor an estimate to compare with.</p>{walls}"
     note = "Total variation: first the prior's, then that of what was learnt."
-    return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>'
+    return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>{walls}'
 
 
 def _samples(run: RunFolder, images: Images | None, absent: str) -> str:

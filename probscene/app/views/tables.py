@@ -46,6 +46,8 @@ def show(evaluation: Evaluation, console: Console) -> None:
         console.print(f"Labels: {note}", style="dim", soft_wrap=True)
     for note in sorted(notes):
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
+    for warning in evaluation.warnings:
+        console.print(warning, soft_wrap=True)
 
 
 def apart(evaluation: Evaluation, spread: bool = False) -> list[Table]:

@@ -84,7 +84,8 @@ def _sentences(judged: Judged) -> list[str]:
     if found is None:
         return [judged.absent]
     out = [found.because, found.remedy]
-    return out if judged.agreement is None else [*out, judged.agreement.sentence(found.verdict)]
+    out += [] if judged.agreement is None else [judged.agreement.sentence(found.verdict)]
+    return [*out, judged.walls] if judged.walls else out
 
 
 def _apart(found: Apart, unit: float | None = None) -> tuple[str, str]:
