@@ -85,7 +85,7 @@ def lengths(grammar: Grammar, derivation: Derivation, symbol: int) -> Lengths:
 
 
 def element_kinds(grammar: Grammar, symbol: int, among: Collection[int]) -> tuple[tuple[int, ...], int]:
-    """Kinds of which each element of a list has one object in all, as every ``Item`` of ``Items -> Item Items | ε`` with
+    """Kinds of which each element of a list has one object in all, as each ``Item`` of ``Items -> Item Items | ε`` with
     ``Item -> red | blue``, and how many its end has; those of lists inside an element are not its own. No kinds where
     lengths cannot be told from objects.
 

@@ -94,7 +94,7 @@ def sentences(found: Iterable[Piled]) -> list[str]:
         return [*out, *(f"Note: {each}" for each in found if each.past)]
     if past:
         out.append(
-            "Note: learnt lists are longer than the prior's longest, as pretraining allows; if the images have such, the "
+            "Note: learnt lists are longer than the prior's longest, as pretraining allows; if images have such, the "
             f"prior should, too: {', '.join(past)}."
         )
     return out
