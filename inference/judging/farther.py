@@ -46,7 +46,8 @@ def farther(one: Features, other: Features, real: Features, seed: int = 0) -> Fa
         weights = [rng.multinomial(len(x), x) / len(x) for x in whole]
         drawn = [_energy(*kernels[i], within, weights[i], weights[2]) for i in (0, 1)]
         larger += drawn[0] > drawn[1]
-    return Farther(*(float(np.sqrt(max(0.0, value))) for value in found), larger / RESAMPLES)
+    distance, of_other = (float(np.sqrt(max(0.0, value))) for value in found)
+    return Farther(distance, of_other, larger / RESAMPLES)
 
 
 def _energy(

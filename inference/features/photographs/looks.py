@@ -38,4 +38,4 @@ def _one(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     x = x + rng.normal(0, rng.uniform(0, NOISE), x.shape)
     x = np.rint(np.clip(x, 0, 1) * 255).astype(np.uint8)
     _, coded = cv2.imencode(".jpg", x, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(*QUALITY))])
-    return cv2.imdecode(coded, cv2.IMREAD_UNCHANGED).reshape(x.shape).transpose(2, 0, 1)
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)).reshape(x.shape).transpose(2, 0, 1)
