@@ -32,7 +32,7 @@ PRIOR = ps.StructurePrior(
     GRAMMAR, Reds=ps.counts(*[1] * 41), Whites=ps.counts(1, 1, 1, 1), Platelets=ps.counts(*[1] * 9)
 )
 HEIGHT, WIDTH = 240, 320  # pixels: half of the photographs
-RED, WHITE, PLATELET = 25.0, 46.0, 9.5  # typical radii, pixels of the canvas
+RED, WHITE, PLATELET = 27.5, 49.0, 10.5  # typical radii, pixels of the canvas
 FOCUS = (0.6, 1.2, 2.2)  # pixels of blur that every sprite is drawn with
 DIRT, CROWD = 16, 6  # specks at most; steps in which cells push one another apart
 CLASSES = ("rbc", "wbc", "platelet")
@@ -62,27 +62,27 @@ def sprites(colour: np.ndarray, alpha: np.ndarray) -> list[np.ndarray]:
 
 
 def red(rng: np.random.Generator, pallor: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """A red cell of radius 25, paler in the middle, and what it takes of the light that comes through others."""
-    inside = outline(rng, 64, RED, 0.1)
-    middle = outline(rng, 64, rng.uniform(8, 16), 0.25, *rng.normal(0, 2.5, 2))
+    """A red cell of radius 27.5, paler in the middle, and what it takes of the light that comes through others."""
+    inside = outline(rng, 72, RED, 0.1)
+    middle = outline(rng, 72, rng.uniform(9, 17), 0.25, *rng.normal(0, 2.5, 2))
     pale = pallor * np.clip(middle / 7 + 0.5, 0, 1)[..., None]
     rim = np.exp(-((inside / 3) ** 2))[..., None]
-    colour = (200, 178, 178) + pale * (10, 34, 32) - rim * (2, 8, -4) + 2 * grain(rng, 64, 4) + 2 * grain(rng, 64, 0.7)
+    colour = (200, 178, 178) + pale * (10, 34, 32) - rim * (2, 8, -4) + 2 * grain(rng, 72, 4) + 2 * grain(rng, 72, 0.7)
     there, shade = np.clip(inside + 0.5, 0, 1), np.broadcast_to((134.0, 88.0, 92.0), colour.shape)
     return sprites(colour, there * (0.8 - 0.15 * pale[..., 0])), sprites(shade, there * 0.2 * (1 - 0.9 * pale[..., 0]))
 
 
 def white(rng: np.random.Generator, form: str) -> list[np.ndarray]:
-    """A white cell of radius 46: cytoplasm and a nucleus of lobes."""
-    size, plain = 116, form == "lymphocyte"
-    inside = outline(rng, size, 46, 0.12 if form == "monocyte" else 0.06)
+    """A white cell of radius 49: cytoplasm and a nucleus of lobes."""
+    size, plain = 124, form == "lymphocyte"
+    inside = outline(rng, size, WHITE, 0.12 if form == "monocyte" else 0.06)
     colour = np.array({"neutrophil": (202, 176, 210), "eosinophil": (198, 142, 174)}.get(form, (190, 182, 214)), float)
     colour = colour + grain(rng, size, 1.6) * {"eosinophil": (16, 26, 18), "neutrophil": (6, 10, 6)}.get(form, 4)
     lobes = {"neutrophil": rng.integers(3, 6), "eosinophil": 2}.get(form, 1)
     start, nucleus = rng.uniform(0, 6.3), np.full((size, size), -99.0)
     for lobe in range(lobes):
         turn, away = start + lobe * rng.uniform(1.1, 1.9), 0.0 if lobes == 1 else rng.uniform(16, 22)
-        radius = {"neutrophil": rng.uniform(13, 19), "eosinophil": rng.uniform(18, 23)}.get(form, 41 if plain else 34)
+        radius = {"neutrophil": rng.uniform(13, 19), "eosinophil": rng.uniform(18, 23)}.get(form, 43 if plain else 36)
         part = outline(rng, size, radius, 0.1 if plain else 0.22, away * np.cos(turn), away * np.sin(turn))
         nucleus = np.logaddexp(nucleus / 3, part / 3) * 3
     purple = np.array((146, 108, 226)) * rng.uniform(0.7, 1.05) + (9, 11, 6) * grain(rng, size, 3)
@@ -92,10 +92,10 @@ def white(rng: np.random.Generator, form: str) -> list[np.ndarray]:
 
 
 def platelet(rng: np.random.Generator) -> list[np.ndarray]:
-    """A small violet body of radius 9.5, grainy and ragged."""
-    inside = outline(rng, 32, PLATELET, 0.2)
-    core = np.clip(outline(rng, 32, 6, 0.25) / 4 + 0.5, 0, 1)[..., None]
-    colour = (176, 168, 222) - core * (34, 48, 2) + 10 * grain(rng, 32, 1.5)
+    """A small violet body of radius 10.5, grainy and ragged."""
+    inside = outline(rng, 36, PLATELET, 0.2)
+    core = np.clip(outline(rng, 36, 6.5, 0.25) / 4 + 0.5, 0, 1)[..., None]
+    colour = (176, 168, 222) - core * (34, 48, 2) + 10 * grain(rng, 36, 1.5)
     return sprites(colour, np.clip(inside / 3 + 0.5, 0, 1) * rng.uniform(0.6, 0.95))
 
 
@@ -168,15 +168,7 @@ def blood_smear(scene: ps.SceneGraph) -> ps.Drawing:
     stain = torch.stack([1 - 0.06 * dye, 0.98 - 0.1 * dye, 1 - 0.1 * dye - 0.08 * hue], -1)
     violet = torch.stack(torch.broadcast_tensors(0.82 + 0.18 * tone, 0.84 + 0.16 * hue, 1 - 0.1 * dye), -1)
     return scene.draw(
-        ps.Sprites(
-            (),
-            FIELDS,
-            (8 * empty).long().clamp(max=7),
-            WIDTH / 2,
-            HEIGHT / 2,
-            tint=colour,
-            present=torch.ones_like(light) > 0,
-        ),
+        ps.Sprites((), FIELDS, (8 * empty).long().clamp(max=7), WIDTH / 2, HEIGHT / 2, tint=colour, present=light >= 0),
         drawn("rbc", REDS, flat, stain * (0.94 + 0.06 * tone[..., None])),
         drawn("rbc", SHADES, flat, torch.ones(3), labelled=False),
         drawn("wbc", WHITES, look, violet),
