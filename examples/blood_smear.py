@@ -67,7 +67,7 @@ def red(rng: np.random.Generator, pallor: float) -> tuple[list[np.ndarray], list
     middle = outline(rng, 72, rng.uniform(9, 17), 0.25, *rng.normal(0, 2.5, 2))
     pale = pallor * np.clip(middle / 7 + 0.5, 0, 1)[..., None]
     rim = np.exp(-((inside / 3) ** 2))[..., None]
-    colour = (200, 178, 178) + pale * (10, 34, 32) - rim * (2, 8, -4) + 2 * grain(rng, 72, 4) + 2 * grain(rng, 72, 0.7)
+    colour = (200, 178, 178) + pale * (10, 34, 32) - rim * (2, 8, -4) + 2 * grain(rng, 72, 4) + 4 * grain(rng, 72, 0.7)
     there, shade = np.clip(inside + 0.5, 0, 1), np.broadcast_to((134.0, 88.0, 92.0), colour.shape)
     return sprites(colour, there * (0.8 - 0.15 * pale[..., 0])), sprites(shade, there * 0.2 * (1 - 0.9 * pale[..., 0]))
 
@@ -165,7 +165,7 @@ def blood_smear(scene: ps.SceneGraph) -> ps.Drawing:
 
     grey, flat = 0.88 + 0.06 * light, (0.7 * pale + 0.8 * look - 0.2).clamp(0, 1)
     colour = torch.stack([grey, grey, grey - 0.04 * (hue - 0.5)], -1)
-    stain = torch.stack([1 - 0.06 * dye, 0.98 - 0.1 * dye, 1 - 0.1 * dye - 0.08 * hue], -1)
+    stain = torch.stack([1 - 0.06 * dye, 0.98 - 0.08 * dye, 1 - 0.08 * dye - 0.08 * hue], -1)
     violet = torch.stack(torch.broadcast_tensors(0.82 + 0.18 * tone, 0.84 + 0.16 * hue, 1 - 0.1 * dye), -1)
     return scene.draw(
         ps.Sprites((), FIELDS, (8 * empty).long().clamp(max=7), WIDTH / 2, HEIGHT / 2, tint=colour, present=light >= 0),
@@ -185,7 +185,7 @@ def main() -> None:
     parser.add_argument("--out", required=True, help="the PNG to write")
     options = parser.parse_args()
     ps.seed_everything(0)
-    read = [cv2.imread(str(path)) for path in sorted(options.photographs.glob("*.[jp]*g"))]
+    read = [cv2.imread(str(path)) for path in sorted(options.photographs.glob("*"))]
     read = [cv2.resize(pixels, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for pixels in read if pixels is not None]
     if len(read) < 8:
         parser.error(f"expected at least 8 images in {options.photographs}, actual {len(read)}")
