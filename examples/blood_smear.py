@@ -75,17 +75,17 @@ def red(rng: np.random.Generator, pallor: float) -> tuple[list[np.ndarray], list
 def white(rng: np.random.Generator, form: str) -> list[np.ndarray]:
     """A white cell of radius 49: cytoplasm and a nucleus of lobes."""
     size, plain = 124, form == "lymphocyte"
-    inside = outline(rng, size, WHITE, 0.12 if form == "monocyte" else 0.06)
+    inside = outline(rng, size, 0.65 * WHITE if plain else WHITE, 0.06 if form == "neutrophil" else 0.12)
     colour = np.array({"neutrophil": (202, 176, 210), "eosinophil": (198, 142, 174)}.get(form, (190, 182, 214)), float)
-    colour = colour + grain(rng, size, 1.6) * {"eosinophil": (16, 26, 18), "neutrophil": (6, 10, 6)}.get(form, 4)
+    colour = colour + grain(rng, size, 1.6) * {"eosinophil": (24, 38, 26), "neutrophil": (6, 10, 6)}.get(form, 4)
     lobes = {"neutrophil": rng.integers(3, 6), "eosinophil": 2}.get(form, 1)
     start, nucleus = rng.uniform(0, 6.3), np.full((size, size), -99.0)
+    radii = {"neutrophil": (13, 19), "eosinophil": (18, 23), "lymphocyte": (30, 32)}.get(form, (32, 42))
     for lobe in range(lobes):
-        turn, away = start + lobe * rng.uniform(1.1, 1.9), 0.0 if lobes == 1 else rng.uniform(16, 22)
-        radius = {"neutrophil": rng.uniform(13, 19), "eosinophil": rng.uniform(18, 23)}.get(form, 43 if plain else 36)
-        part = outline(rng, size, radius, 0.1 if plain else 0.22, away * np.cos(turn), away * np.sin(turn))
+        turn, away = start + lobe * rng.uniform(1.1, 1.9), 0.0 if lobes == 1 else rng.uniform(18, 28)
+        part = outline(rng, size, rng.uniform(*radii), 0.1 if plain else 0.2, away * np.cos(turn), away * np.sin(turn))
         nucleus = np.logaddexp(nucleus / 3, part / 3) * 3
-    purple = np.array((146, 108, 226)) * rng.uniform(0.7, 1.05) + (9, 11, 6) * grain(rng, size, 3)
+    purple = (146, 108, 226) - rng.uniform(0, 80 if plain else 35) * np.array((1, 0.6, 0.5)) + 9 * grain(rng, size, 3)
     cover = np.clip(nucleus / 3 + 0.5, 0, 1)[..., None]
     alpha = np.clip(inside / 2 + 0.5, 0, 1) * (0.75 + 0.22 * cover[..., 0])
     return sprites(colour * (1 - cover) + purple * cover, alpha)
@@ -95,8 +95,8 @@ def platelet(rng: np.random.Generator) -> list[np.ndarray]:
     """A small violet body of radius 10.5, grainy and ragged."""
     inside = outline(rng, 36, PLATELET, 0.2)
     core = np.clip(outline(rng, 36, 6.5, 0.25) / 4 + 0.5, 0, 1)[..., None]
-    colour = (176, 168, 222) - core * (34, 48, 2) + 10 * grain(rng, 36, 1.5)
-    return sprites(colour, np.clip(inside / 3 + 0.5, 0, 1) * rng.uniform(0.6, 0.95))
+    colour = (170, 166, 220) - core * (38, 50, 4) + 10 * grain(rng, 36, 1.5)
+    return sprites(colour, np.clip(inside / 3 + 0.5, 0, 1) * rng.uniform(0.7, 0.95))
 
 
 def field(rng: np.random.Generator) -> np.ndarray:
@@ -120,7 +120,7 @@ def speck(rng: np.random.Generator) -> list[np.ndarray]:
 RNG = np.random.default_rng(0)
 LOOKS = zip(*(red(RNG, pallor) for pallor in np.linspace(0, 1, 12)), strict=True)
 REDS, SHADES = (Atlas(tuple(chain(*looks))) for looks in LOOKS)
-FORMS = ("neutrophil", "neutrophil", "eosinophil", "lymphocyte", "monocyte")
+FORMS = ("neutrophil", "neutrophil", "eosinophil", "lymphocyte", "lymphocyte", "monocyte")
 WHITES = Atlas(tuple(chain(*(white(RNG, form) for form in FORMS * 4))))
 PLATELETS = Atlas(tuple(chain(*(platelet(RNG) for _ in range(8)))))
 SPECKS = Atlas(tuple(chain(*(speck(RNG) for _ in range(6)))))
@@ -164,9 +164,9 @@ def blood_smear(scene: ps.SceneGraph) -> ps.Drawing:
         return ps.Sprites(kind, looks, sprite, x, y, 2 * math.pi * turn, scale, narrow, tint, **more)
 
     grey, flat = 0.88 + 0.06 * light, (0.7 * pale + 0.8 * look - 0.2).clamp(0, 1)
-    colour = torch.stack([grey, grey, grey - 0.04 * (hue - 0.5)], -1)
-    stain = torch.stack([1 - 0.06 * dye, 0.98 - 0.08 * dye, 1 - 0.08 * dye - 0.08 * hue], -1)
-    violet = torch.stack(torch.broadcast_tensors(0.82 + 0.18 * tone, 0.84 + 0.16 * hue, 1 - 0.1 * dye), -1)
+    colour = torch.stack([grey - 0.03 * hue, grey, grey - 0.02 * hue], -1)
+    stain = torch.stack([1 - 0.06 * dye, 0.98 - 0.08 * dye, 1 - 0.08 * dye - 0.14 * hue], -1)
+    violet = torch.stack(torch.broadcast_tensors(0.9 - 0.25 * hue + 0.1 * tone, 0.84 + 0.16 * hue, 1 - 0.1 * dye), -1)
     return scene.draw(
         ps.Sprites((), FIELDS, (8 * empty).long().clamp(max=7), WIDTH / 2, HEIGHT / 2, tint=colour, present=light >= 0),
         drawn("rbc", REDS, flat, stain * (0.94 + 0.06 * tone[..., None])),
