@@ -75,12 +75,12 @@ def red(rng: np.random.Generator, pallor: float) -> tuple[list[np.ndarray], list
 def white(rng: np.random.Generator, form: str) -> list[np.ndarray]:
     """A white cell of radius 49: cytoplasm and a nucleus of lobes."""
     size, plain = 124, form == "lymphocyte"
-    inside = outline(rng, size, 0.65 * WHITE if plain else WHITE, 0.06 if form == "neutrophil" else 0.12)
+    inside = outline(rng, size, 0.8 * WHITE if plain else WHITE, 0.06 if form == "neutrophil" else 0.12)
     colour = np.array({"neutrophil": (202, 176, 210), "eosinophil": (198, 142, 174)}.get(form, (190, 182, 214)), float)
     colour = colour + grain(rng, size, 1.6) * {"eosinophil": (24, 38, 26), "neutrophil": (6, 10, 6)}.get(form, 4)
     lobes = {"neutrophil": rng.integers(3, 6), "eosinophil": 2}.get(form, 1)
     start, nucleus = rng.uniform(0, 6.3), np.full((size, size), -99.0)
-    radii = {"neutrophil": (13, 19), "eosinophil": (18, 23), "lymphocyte": (30, 32)}.get(form, (32, 42))
+    radii = {"neutrophil": (13, 19), "eosinophil": (18, 23), "lymphocyte": (36, 39)}.get(form, (32, 42))
     for lobe in range(lobes):
         turn, away = start + lobe * rng.uniform(1.1, 1.9), 0.0 if lobes == 1 else rng.uniform(18, 28)
         part = outline(rng, size, rng.uniform(*radii), 0.1 if plain else 0.2, away * np.cos(turn), away * np.sin(turn))
@@ -153,7 +153,7 @@ def blood_smear(scene: ps.SceneGraph) -> ps.Drawing:
     with pyro.plate("dirt", DIRT, dim=-1):
         dirt_x, dirt_y, dirt, there = (pyro.sample(f"dirt.{name}", unit) for name in ("x", "y", "look", "there"))
     red, white = scene.mask("rbc"), scene.mask("wbc")
-    scale = torch.where(red, 0.8 + 0.15 * large + 0.2 * size, torch.where(white, 0.6 + 0.75 * size, 0.7 + 0.7 * size))
+    scale = torch.where(red, 0.8 + 0.15 * large + 0.2 * size, torch.where(white, 0.7 + 0.68 * size, 0.7 + 0.7 * size))
     radius = scale * torch.where(red, RED, torch.where(white, WHITE, PLATELET))
     x, y = settled(x, y, radius, scene.mask(*CLASSES), 0.35 + 0.65 * close)
     blur = (3 * (0.75 * focus + 0.25 * tone)).long().clamp(max=2)
