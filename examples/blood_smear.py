@@ -3,8 +3,8 @@
     python examples/blood_smear.py PHOTOGRAPHS --out beside.png     # photographs above, scenes of the prior below
     probscene fit examples/blood_smear.py --target PHOTOGRAPHS --out runs/blood
 
-PHOTOGRAPHS is a folder of images of 640 x 480 pixels in which a red cell is about 100 across. Sizes and colours were
-taken from looking at them; how many cells the prior has is a guess. ``docs/blood.md`` goes on from here.
+PHOTOGRAPHS is a folder of images of 640 x 480 pixels in which a red cell is about 100 across. Colours were taken from
+looking at them and sizes from boxes; how many cells the prior has is a guess. ``docs/blood.md`` goes on from here.
 """
 
 import argparse
