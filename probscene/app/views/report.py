@@ -17,6 +17,7 @@ from probscene.errors import DataError, RunError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.judge import SCENES, Judged, judge
 from ..evaluation.labels import read_labels
+from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
 from ..fitting import session
 from ..fitting.fit import open_target
@@ -42,6 +43,7 @@ def report(
     labels: Path | None = None,
     num: int = 10000,
     judged_by: int = SCENES,
+    visible: Visible | None = None,
 ) -> Path:
     """Write the page.
 
@@ -50,6 +52,7 @@ def report(
         labels: of the run's target, see ``read_labels``.
         num: structures sampled a source.
         judged_by: scenes rendered for the verdict, none where 0.
+        visible: see ``evaluate``.
 
     Returns:
         Where it is.
@@ -68,7 +71,7 @@ def report(
             raise
         absent = str(error)
     truth = None if labels is None or images is None else read_labels(labels, run.model, images)
-    evaluation = evaluate(run, images, truth, show, num)
+    evaluation = evaluate(run, images, truth, show, num, visible=visible)
     judged = judge(run, images, show, judged_by, evaluation) if images and judged_by else None
     return write(run, evaluation, images, out, absent, judged)
 
