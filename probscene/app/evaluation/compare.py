@@ -201,8 +201,8 @@ def compare(
     if truth is not None:
         sources[TRUTH] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
     else:
-        seen = (network_counts(run, target, progress) for run in runs.values())
-        if (estimate := next((source for source in seen if source is not None), None)) is not None:
+        estimates = (network_counts(run, target, progress) for run in runs.values())
+        if (estimate := next((source for source in estimates if source is not None), None)) is not None:
             sources[ESTIMATE] = estimate
     classes = tuple(model.classes[c] for c in columns)
     notes += whole_note(model, first.guide, truth, seen) + (() if truth is None else truth.notes)
