@@ -126,6 +126,7 @@ def compare(
     min_height: float = 0.0,
     progress: bool = True,
     visible: Visible | None = None,
+    some_labels: bool = False,
 ) -> Comparison:
     """The prior, several runs of one model and the truth side by side.
 
@@ -135,7 +136,7 @@ def compare(
         labels: see ``evaluate``.
         out: the picture to write, a PNG; none where None.
         num: structures a source.
-        visible: see ``evaluate``.
+        visible, some_labels: see ``evaluate``.
 
     Raises:
         ProbsceneError: see ``evaluation.compare``.
@@ -146,7 +147,7 @@ def compare(
     first = next(iter(opened.values()))
     with display(progress) as show:
         images = None if target is None and labels is None else _images(first, target, show)
-        truth = _truth(labels, first.model, images, False, min_height)
+        truth = _truth(labels, first.model, images, some_labels, min_height)
         found = comparing.compare(opened, images, truth, show, num, visible=visible)
         if out is not None:
             comparison_picture.draw(found, Path(out))
@@ -161,6 +162,7 @@ def report(
     scenes: int = reporting.SCENES,
     progress: bool = True,
     visible: Visible | None = None,
+    some_labels: bool = False,
 ) -> Path:
     """Write one self-contained HTML page about a run; returns where it is.
 
@@ -169,7 +171,7 @@ def report(
         labels: of the run's target, see ``evaluate``.
         num: structures a source.
         scenes: rendered of prior and guide for the verdict; 0 for none.
-        visible: see ``evaluate``.
+        visible, some_labels: see ``evaluate``.
 
     Raises:
         ProbsceneError: see ``views.report``.
@@ -177,7 +179,7 @@ def report(
     opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
     with display(progress) as show:
         where, truth = None if out is None else Path(out), None if labels is None else Path(labels)
-        return reporting.report(opened, show, where, truth, num, scenes, visible)
+        return reporting.report(opened, show, where, truth, num, scenes, visible, some_labels)
 
 
 def display(progress: bool) -> Display:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from .application import app
-from .options import MinHeight, RunPath, Seed, Visible
+from .options import MinHeight, RunPath, Seed, SomeLabels, Visible
 
 
 @app.command()
@@ -57,7 +57,7 @@ def evaluate(
     ] = None,
     num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
-    some_labels: Annotated[bool, typer.Option("--some-labels", help="Labels need not cover all images.")] = False,
+    some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
     visible: Visible = None,
 ) -> None:
@@ -99,12 +99,13 @@ def report(
     labels: Annotated[Path | None, typer.Option(metavar="PATH", help="Of the run's target, as of evaluate.")] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
+    some_labels: SomeLabels = False,
     visible: Visible = None,
 ) -> None:
     """Write one self-contained HTML page about a run."""
     from ..api import calls
 
-    path = calls.report(run, out, labels, num, scenes, visible=visible)
+    path = calls.report(run, out, labels, num, scenes, some_labels=some_labels, visible=visible)
     print(f"The report is {path}")
 
 
@@ -119,6 +120,7 @@ def compare(
         Path | None,
         typer.Option(metavar="PATH", help="Of the target, as of evaluate, for the truth."),
     ] = None,
+    some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
     visible: Visible = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
@@ -133,7 +135,7 @@ def compare(
 
     if json is not None:
         make_folder(json.parent)
-    found = calls.compare(runs, target, labels, out, num, min_height, visible=visible)
+    found = calls.compare(runs, target, labels, out, num, min_height, some_labels=some_labels, visible=visible)
     tables.show_comparison(found, Console(highlight=False))
     print(f"The picture is {out}")
     if json is not None:

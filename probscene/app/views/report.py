@@ -44,6 +44,7 @@ def report(
     num: int = 10000,
     judged_by: int = SCENES,
     visible: Visible | None = None,
+    some_labels: bool = False,
 ) -> Path:
     """Write the page.
 
@@ -53,6 +54,7 @@ def report(
         num: structures sampled a source.
         judged_by: scenes rendered for the verdict, none where 0.
         visible: see ``evaluate``.
+        some_labels: labels need not cover all images.
 
     Returns:
         Where it is.
@@ -70,7 +72,7 @@ def report(
         if labels is not None:
             raise
         absent = str(error)
-    truth = None if labels is None or images is None else read_labels(labels, run.model, images)
+    truth = None if labels is None or images is None else read_labels(labels, run.model, images, some_labels)
     evaluation = evaluate(run, images, truth, show, num, visible=visible)
     judged = judge(run, images, show, judged_by, evaluation) if images and judged_by else None
     return write(run, evaluation, images, out, absent, judged)

@@ -155,6 +155,13 @@ def test_every_command_counts_what_can_be_seen(call, fitted, target, tmp_path):
     assert call("report", fitted, *words, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
     page = (tmp_path / "r.html").read_text()
     assert "red 90 %, blue 100 %" in page and f"{moved:.3f}" in page
+    (tmp_path / "few.csv").write_text("\n".join(target.labels.read_text().splitlines()[:6]))
+    words[1] = tmp_path / "few.csv"
+    refused = call("report", fitted, *words, "--scenes", 0, "--out", tmp_path / "few.html")
+    assert refused.code == 2 and "add --some-labels" in refused.err
+    assert call("report", fitted, *words, "--scenes", 0, "--out", tmp_path / "few.html", "--some-labels").code == 0
+    done = call("compare", fitted, *words, "--out", tmp_path / "c.png", "--some-labels")
+    assert done.code == 0 and f"({target.counts[:5, 0].mean():.2f})" in done.out, done.err
     done = call("evaluate", fitted, "--target", target.images, "--visible", "green=0.5")
     assert done.code == 2 and "red, blue, actual 'green'" in done.err
 
