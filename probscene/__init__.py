@@ -24,6 +24,7 @@ __version__ = "0.2.0"
 _HOME = {
     "api.calls": ("compare", "evaluate", "generate", "render", "report"),
     "api.fit": ("fit",),
+    "api.label": ("label",),
     "api.run": ("Run",),
     "datasets.scene_dataset": ("SceneDataset",),
     "fitting.presets": ("Preset",),
@@ -62,6 +63,7 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 if TYPE_CHECKING:
     from probscene.app.api.calls import compare, evaluate, generate, render, report
     from probscene.app.api.fit import fit
+    from probscene.app.api.label import label
     from probscene.app.api.run import Run
     from probscene.app.datasets.scene_dataset import SceneDataset
     from probscene.app.fitting.presets import Preset
@@ -97,8 +99,8 @@ __all__ = [
     "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "Photo", "Policy", "Preset",
     "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph",
     "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive",
-    "evaluate", "fit", "generate", "load_model", "pretrain", "ranked", "render", "report", "sample", "scene_model",
-    "seed_everything", "weights",
+    "evaluate", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report", "sample",
+    "scene_model", "seed_everything", "weights",
 ]  # fmt: skip
 
 

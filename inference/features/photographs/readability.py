@@ -22,6 +22,7 @@ SKILL = 0.8  # least correlation with the true counts of renders
 BASE = 0.3  # objects
 RENDERS = 1.0  # how many labelled images the error on renders is worth
 ENOUGH = 5  # labelled images from which on rules are chosen by them
+MUCH, LITTLE = 1.25, 0.1  # by which factor, and how many objects, a larger share must mend the error
 GOES_WITH = 0.4  # least correlation of labels with a reading that is believed without them
 APART = 0.25  # relative difference of means from which on labels and such a reading are of different things
 Array = NDArray[np.float64]
@@ -164,10 +165,11 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
 
 
 def _choose(seen: Array, labels: Array, drawn: Array) -> tuple[int, int]:
-    """The share and the rule with the least error on labelled images ``(K, S, R)`` and on renders ``(S, R)``."""
-    cost = len(labels) * _errors(seen, labels[:, None, None]) + RENDERS * drawn
-    share, rule = np.unravel_index(np.argmin(cost), cost.shape)
-    return int(share), int(rule)
+    """The share and the rule with the least error on labelled images ``(K, S, R)`` and on renders ``(S, R)``; of shares
+    that do about as well the least, which asks least of where objects stand."""
+    cost = _errors(seen, labels[:, None, None]) + RENDERS / len(labels) * drawn
+    share = int(np.argmax(cost.min(1) <= MUCH * cost.min() + LITTLE))
+    return share, int(np.argmin(cost[share]))
 
 
 def _errors(read: Array, true: Array) -> Array:

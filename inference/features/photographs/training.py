@@ -1,8 +1,8 @@
 """Training ``PretrainedCountNet`` on renders with their free labels.
 
 The frozen network sees each image once; its maps stay in memory as half-precision numbers, 0.2 MB an image of 320 x
-240, and the heads take many epochs on them. Each structure is drawn twice, the second time as a camera might have taken
-it (``looks``). Photographs' maps are unlike renders' channel by channel, so the heads are kept from relying on any:
+240, and the heads take many epochs on them. Every render looks as a camera might have taken it (``looks``). Photographs'
+maps are unlike renders' channel by channel, so the heads are kept from relying on any:
 channels are left out (``heads.DROPPED``) and shifted at random.
 
 Axis letters: N images, M nodes, S shares.
@@ -124,7 +124,7 @@ class PretrainedCountTraining:
         while done < total:
             number = min(DRAWN_AT_ONCE, total - done, self.pairs - done if done < self.pairs else total)
             drawn = self.draw_twice(number)
-            maps = self.net.look(torch.cat([drawn.image[:number], photographed(drawn.image[number:], rng)]))
+            maps = self.net.look(photographed(drawn.image, rng))
             parts.append([*(some.half() for some in maps), self._target(drawn).half(), self.net.true_counts(drawn)])
             shown = drawn.label.masked_fill(drawn.visible < SHARES[0], -1)
             for c, of_class in enumerate(sizes):

@@ -19,6 +19,7 @@ from ..evaluation import evaluate as evaluating
 from ..evaluation.compare import Comparison
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.labels import Labels, read_labels
+from ..evaluation.visible import Visible
 from ..fitting import session
 from ..fitting.fit import open_target
 from ..fitting.run import RunFolder, is_run
@@ -90,17 +91,20 @@ def evaluate(
     some_labels: bool = False,
     min_height: float = 0.0,
     progress: bool = True,
+    visible: Visible | None = None,
 ) -> Evaluation:
     """Count what the prior and the guide derive, beside the labels and what the run's network sees in the target.
 
     Args:
         target: the images to judge by; the run's own where None.
-        labels: ``counts.csv``, ``provenance.jsonl`` or KITTI's folder ``label_2``.
+        labels: ``counts.csv``, COCO's ``.json``, ``provenance.jsonl`` or KITTI's folder ``label_2``.
         num: structures a source.
         features: networks for FID and KID, such as ``["efficientnet"]``.
         images: at most so many a side for them.
         some_labels: labels need not cover all images.
-        min_height: of objects that KITTI's labels count, pixels.
+        min_height: of objects that labels with boxes count, pixels.
+        visible: least visible share of objects that are counted in rendered scenes, 0 to 1: one, or one for each class
+            by name; where None, the run's, if its labels were read so.
 
     Raises:
         ProbsceneError: see ``evaluation.evaluate`` and ``read_labels``.
@@ -110,7 +114,7 @@ def evaluate(
     with display(progress) as show:
         seen = _images(opened, target, show)
         truth = _truth(labels, opened.model, seen, some_labels, min_height)
-        return evaluating.evaluate(opened, seen, truth, show, num, features=features, images=images)
+        return evaluating.evaluate(opened, seen, truth, show, num, features=features, images=images, visible=visible)
 
 
 def compare(
@@ -121,6 +125,8 @@ def compare(
     num: int = 10000,
     min_height: float = 0.0,
     progress: bool = True,
+    visible: Visible | None = None,
+    some_labels: bool = False,
 ) -> Comparison:
     """The prior, several runs of one model and the truth side by side.
 
@@ -130,6 +136,7 @@ def compare(
         labels: see ``evaluate``.
         out: the picture to write, a PNG; none where None.
         num: structures a source.
+        visible, some_labels: see ``evaluate``.
 
     Raises:
         ProbsceneError: see ``evaluation.compare``.
@@ -140,8 +147,8 @@ def compare(
     first = next(iter(opened.values()))
     with display(progress) as show:
         images = None if target is None and labels is None else _images(first, target, show)
-        truth = _truth(labels, first.model, images, False, min_height)
-        found = comparing.compare(opened, images, truth, show, num)
+        truth = _truth(labels, first.model, images, some_labels, min_height)
+        found = comparing.compare(opened, images, truth, show, num, visible=visible)
         if out is not None:
             comparison_picture.draw(found, Path(out))
     return found
@@ -154,6 +161,8 @@ def report(
     num: int = 10000,
     scenes: int = reporting.SCENES,
     progress: bool = True,
+    visible: Visible | None = None,
+    some_labels: bool = False,
 ) -> Path:
     """Write one self-contained HTML page about a run; returns where it is.
 
@@ -162,6 +171,7 @@ def report(
         labels: of the run's target, see ``evaluate``.
         num: structures a source.
         scenes: rendered of prior and guide for the verdict; 0 for none.
+        visible, some_labels: see ``evaluate``.
 
     Raises:
         ProbsceneError: see ``views.report``.
@@ -169,7 +179,7 @@ def report(
     opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
     with display(progress) as show:
         where, truth = None if out is None else Path(out), None if labels is None else Path(labels)
-        return reporting.report(opened, show, where, truth, num, scenes)
+        return reporting.report(opened, show, where, truth, num, scenes, visible, some_labels)
 
 
 def display(progress: bool) -> Display:

@@ -1,4 +1,4 @@
-"""``probscene check``, ``preview`` and ``view``: looks at a model, or at what a run has learnt."""
+"""``probscene check``, ``preview``, ``view``, ``label``: what is done with a model, or with what a run has learnt."""
 
 from pathlib import Path
 from typing import Annotated
@@ -53,3 +53,25 @@ def view(
 
     view(model_or_run, out, num, checked_seed(seed), assets)
     print(f"{num} {'scene' if num == 1 else 'scenes'} in {out}")
+
+
+@app.command()
+def label(
+    model_or_run: Annotated[
+        str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a run: one that counts proposes better.")
+    ],
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="A folder of PNG or JPEG images.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write: a sheet, a CSV, the pictures.")],
+    number: Annotated[int, typer.Option(metavar="N", help="How many images to label.")] = 10,
+    labels: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Of images that are labelled already; others are proposed.")
+    ] = None,
+    seed: Seed = 0,
+    skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = False,
+    assets: Assets = None,
+) -> None:
+    """Propose which images to label next, and write the sheet in which to count."""
+    from ..api import label
+
+    sheet = label.label(model_or_run, target, out, number, labels, seed, skip_bad, assets)
+    print(f"Count in {len(sheet.names)} pictures: open {sheet.page} in a browser, or fill in {sheet.table}")

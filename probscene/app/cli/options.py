@@ -18,4 +18,12 @@ Cache = Annotated[
 ]
 NoCache = Annotated[bool, typer.Option("--no-cache", help="Train the feature network anew, and keep it nowhere else.")]
 MinHeight = Annotated[float, typer.Option(min=0, help="Of objects that KITTI's labels count, pixels of their boxes.")]
+SomeLabels = Annotated[bool, typer.Option("--some-labels", help="Labels need not cover all images.")]
+Visible = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="[CLASS=]SHARE",
+        help="Count objects of rendered scenes of which at least this is visible, 0 to 1; many.",
+    ),
+]
 PresetName = StrEnum("PresetName", ["quick", "default", "paper", "street"])

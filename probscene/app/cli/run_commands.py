@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from .application import app
-from .options import MinHeight, RunPath, Seed
+from .options import MinHeight, RunPath, Seed, SomeLabels, Visible
 
 
 @app.command()
@@ -45,7 +45,8 @@ def evaluate(
     labels: Annotated[
         Path | None,
         typer.Option(
-            metavar="PATH", help="A counts.csv (image,CLASS,...), a provenance.jsonl, or KITTI's folder label_2."
+            metavar="PATH",
+            help="A counts.csv (image,CLASS,...), COCO's .json, a provenance.jsonl, or KITTI's folder label_2.",
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
@@ -56,8 +57,9 @@ def evaluate(
     ] = None,
     num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
-    some_labels: Annotated[bool, typer.Option("--some-labels", help="Labels need not cover all images.")] = False,
+    some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
+    visible: Visible = None,
 ) -> None:
     """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
     from rich.console import Console
@@ -78,7 +80,7 @@ def evaluate(
     with Display() as show:
         images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
-        found = evaluate(opened, images, truth, show, num, features=features or (), images=num_images)
+        found = evaluate(opened, images, truth, show, num, features=features or (), images=num_images, visible=visible)
         judged = verdict.judge(opened, images, show, scenes, found) if scenes else None
     console = Console(highlight=False)
     if judged is not None:
@@ -94,16 +96,16 @@ def report(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="report.html in the run folder if not given.")
     ] = None,
-    labels: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="counts.csv, provenance.jsonl or label_2 of the run's target.")
-    ] = None,
+    labels: Annotated[Path | None, typer.Option(metavar="PATH", help="Of the run's target, as of evaluate.")] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
+    some_labels: SomeLabels = False,
+    visible: Visible = None,
 ) -> None:
     """Write one self-contained HTML page about a run."""
     from ..api import calls
 
-    path = calls.report(run, out, labels, num, scenes)
+    path = calls.report(run, out, labels, num, scenes, some_labels=some_labels, visible=visible)
     print(f"The report is {path}")
 
 
@@ -116,9 +118,11 @@ def compare(
     ] = None,
     labels: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="counts.csv, provenance.jsonl or label_2 of the target, for the truth."),
+        typer.Option(metavar="PATH", help="Of the target, as of evaluate, for the truth."),
     ] = None,
+    some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
+    visible: Visible = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
 ) -> None:
@@ -131,7 +135,7 @@ def compare(
 
     if json is not None:
         make_folder(json.parent)
-    found = calls.compare(runs, target, labels, out, num, min_height)
+    found = calls.compare(runs, target, labels, out, num, min_height, some_labels=some_labels, visible=visible)
     tables.show_comparison(found, Console(highlight=False))
     print(f"The picture is {out}")
     if json is not None:

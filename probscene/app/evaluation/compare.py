@@ -15,7 +15,7 @@ import numpy as np
 import probscene
 from probscene.dataset import Images
 from probscene.errors import ProbsceneError, RunError
-from probscene.inference.judging.metrics import Shares, histogram, pooled_shares, total_variation
+from probscene.inference.judging.metrics import Shares, histogram, pooled_shares, total_variation, wasserstein
 from probscene.inference.judging.tally import Tally
 
 from ..fitting.fit import Progress
@@ -25,7 +25,7 @@ from .labels import Labels
 from .likelihood import Likelihood, likelihood
 from .sources import Source
 from .structure_counts import GROUPS, PARENTS, label
-from .visible import counted, number_of
+from .visible import Visible, counted, number_of, seen_by, whole_note
 
 PRIOR, TRUTH, ESTIMATE = "prior", "truth", "estimate"
 SAME = ("model", "model_sha256", "assets")  # what runs of one model agree in
@@ -39,12 +39,14 @@ class Row(NamedTuple):
         shares: by source, ``(K,)`` shares by count, or by class.
         means: by source; empty where a mean says nothing.
         apart: by source other than the reference, the total variation to the reference.
+        moved: Wasserstein-1 to it, in what is counted; empty for shares by class.
     """
 
     label: str
     shares: dict[str, Shares]
     means: dict[str, float]
     apart: dict[str, float]
+    moved: dict[str, float] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +119,9 @@ class Comparison(Evaluation):
         if known is None:
             return Row(words, shares, means, {})
         others = {name: p for name, p in shares.items() if name != self.reference}
-        return Row(words, shares, means, {name: total_variation(p, known) for name, p in others.items()})
+        apart = {name: total_variation(p, known) for name, p in others.items()}
+        moved = {name: wasserstein(p, known) for name, p in others.items()} if means else {}
+        return Row(words, shares, means, apart, moved)
 
 
 def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
@@ -154,6 +158,7 @@ def compare(
     progress: Progress,
     num: int = 10000,
     seed: int = 0,
+    visible: Visible | None = None,
 ) -> Comparison:
     """Sample structures of the prior and of every guide, and count.
 
@@ -162,9 +167,10 @@ def compare(
         target: its images; without them, what the first run's network saw in the images that it was fitted to.
         truth: the labels of the target's images.
         num: structures a source.
+        visible: see ``evaluate``; those of the first run, where it has some and this is None.
 
     Raises:
-        ProbsceneError: a number that is not positive.
+        ProbsceneError: a number that is not positive; see ``seen_by``.
         RunError: there are no target images, and the runs were fitted to different ones.
     """
     if num < 1:
@@ -177,27 +183,29 @@ def compare(
             f"{other.target}; say with --target which to compare with."
         )
     model, done = first.model, 0
+    seen, notes = seen_by(model, first, truth, visible)
     columns = list(range(len(model.classes))) if truth is None else truth.columns(model)
 
     def each(scenes):
         nonlocal done
         done += scenes
-        progress("counting", done, (1 + len(runs)) * number_of(truth, num), "")
+        progress("counting", done, (1 + len(runs)) * number_of(seen, num), "")
 
     sources: dict[str, Source] = {}
     likelihoods: dict[str, Likelihood] = {}
     for name, policy in {PRIOR: model.prior, **{name: run.guide for name, run in runs.items()}}.items():
-        found = counted(model, policy, num, seed, truth, each)
+        found = counted(model, policy, num, seed, seen, each)
         sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:
             likelihoods[name] = likelihood(policy, truth.derivation)
     if truth is not None:
         sources[TRUTH] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
     else:
-        seen = (network_counts(run, target, progress) for run in runs.values())
-        if (estimate := next((source for source in seen if source is not None), None)) is not None:
+        estimates = (network_counts(run, target, progress) for run in runs.values())
+        if (estimate := next((source for source in estimates if source is not None), None)) is not None:
             sources[ESTIMATE] = estimate
-    classes, notes = tuple(model.classes[c] for c in columns), () if truth is None else truth.notes
+    classes = tuple(model.classes[c] for c in columns)
+    notes += whole_note(model, first.guide, truth, seen) + (() if truth is None else truth.notes)
     return Comparison(first, path, classes, sources, likelihoods, notes=notes, runs=runs)
 
 

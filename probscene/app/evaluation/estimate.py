@@ -40,6 +40,19 @@ def estimated(
     return counts, total, children
 
 
+def class_counts(model: SceneModel, names: tuple[str, ...], features: Tensor) -> Tensor | None:
+    """Counts ``(L, c)`` as they were read, not rounded, of the c classes that features count; None if they count none.
+
+    Args:
+        names: of the features.
+        features: ``(L, D)``, objects.
+    """
+    column = dict(zip(names, features.T, strict=True))
+    parts = [[name] if name in column else _numbered(names, name) for name in model.classes]
+    found = [torch.stack([column[part] for part in each]).sum(0) for each in parts if each]
+    return torch.stack(found, 1) if found else None
+
+
 def _numbered(names: tuple[str, ...], name: str) -> list[str]:
     return [each for each in names if re.fullmatch(rf"{re.escape(name)} \d+", each)]
 

@@ -33,7 +33,7 @@ from .labels import Labels
 from .likelihood import Likelihood, likelihood
 from .sources import Source
 from .structure_counts import Relation
-from .visible import counted, number_of
+from .visible import Visible, counted, number_of, seen_by, whole_note
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +135,7 @@ class Evaluation:
         return {
             "scenes": len(source.total),
             "mean_number": float(source.total.mean()),
+            "means": {name: float(source.counts[:, c].mean()) for c, name in enumerate(self.classes)},
             "number": _plain(source.number()),
             "classes": _plain(source.classes()),
             "each_class": {name: histogram(source.counts[:, c]).tolist() for c, name in enumerate(self.classes)},
@@ -156,18 +157,21 @@ def evaluate(
     seed: int = 0,
     features: Sequence[str] = (),
     images: int = IMAGES,
+    visible: Visible | None = None,
 ) -> Evaluation:
     """Sample structures of the prior and of the guide and count, beside the truth and the network's estimate.
 
     Args:
         target: its images; without them there is only the run's own record of what the network saw.
         truth: the labels of the target's images.
-        num: structures a source; see ``shown.SHOWN`` where they are rendered for it.
+        num: structures a source; see ``visible.SHOWN`` where they are rendered for it.
         features: networks to compare images by, see ``seen.network``; none, as it renders.
         images: how many are compared at most, where they are.
+        visible: least visible shares of what is counted in rendered scenes, see ``visible.Visible``; those of the run,
+            where it has some and this is None.
 
     Raises:
-        ProbsceneError: a number that is not positive; see ``image_distances``.
+        ProbsceneError: a number that is not positive; see ``image_distances`` and ``seen_by``.
         RunError: the fit is not finished.
     """
     if num < 1:
@@ -175,12 +179,13 @@ def evaluate(
     if features and target is None:
         raise ProbsceneError("Expected the target's images to compare features with, actual none.")
     policies = {"prior": run.model.prior, "learnt": run.guide}
+    seen, notes = seen_by(run.model, run, truth, visible)
     done = 0
 
     def each(scenes):
         nonlocal done
         done += scenes
-        progress("counting", done, 2 * number_of(truth, num), "")
+        progress("counting", done, 2 * number_of(seen, num), "")
 
     columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
     compared = {}
@@ -188,7 +193,7 @@ def evaluate(
         compared = image_distances(run, target, features, progress, images, seed)
     sources, likelihoods = {}, {}
     for name, policy in policies.items():
-        found = counted(run.model, policy, num, seed, truth, each)
+        found = counted(run.model, policy, num, seed, seen, each)
         sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:
             likelihoods[name] = likelihood(policy, truth.derivation)
@@ -198,14 +203,20 @@ def evaluate(
     if estimate is not None:
         sources["estimate"] = estimate.only(columns)
     path = run.target if target is None else target.path
-    classes, notes = tuple(run.model.classes[c] for c in columns), () if truth is None else truth.notes
+    classes = tuple(run.model.classes[c] for c in columns)
+    notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
     short = piled(run.model, run.guide, estimate, seed)
-    beyond = _inexpressible(run, classes, sources, truth, target)
+    beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
     return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond)
 
 
 def _inexpressible(
-    run: RunFolder, classes: tuple[str, ...], sources: dict[str, Source], truth: Labels | None, target: Images | None
+    run: RunFolder,
+    classes: tuple[str, ...],
+    sources: dict[str, Source],
+    truth: Labels | None,
+    target: Images | None,
+    visible: bool,
 ) -> tuple[Inexpressible, ...]:
     """By the labels, else by the estimate of the classes whose instances can be counted."""
     by = next((name for name in ("truth", "estimate") if name in sources), None)
@@ -217,7 +228,6 @@ def _inexpressible(
         classes, source = tuple(classes[c] for c in columns), source.only(columns)
     names = [] if target is None else [file.name for file in target.paths]
     names = names if len(names) == len(source.counts) else []
-    visible = truth is not None and truth.min_height is not None
     return inexpressible(run.model, source, classes, by == "truth", names, visible)
 
 

@@ -2,61 +2,187 @@
 
 A street's structure holds cars behind other cars, beside the image and too far away to be labelled: of the driving
 model's cars in a city, about one in eight has no visible pixel, and one in four more is lower than 25 of KITTI's. Where
-labels are of what can be seen, so is what they are compared with.
+labels are of what can be seen, so is what they are compared with. People leave out what is hidden for the most part,
+too: how much of an object of a class must be seen for them to count it is its least visible share.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 
 from probscene.batch import RenderBatch
+from probscene.errors import ProbsceneError, RunError
 from probscene.model import SceneModel
 from probscene.policy import Policy
 
 from ..chunks import CHUNK, draw_chunk
 from ..datasets.coco import labelled
+from ..fitting.storage import Storage
 from ..loading import renderer_for
 from .labels import Labels
 from .structure_counts import Counts, StructureCounts, sampled
 
 SHOWN = 2000  # scenes at most that are rendered to be counted
+LOOKED_AT = 128  # scenes that are rendered to see how much of them is hidden
+HARDLY, SOME = 0.25, 0.02  # visible share of an object that is hardly seen; share of such objects that matters
 
 Each = Callable[[int], None]
 """Told how many more are counted."""
 
+Visible = float | Mapping[str, float] | Sequence[str]
+"""Least visible shares, 0 to 1: of every class, by class, or in words such as ``"0.25"`` and ``"rbc=0.6"``."""
 
-def number_of(truth: Labels | None, num: int) -> int:
+
+class Seen(NamedTuple):
+    """What must be seen of an object for labels to count it; some pixel in any case.
+
+    Attributes:
+        min_height: of its box, pixels of the canvas.
+        shares: by class, of its silhouette; 0 for others.
+    """
+
+    min_height: float = 0.0
+    shares: Mapping[str, float] = {}
+
+
+def seen_by(
+    model: SceneModel, run: Storage, truth: Labels | None, given: Visible | None
+) -> tuple[Seen | None, tuple[str, ...]]:
+    """What must be seen of an object to be counted, None where whole structures are, and notes for a person.
+
+    Args:
+        run: knows the shares, it may be, where none are given.
+        given: the shares.
+
+    Raises:
+        ProbsceneError: see ``visible_shares``; shares for labels that are whole structures.
+    """
+    if isinstance(given, Sequence | Mapping) and not given:
+        given = None
+    if truth is not None and truth.derivation is not None:
+        if given is not None:
+            raise ProbsceneError(
+                "Expected labels of what can be seen with a visible share, actual whole structures; leave out the "
+                "share, or give labels that people made."
+            )
+        return None, ()
+    shares = _of_run(model, run) if given is None else visible_shares(given, model.classes)
+    if given is None and not shares:
+        return (None if truth is None or truth.min_height is None else Seen(truth.min_height)), ()
+    said = ", ".join(f"{name} {100 * share:.3g} %" for name, share in shares.items())
+    where = "" if given is not None else ", as the run's labels were read"
+    note = (
+        f"Prior and learnt scenes are rendered, and objects counted of which at least this is visible: {said}{where}."
+    )
+    return Seen(0.0 if truth is None else truth.min_height or 0.0, shares), (note,)
+
+
+def visible_shares(given: Visible, classes: tuple[str, ...]) -> dict[str, float]:
+    """Least visible shares by class, all classes if one is for all.
+
+    Raises:
+        ProbsceneError: not a share from 0 to 1, no class of the model, or one twice.
+    """
+    if isinstance(given, int | float):
+        pairs = [("", given)]
+    elif isinstance(given, Mapping):
+        pairs = list(given.items())
+    else:
+        pairs = [(name, _number(share)) for name, _, share in (word.rpartition("=") for word in given)]
+    found: dict[str, float] = {}
+    for name, share in pairs:
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
+            raise ProbsceneError(f"Expected a visible share from 0 to 1, or CLASS=SHARE, actual {share!r}.")
+        if name in found:
+            raise ProbsceneError(
+                f"Expected one visible share {f'of {name}' if name else 'of all classes'}, actual two."
+            )
+        found[name] = float(share)
+    if unknown := next((name for name in found if name and name not in classes), None):
+        raise ProbsceneError(
+            f"Expected a visible share of a class among {', '.join(classes)}, actual {unknown!r}; mend the name."
+        )
+    every = {name: found[""] for name in classes} if "" in found else {}
+    return every | {name: share for name, share in found.items() if name}
+
+
+def hidden(model: SceneModel, policy: Policy, columns: Sequence[int], seed: int = 0) -> dict[str, float]:
+    """Of each of some classes, the share of the objects in scenes with structures from ``policy`` that are hardly
+    seen; classes without objects are left out.
+
+    Args:
+        columns: the classes, by number.
+    """
+    render, drawn, hardly = renderer_for(model), torch.zeros(len(columns)), torch.zeros(len(columns))
+    kinds = torch.tensor([model.grammar.kind(model.classes[c]) for c in columns]).view(-1, 1, 1)
+    for chunk in range(LOOKED_AT // CHUNK):
+        batch = render(draw_chunk(model, policy, seed, chunk).drawing)
+        of_class = batch.kind == kinds
+        drawn += of_class.sum((1, 2))
+        hardly += (of_class & (batch.visible < HARDLY)).sum((1, 2))
+    each = zip((model.classes[c] for c in columns), (hardly / drawn).tolist(), strict=True)
+    return {name: share for name, share in each if math.isfinite(share)}
+
+
+def whole_note(model: SceneModel, policy: Policy, truth: Labels | None, seen: Seen | None) -> tuple[str, ...]:
+    """A note that labels are compared with whole structures, where what can be seen is something else."""
+    if truth is None or truth.derivation is not None or seen is not None:
+        return ()
+    shares = {name: share for name, share in hidden(model, policy, truth.columns(model)).items() if share > SOME}
+    if not shares:
+        return ()
+    said = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
+    return (
+        "Counts are compared with whole structures; in learnt scenes less than a quarter can be seen of some objects "
+        f"({said}). If labels leave out what is hidden, add --visible {HARDLY:g}, or --visible CLASS=SHARE.",
+    )
+
+
+def number_of(seen: Seen | None, num: int) -> int:
     """How many scenes ``counted`` counts of ``num``."""
-    return num if truth is None or truth.min_height is None else min(num, SHOWN)
+    return num if seen is None else min(num, SHOWN)
 
 
 def counted(
-    model: SceneModel, policy: Policy, num: int, seed: int, truth: Labels | None, each: Each | None = None
+    model: SceneModel, policy: Policy, num: int, seed: int, seen: Seen | None, each: Each | None = None
 ) -> StructureCounts:
-    """The counts of scenes with structures from ``policy``, to compare with ``truth``: rendered where its labels are of
-    what can be seen, else as ``sampled`` gives them."""
-    if truth is None or truth.min_height is None:
+    """The counts of scenes with structures from ``policy``: rendered where it is said what must be seen of an object,
+    else as ``sampled`` gives them."""
+    if seen is None:
         return sampled(model, policy, num, seed, each)
-    return StructureCounts(shown(model, policy, number_of(truth, num), seed, truth.min_height, each), {})
+    return StructureCounts(shown(model, policy, number_of(seen, num), seed, seen, each), {})
 
 
-def shown(
-    model: SceneModel, policy: Policy, num: int, seed: int, min_height: float, each: Each | None = None
-) -> Counts:
-    """The labels ``(num, C)`` by class of what ``generate`` would write in KITTI's format, the same for the same seed.
-
-    Args:
-        min_height: of a box that is counted, pixels of the canvas.
-    """
+def shown(model: SceneModel, policy: Policy, num: int, seed: int, seen: Seen, each: Each | None = None) -> Counts:
+    """The labels ``(num, C)`` by class of what ``generate`` would write in KITTI's format and is seen well enough; the
+    same for the same seed."""
     render, parts = renderer_for(model), []
     numbers = torch.arange(1, len(model.classes) + 1).view(-1, 1, 1)
+    least = torch.tensor([seen.shares.get(name, 0.0) for name in model.classes]).view(-1, 1, 1)
     for chunk, first in enumerate(range(0, num, CHUNK)):
         batch = render(draw_chunk(model, policy, seed, chunk).drawing[: num - first])
-        counts = (labelled(model, batch) == numbers) & (_height(model, batch) >= min_height)
-        parts.append(counts.sum(2).T)
+        enough = (_height(model, batch) >= seen.min_height) & (batch.visible >= least)
+        parts.append(((labelled(model, batch) == numbers) & enough).sum(2).T)
         if each is not None:
             each(len(parts[-1]))
     return torch.cat(parts).numpy()
+
+
+def _of_run(model: SceneModel, run: Storage) -> dict[str, float]:
+    shares = run.visible_shares()
+    try:
+        return visible_shares(shares, model.classes)
+    except ProbsceneError as error:
+        raise RunError(f"Expected visible shares of the model's classes in {run.path}, actual {shares}.") from error
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _height(model: SceneModel, batch: RenderBatch) -> torch.Tensor:

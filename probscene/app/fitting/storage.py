@@ -7,6 +7,7 @@
     readings.json          how its features are read in the target's images, where they are suited to them
     outcome.json           how far prior and learnt scenes are from the target, and which are kept
     real.safetensors       features of the target images
+    readings.json          how each class is read, where a fit has chosen that
     log.jsonl              one line an update
     checkpoint.safetensors what ``--resume`` goes on from
 
@@ -50,6 +51,23 @@ class Storage:
     def guide_hash(self) -> str:
         """SHA-256 of the learnt guide's file, hexadecimal; provenance names it."""
         return file_digest(self.path / "guide.safetensors")
+
+    def visible_shares(self) -> dict[str, float]:
+        """By class, how much of an object must be visible for labels to count it, 0 to 1; empty where nothing is known.
+
+        Raises:
+            RunError: ``readings.json`` is damaged.
+        """
+        file = self.path / "readings.json"
+        if not file.is_file():
+            return {}
+        try:
+            classes = json.loads(file.read_text(encoding="utf-8"))["classes"]
+            return {name: float(found["visible"]) for name, found in classes.items() if "visible" in found}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RunError(
+                f"Expected what was read of each class in {file}, actual something else; fit again."
+            ) from error
 
     @property
     def is_finished(self) -> bool:

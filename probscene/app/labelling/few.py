@@ -41,12 +41,15 @@ class FewLabels(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_few(path: Path, model: SceneModel, target: Images) -> FewLabels:
+def read_few(path: Path, model: SceneModel, target: Images, least: int = LEAST) -> FewLabels:
     """The labels of some of a target's images: COCO's JSON, a folder of KITTI's labels, else a CSV of counts.
+
+    Args:
+        least: images that must be labelled.
 
     Raises:
         DataError: see ``read_coco``, ``read_kitti`` and ``read_table``; whole structures (``.jsonl``); fewer than
-            ``LEAST`` images are labelled.
+            ``least`` images are labelled.
     """
     path, boxes, notes = Path(path), None, ()
     if path.suffix == ".jsonl":
@@ -65,10 +68,10 @@ def read_few(path: Path, model: SceneModel, target: Images) -> FewLabels:
                 f"Of {cut} labelled images only the middle is seen, and counts may be of the whole; count in the "
                 "middle alone, or give boxes.",
             )
-    if len(read.rows) < LEAST:
-        short = len(target) < LEAST
+    if len(read.rows) < least:
+        short = len(target) < least
         raise DataError(
-            f"Expected labels of at least {LEAST} images of {target.path} in {path}, actual {len(read.rows)}; "
+            f"Expected labels of at least {least} images of {target.path} in {path}, actual {len(read.rows)}; "
             f"{'add images' if short else 'label more (probscene label says which)'}."
         )
     counts = torch.from_numpy(read.counts)

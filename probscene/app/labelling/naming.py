@@ -59,11 +59,15 @@ class NamedImages:
             DataError: there are no labels of an image, and not only some are expected; none of any.
         """
         missing = [f.name for f in self.target.paths if f.name not in self.found and f.name not in self.unknown]
-        if missing and not (self.some and self.found):
+        if not self.found and (self.some or not missing):
+            raise DataError(
+                f"Expected labels of images of {self.target.path} in {self.path}, actual none; label at least one."
+            )
+        if missing and not self.some:
             names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
             raise DataError(
-                f"Expected labels of every image of {self.target.path} in {self.path}, actual none of {names}"
-                f"{'' if self.some else '; if only some are labelled, add --some-labels'}."
+                f"Expected labels of every image of {self.target.path} in {self.path}, actual none of {names}; if only "
+                "some are labelled, add --some-labels."
             )
         return [i for i, file in enumerate(self.target.paths) if file.name in self.found]
 

@@ -17,6 +17,7 @@ from probscene.errors import DataError, RunError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.judge import SCENES, Judged, judge
 from ..evaluation.labels import read_labels
+from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
 from ..fitting import session
 from ..fitting.fit import open_target
@@ -42,6 +43,8 @@ def report(
     labels: Path | None = None,
     num: int = 10000,
     judged_by: int = SCENES,
+    visible: Visible | None = None,
+    some_labels: bool = False,
 ) -> Path:
     """Write the page.
 
@@ -50,6 +53,8 @@ def report(
         labels: of the run's target, see ``read_labels``.
         num: structures sampled a source.
         judged_by: scenes rendered for the verdict, none where 0.
+        visible: see ``evaluate``.
+        some_labels: labels need not cover all images.
 
     Returns:
         Where it is.
@@ -67,8 +72,8 @@ def report(
         if labels is not None:
             raise
         absent = str(error)
-    truth = None if labels is None or images is None else read_labels(labels, run.model, images)
-    evaluation = evaluate(run, images, truth, show, num)
+    truth = None if labels is None or images is None else read_labels(labels, run.model, images, some_labels)
+    evaluation = evaluate(run, images, truth, show, num, visible=visible)
     judged = judge(run, images, show, judged_by, evaluation) if images and judged_by else None
     return write(run, evaluation, images, out, absent, judged)
 

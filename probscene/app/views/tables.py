@@ -12,7 +12,7 @@ from rich.table import Table
 from probscene.inference.judging.metrics import Histogram, histogram_interval, ranges
 from probscene.inference.judging.tally import Interval, Tally
 
-from ..evaluation.compare import ESTIMATE, Comparison
+from ..evaluation.compare import ESTIMATE, Comparison, Row
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.likelihood import Likelihood
 from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, label
@@ -263,10 +263,12 @@ def show_comparison(comparison: Comparison, console: Console) -> None:
 
 
 def comparison_table(comparison: Comparison) -> Table:
-    """A column for each source; in each cell the total variation to the reference, and the mean in brackets."""
+    """A column for each source; in each cell the distances to the reference, and the mean in brackets."""
     reference = comparison.reference
-    what = "Means" if reference is None else f"Total variation to {WORDS[reference]}, and (means)"
+    what = "Means" if reference is None else f"TV and W-1 to {WORDS[reference]}, and (means)"
     table = Table(title=what, title_justify="left", title_style="bold")
+    if reference is not None:
+        table.caption, table.caption_justify = LEGEND, "left"
     table.add_column("", no_wrap=True)
     for name in comparison.sources:
         table.add_column(textwrap.fill(NAMES.get(name, name), 16), justify="right", no_wrap=True)
@@ -274,8 +276,7 @@ def comparison_table(comparison: Comparison) -> Table:
     known = nested_counts(comparison)
     deeper = {row.label: row for row in rows[1 + kinds :] if row.label in known}
     for row in (*rows[: 1 + kinds], *([comparison.shares_of_classes()] if kinds else []), *deeper.values()):
-        cells = (_compared(row.apart.get(name), row.means.get(name)) for name in comparison.sources)
-        table.add_row(row.label, *cells)
+        table.add_row(row.label, *(_compared(row, name) for name in comparison.sources))
     if comparison.likelihoods:
         table.add_section()
         found = (comparison.likelihoods.get(name) for name in comparison.sources)
@@ -283,6 +284,6 @@ def comparison_table(comparison: Comparison) -> Table:
     return table
 
 
-def _compared(apart: float | None, mean: float | None) -> str:
-    said = [] if apart is None else [f"{apart:.3f}"]
-    return " ".join(said + ([] if mean is None else [f"({mean:.2f})"])) or "-"
+def _compared(row: Row, name: str) -> str:
+    figures = [f"{found[name]:.3f}" for found in (row.apart, row.moved) if name in found]
+    return " ".join(figures + ([f"({row.means[name]:.2f})"] if name in row.means else [])) or "-"

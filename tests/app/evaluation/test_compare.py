@@ -176,9 +176,10 @@ def test_the_command_draws_prints_and_writes_the_same(call, two, target, tmp_pat
     assert record == json.loads(json.dumps(expected.record()))
     assert record["runs"]["pcfg"]["guide"] == {"kind": "pcfg"} and record["reference"] == "truth"
     for row in expected.rows():
-        cells = r"\D+".join(f"{row.apart[name]:.3f} \\({row.means[name]:.2f}\\)" for name in ("prior", "lstm", "pcfg"))
+        figures = ((row.apart[name], row.moved[name], row.means[name]) for name in ("prior", "lstm", "pcfg"))
+        cells = r"\D+".join(f"{apart:.3f} {moved:.3f} \\({mean:.2f}\\)" for apart, moved, mean in figures)
         assert re.search(rf"{row.label}\D+{cells}", done.out), row.label
-    assert "Total variation to the truth" in done.out and "…" not in done.out
+    assert "TV and W-1 to the truth" in done.out and "…" not in done.out
     first = out.read_bytes()
     with Image.open(out) as drawn:
         assert drawn.format == "PNG" and drawn.width > drawn.height
@@ -190,7 +191,7 @@ def test_the_runs_own_target_is_taken_where_none_is_named(call, two, target, tmp
     done = call("compare", *two, "--num", 100, "--out", tmp_path / "c.png")
     assert done.code == 0 and "what the feature network sees" in done.out and "An estimate without labels" in done.out
     done = call("compare", *two, "--labels", target.labels, "--num", 100, "--out", tmp_path / "c.png")
-    assert done.code == 0 and "Total variation to the truth" in done.out
+    assert done.code == 0 and "TV and W-1 to the truth" in done.out
 
 
 def test_what_cannot_be_compared(call, two, nested, target, tmp_path):
