@@ -9,7 +9,6 @@ from probscene.model import SceneModel
 from ...divergence import Blockwise, Divergence
 from ...training import Training, batch_seed
 from ..base import FeatureNet, Features, Photographs, Renders, Seen
-from ..counting.choices import slow_settings
 
 if TYPE_CHECKING:
     from .heads import PretrainedCountNet
@@ -69,9 +68,15 @@ class PretrainedCountFeatures(Features):
         return cast("PretrainedCountNet", net).taught_by_fingerprint
 
     def settings(self, preset: Any) -> dict[str, Any]:
-        """Photographs' counts are noisy, and few: a prior, where there is one, holds them more. Those of things do lie
-        among the renders', and a bounded objective bears their marginals. After 40 batches costs still fall."""
-        weight = max(preset.prior_kl_weight, 0.1) if preset.prior_kl_weight else 0.0
-        single = 0.25 if preset.objective == "js" else None
-        few = {"marginal_variance": single, "pairs": 1000, "prior_kl_weight": weight, "batches": 60}
-        return slow_settings(preset) | few
+        """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
+        each structure is drawn once. Photographs' counts are noisy, and few: the prior of a preset that has such a
+        weight holds them more."""
+        return {
+            "pairs": self.pairs,
+            "batches": 40,
+            "num_scenes": 250,
+            "draws_per_structure": 1,
+            "variance": None if preset.variance is None else 1.0,
+            "marginal_variance": 0.1,
+            "prior_kl_weight": max(preset.prior_kl_weight, 0.1) if preset.prior_kl_weight else 0.0,
+        }

@@ -35,7 +35,7 @@ SMALLEST = 2 / 3  # places that the longer side of an object spans; what is smal
 LEAST_SPREAD, LEAST_UNIT = 0.3, 0.3  # objects
 HEADS, HIDDEN = 4, 32
 MOST = 200  # objects of a class that labels may count
-DROPPED = 0.2  # of the channels, so that none is relied upon
+DROPPED = 0.35  # of the channels, so that none is relied upon
 Maps = list[Tensor]
 """Maps at strides of 8, 16 and 32, each ``(N, channels, h, w)``."""
 

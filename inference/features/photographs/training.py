@@ -1,9 +1,9 @@
 """Training ``PretrainedCountNet`` on renders with their free labels.
 
 The frozen network sees each image once; its maps stay in memory as half-precision numbers, 0.2 MB an image of 320 x
-240, and the heads take many epochs on them. Every render looks as a camera might have taken it (``looks``). Photographs'
-maps are unlike renders' channel by channel, so the heads are kept from relying on any:
-channels are left out (``heads.DROPPED``) and shifted at random.
+240, and the heads take many epochs on them. Every render looks as a camera might have taken it (``looks``).
+Photographs' maps are unlike renders' channel by channel, so the heads are kept from relying on any: channels are left
+out (``heads.DROPPED``) and shifted at random.
 
 Axis letters: N images, M nodes, S shares.
 """
@@ -26,7 +26,7 @@ from .looks import photographed
 from .reading import SHARES
 
 DRAWN_AT_ONCE = 32  # structures
-SHIFT = 0.2  # of a channel over a whole image, in its standard deviations
+SHIFT = 0.5  # of a channel over a whole image, in its standard deviations
 
 
 class PretrainedCountTraining:
