@@ -55,7 +55,7 @@ def presence(dots, small):
 
 
 def pretrained_counting(dots, small):
-    net = PretrainedCountNet(dots.classes, 2, dots.canvas, held=8, sizes=(160, 160))
+    net = PretrainedCountNet(dots.classes, dots.canvas, held=8, sizes=(160, 160))
     return PretrainedCountTraining(net, Observer(dots, 1).draw_twice, 8, 2, 4, seed=1), net
 
 
