@@ -197,8 +197,8 @@ def trial(
     workers: int = 1,
     progress: bool = True,
 ) -> Results:
-    """What is a labelled set worth? Train one detector, from one start and with one budget, on each of several sets, and
-    test it on labelled real images; the same call goes on after an interruption.
+    """What is a labelled set worth? Train one detector, from one start and with one budget, on each of several sets,
+    and test it on labelled real images; the same call goes on after an interruption.
 
     Args:
         test: labelled real images: a folder of COCO or KITTI, a JSON file, or ``FOLDER@LIST``.

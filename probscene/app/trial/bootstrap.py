@@ -1,8 +1,8 @@
 """Intervals by a paired bootstrap [1] over test images and seeds, and what a set is worth in labelled photographs.
 
-A resample draws as many test images, with replacement, as there are, and as many seeds as there are; all sets are scored
-on the same draw, so that a difference between two has the interval of the difference. A seed is a start of the detector
-and, where a set has n of its images, a choice of them; sets are paired by it.
+A resample draws as many test images, with replacement, as there are, and as many seeds as there are; all sets are
+scored on the same draw, so that a difference between two has the interval of the difference. A seed is a start of the
+detector and, where a set has n of its images, a choice of them; sets are paired by it.
 
 Axis letters: B resamples, L test images, S seeds.
 

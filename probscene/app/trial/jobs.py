@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import safetensors.torch
-import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file

@@ -7,12 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..files import write_whole
-from .results import MEAN, Column, Results
+from .results import Column, Results
 from .tables import shown
 
 REAL, OTHER = "#30363d", "#2b7bba"  # of rows that are shown labelled photographs alone, and of the others
 INK, FAINT = "#1f2328", "#d0d7de"
-MOST = 6  # panels
+MOST, LEAST = 6, 2.0  # panels; percent that a panel spans
 PANEL, LINE, NAMES = 2.1, 0.3, 2.0  # inches
 
 
@@ -35,7 +35,6 @@ def picture(results: Results) -> Figure:
     for axes, column in zip(panels, columns, strict=True):
         _panel(axes, results, column)
     panels[0].set_yticks(range(len(results.rows)), [textwrap.fill(row, 26) for row in results.rows], fontsize=9)
-    panels[0].invert_yaxis()
     figure.supxlabel(
         f"average precision in %, {results.counts['test_images']} test images, {results.counts['seeds']} seeds; "
         "lines: 95 % of resamples; dark: photographs alone",
@@ -46,8 +45,7 @@ def picture(results: Results) -> Figure:
 
 def _panel(axes: Axes, results: Results, column: Column) -> None:
     name, measure = column
-    first = results.columns[0][1]
-    axes.set_title(name if measure == first and name == MEAN else f"{name}, {measure}", fontsize=9, color=INK)
+    axes.set_title(f"{name}, {measure}", fontsize=9, color=INK)
     for y, row in enumerate(results.rows):
         found = results.precision(row, column)
         colour = REAL if row in results.photographs else OTHER
@@ -61,3 +59,6 @@ def _panel(axes: Axes, results: Results, column: Column) -> None:
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set_color(FAINT)
     axes.margins(x=0.06)
+    low, high = axes.get_xlim()
+    if high - low < LEAST:  # one value, or nearly
+        axes.set_xlim((low + high - LEAST) / 2, (low + high + LEAST) / 2)

@@ -21,6 +21,7 @@ from probscene.errors import DataError, ProbsceneError
 from .sets import Example, LabelledSet
 
 REAL = "real"
+NAMED = 5  # images in a message
 
 
 class Part(NamedTuple):
@@ -136,6 +137,49 @@ def list_of(path: Path) -> tuple[Path, Path | None]:
     return (Path(before), Path(after)) if at and not path.exists() else (path, None)
 
 
+def check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet, later: set[str]) -> None:
+    """See that every part has the images that are asked for, and that none of them is a test image.
+
+    Args:
+        later: sources that are generated only after that.
+
+    Raises:
+        DataError: one has fewer, or some of those that are tested on, by their pixels.
+    """
+    for row in planned.rows:
+        for part in (part for stage in row.stages for part in stage):
+            there = None if part.source in later else len(loaded[part.source].examples)
+            if there is not None and (part.number or 0) > there:
+                raise DataError(
+                    f"Expected at least {part.number} images in {part.source} for the set {row.name!r}, actual {there}."
+                )
+    of_digest = {example.digest: example.path for example in tested.examples}
+    used = {part.source for row in planned.rows for stage in row.stages for part in stage}
+    for name in sorted(used & loaded.keys()):
+        both = [f"{e.path} is {of_digest[e.digest]}" for e in loaded[name].examples if e.digest in of_digest]
+        if both:
+            more = f" and {len(both) - NAMED} more" if len(both) > NAMED else ""
+            raise DataError(
+                f"Expected test images that are in no set, actual {len(both)} in {name!r}: "
+                f"{'; '.join(both[:NAMED])}{more}. Take them out of one of the two; for a part of one folder, name "
+                "'real' with --hold-out N."
+            )
+
+
+def baselines_of(planned: Plan, names: Iterable[str]) -> tuple[str, ...]:
+    """The rows that others are compared with; the first where none is named.
+
+    Raises:
+        ProbsceneError: a name that no row has.
+    """
+    there = [row.name for row in planned.rows]
+    chosen = tuple(names) or (there[0],)
+    unknown = [name for name in chosen if name not in there]
+    if unknown:
+        raise ProbsceneError(f"Expected a baseline among {', '.join(there)}, actual {unknown[0]!r}.")
+    return chosen
+
+
 def _row_name(part: Part) -> str:
     return f"{REAL} {'all' if part.number is None else part.number}"
 
@@ -178,8 +222,8 @@ def _named(
 def _path(word: str, paths: dict[str, Path]) -> Part:
     if not list_of(Path(word))[0].exists():
         raise DataError(
-            f"Expected a labelled set at {word!r}, actual none; name a folder of COCO or KITTI, a JSON file, an earlier "
-            "row, or real, prior, start or learnt where they are given."
+            f"Expected a labelled set at {word!r}, actual none; name a folder of COCO or KITTI, a JSON file, an "
+            "earlier row, or real, prior, start or learnt where they are given."
         )
     paths[word] = Path(word)
     return Part(word)

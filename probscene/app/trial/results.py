@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bootstrap import Draws, Estimate, draw, estimate, over_seeds, worth, worth_in_words
-from .coco_figures import coco_figures
 from .jobs import Job
 from .plan import Row
-from .scoring import average_precision, match, measures
+from .scoring import average_precision, coco_figures, match, measures
 from .sets import LabelledSet
 
 MEAN = "mean"

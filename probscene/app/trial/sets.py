@@ -107,6 +107,16 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
+def digest_of(found: LabelledSet) -> str:
+    """Of all that a set says, not where it lies."""
+    made = hashlib.sha256(repr(found.classes).encode())
+    for example in found.examples:
+        made.update(example.digest.encode())
+        for array in (example.boxes, example.classes, example.levels, example.real):
+            made.update(array.tobytes())
+    return made.hexdigest()
+
+
 def _read_coco(path: Path, file: Path, wanted: tuple[str, ...] | None, progress: Progress) -> LabelledSet:
     try:
         record = json.loads(file.read_text(encoding="utf-8-sig"))

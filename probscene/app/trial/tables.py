@@ -70,9 +70,9 @@ def legend(results: Results) -> str:
     """What the figures are of."""
     counts = results.counts
     return (
-        f"{counts['test_images']} test images, {counts['seeds']} seeds, {results.budget} for every set. Below each figure "
-        f"its 95 % interval: {counts['resamples']:,} resamples of test images and seeds, the same for all sets. An * marks "
-        "a difference whose interval leaves out 0. Worth: how many labelled photographs alone reach the mean."
+        f"{counts['test_images']} test images, {counts['seeds']} seeds, {results.budget} for every set. Below each "
+        f"figure its 95 % interval: {counts['resamples']:,} resamples of test images and seeds, the same for all sets. "
+        "An * marks a difference whose interval leaves out 0. Worth: as many labelled photographs alone reach the mean."
     )
 
 

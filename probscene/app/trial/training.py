@@ -118,8 +118,8 @@ class Pictures:
 def augmented(
     example: Example, pictures: Pictures, random: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
-    """An image ``(H, W, 3)`` as a training sees it once, mirrored, moved, scaled and lit by chance, the boxes ``(N, 4)``
-    of its objects and their classes ``(N,)``."""
+    """An image ``(H, W, 3)`` as a training sees it once, mirrored, moved, scaled and lit by chance, and the boxes
+    ``(N, 4)`` and classes ``(N,)`` of its objects."""
     image, fit = pictures(example)
     height, width = pictures.size
     scale = math.exp(random.uniform(*map(math.log, SCALES)))

@@ -26,15 +26,14 @@ from ..progress import Progress, silent
 from .detector import RECIPES, checked, fingerprint
 from .jobs import Job
 from .pictures import draw
-from .plan import REAL, Plan, Row, list_of, only, plan, split
+from .plan import REAL, Plan, Row, baselines_of, check, list_of, only, plan, split
 from .results import Results, score
-from .sets import LabelledSet, read_set
+from .sets import LabelledSet, digest_of, read_set
 from .tables import text
 
 FORMAT = 1
 AREA, STEP = 256 * 192, 32  # pixels at which images come where no size is given, and what sides are multiples of
 NUMBERS = (10, 20, 50, None)
-NAMED = 5  # images in a message
 
 
 class Budget(NamedTuple):
@@ -127,22 +126,22 @@ def trial(
         if wanted:
             raise ProbsceneError("Expected --hold-out N or --real PATH for --real-numbers, actual neither.")
     planned = plan(sets, known, wanted)
-    bases = _baselines(planned, baselines)
+    bases = baselines_of(planned, baselines)
     loaded = {} if photographs is None else {REAL: photographs}
     loaded |= {key: _read(path, names, show) for key, path in planned.paths.items()}
-    _check(planned, loaded, tested, set(known) - {REAL})
+    check(planned, loaded, tested, set(known) - {REAL})
     if generated is not None:
         _check_classes(generated, names)
     size = size or _size(tested)
     shared = {
         "format": FORMAT, "classes": list(names), "detector": fingerprint(choice), "recipe": list(recipe),
-        "last": budget.last, "chain": budget.chain, "size": list(size), "seed": seed, "test": _digest(tested),
+        "last": budget.last, "chain": budget.chain, "size": list(size), "seed": seed, "test": digest_of(tested),
     }  # fmt: skip
     _bind(out, shared)
     if generated is not None:
         for key, path in _generate(generated, out / "sets", seed, workers, show).items():
             loaded[key] = _read(path, names, show)
-        _check(planned, loaded, tested, set())
+        check(planned, loaded, tested, set())
     rows = {
         row.name: tuple(tuple((loaded[p.source], p) for p in stage) for stage in row.stages) for row in planned.rows
     }
@@ -238,38 +237,6 @@ def _generate(generated: Generated, into: Path, seed: int, workers: int, show: P
     return folders
 
 
-def _check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet, later: set[str]) -> None:
-    """See that every part has the images that are asked for, and that none of them is a test image."""
-    for row in planned.rows:
-        for part in (part for stage in row.stages for part in stage):
-            there = None if part.source in later else len(loaded[part.source].examples)
-            if there is not None and (part.number or 0) > there:
-                raise DataError(
-                    f"Expected at least {part.number} images in {part.source} for the set {row.name!r}, actual {there}."
-                )
-    of_digest = {example.digest: example.path for example in tested.examples}
-    used = {part.source for row in planned.rows for stage in row.stages for part in stage}
-    for name in sorted(used & loaded.keys()):
-        both = [example.path for example in loaded[name].examples if example.digest in of_digest]
-        if both:
-            pairs = [f"{path} is {of_digest[e.digest]}" for path in both[:NAMED]
-                     for e in loaded[name].examples if e.path == path]  # fmt: skip
-            more = f" and {len(both) - NAMED} more" if len(both) > NAMED else ""
-            raise DataError(
-                f"Expected test images that no set has, actual {len(both)} in {name!r}: {'; '.join(pairs)}{more}. Take "
-                "them out of one of the two, or split one folder by --hold-out N."
-            )
-
-
-def _baselines(planned: Plan, names: Iterable[str]) -> tuple[str, ...]:
-    there = [row.name for row in planned.rows]
-    chosen = tuple(names) or (there[0],)
-    unknown = [name for name in chosen if name not in there]
-    if unknown:
-        raise ProbsceneError(f"Expected a baseline among {', '.join(there)}, actual {unknown[0]!r}.")
-    return chosen
-
-
 def _size(tested: LabelledSet) -> tuple[int, int]:
     """Of ``AREA``, in the shape of the test images."""
     shape = float(np.median([width / height for height, width in (e.size for e in tested.examples)]))
@@ -278,19 +245,9 @@ def _size(tested: LabelledSet) -> tuple[int, int]:
     return height, width
 
 
-def _digest(found: LabelledSet) -> str:
-    """Of all that a set says, not where it lies."""
-    digest = hashlib.sha256(repr(found.classes).encode())
-    for example in found.examples:
-        digest.update(example.digest.encode())
-        for array in (example.boxes, example.classes, example.levels, example.real):
-            digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
 def _digests(planned: Plan, loaded: Mapping[str, LabelledSet], shared: Mapping[str, Any]) -> dict[str, str]:
     """By row, of what its trainings depend on; in a chain also of the rows before it."""
-    of_source = {name: _digest(found) for name, found in loaded.items()}
+    of_source = {name: digest_of(found) for name, found in loaded.items()}
 
     def one(row: Row) -> str:
         stages = [[(of_source[part.source], part.number) for part in stage] for stage in row.stages]
