@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torch import Tensor, nn
-from torchvision.models.detection import maskrcnn_resnet50_fpn
 from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor
 from torchvision.models.detection.fcos import FCOS, FCOSClassificationHead, FCOSRegressionHead
+from torchvision.models.detection.mask_rcnn import MaskRCNN
 from torchvision.ops import FeaturePyramidNetwork
 
 from probscene.errors import DataError, ProbsceneError
@@ -161,14 +162,14 @@ def _fcos(classes: int, size: tuple[int, int]) -> FCOS:
 
 def _mask_rcnn(file: Path, classes: int, size: tuple[int, int]) -> nn.Module:
     tensors = read_tensors(file)
-    detector: Any = maskrcnn_resnet50_fpn(
-        weights=None,
-        weights_backbone=None,
+    # With batch norms that stay as they were, and the first two stages frozen, as torchvision fine-tunes it.
+    detector: Any = MaskRCNN(
+        resnet_fpn_backbone(backbone_name="resnet50", weights=None, trainable_layers=3),
+        91,
         min_size=min(size),
         max_size=max(size),
         box_score_thresh=SCORE,
         box_detections_per_img=MOST,
-        trainable_backbone_layers=3,
     )
     whole = any(name.startswith("backbone.") for name in tensors)
     into = detector if whole else detector.backbone.body

@@ -116,7 +116,7 @@ def only(found: LabelledSet, names: Path) -> LabelledSet:
 
 
 def split(found: LabelledSet, number: int, seed: int) -> tuple[LabelledSet, LabelledSet]:
-    """A set without so many of its images, and those.
+    """A set without so many of its images, nor others that are the same as one of them, and those.
 
     Raises:
         ProbsceneError: it has not more than that.
@@ -125,10 +125,10 @@ def split(found: LabelledSet, number: int, seed: int) -> tuple[LabelledSet, Labe
     if not 0 < number < total:
         raise ProbsceneError(f"Expected to hold out 1 to {total - 1} of the images of {found.path}, actual {number}.")
     order = np.random.default_rng([seed, 30]).permutation(total)
-    held = set(order[:number].tolist())
-    both = ([e for i, e in enumerate(found.examples) if (i in held) == of] for of in (False, True))
-    rest, test = (found._replace(examples=tuple(examples)) for examples in both)
-    return rest, test
+    test = tuple(found.examples[i] for i in sorted(order[:number]))
+    held = {example.digest for example in test}
+    rest = tuple(example for example in found.examples if example.digest not in held)
+    return found._replace(examples=rest), found._replace(examples=test)
 
 
 def list_of(path: Path) -> tuple[Path, Path | None]:
@@ -153,10 +153,14 @@ def check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet,
                 raise DataError(
                     f"Expected at least {part.number} images in {part.source} for the set {row.name!r}, actual {there}."
                 )
-    of_digest = {example.digest: example.path for example in tested.examples}
+    of_digest = {example.digest: example for example in tested.examples}
     used = {part.source for row in planned.rows for stage in row.stages for part in stage}
     for name in sorted(used & loaded.keys()):
-        both = [f"{e.path} is {of_digest[e.digest]}" for e in loaded[name].examples if e.digest in of_digest]
+        both = [
+            f"{e.path} is {of_digest[e.digest].path}"
+            for e in loaded[name].examples
+            if e.digest in of_digest and len(e.boxes) + len(of_digest[e.digest].boxes)  # empty scenes may be the same
+        ]
         if both:
             more = f" and {len(both) - NAMED} more" if len(both) > NAMED else ""
             raise DataError(

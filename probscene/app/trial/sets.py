@@ -130,14 +130,14 @@ def _read_coco(path: Path, file: Path, wanted: tuple[str, ...] | None, progress:
     except (OSError, ValueError, KeyError, TypeError) as error:
         about = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise DataError(f"Expected COCO's images, annotations and categories in {file}, actual {about}.") from error
+    _check_once(file, "image files", files)
+    _check_once(file, "images", [f"id {image['id']}" for image in record["images"]])
     if unknown:
         one = unknown[0]
         raise DataError(
             f"Expected annotations of images and categories that {file} lists, actual annotation {one.get('id')} of "
             f"image {one['image_id']} and category {one['category_id']}."
         )
-    _check_once(file, "image files", files)
-    _check_once(file, "images", [f"id {image['id']}" for image in record["images"]])
     _check_once(file, "categories", list(map(str, names.values())))
     if not images:
         raise DataError(f"Expected images in {file}, actual none.")
