@@ -116,7 +116,7 @@ def only(found: LabelledSet, names: Path) -> LabelledSet:
 
 
 def split(found: LabelledSet, number: int, seed: int) -> tuple[LabelledSet, LabelledSet]:
-    """A set without so many of its images, nor others that are the same as one of them, and those.
+    """A set without so many of its images, nor others that are the same, but for empty scenes; and those images.
 
     Raises:
         ProbsceneError: it has not more than that.
@@ -126,8 +126,8 @@ def split(found: LabelledSet, number: int, seed: int) -> tuple[LabelledSet, Labe
         raise ProbsceneError(f"Expected to hold out 1 to {total - 1} of the images of {found.path}, actual {number}.")
     order = np.random.default_rng([seed, 30]).permutation(total)
     test = tuple(found.examples[i] for i in sorted(order[:number]))
-    held = {example.digest for example in test}
-    rest = tuple(example for example in found.examples if example.digest not in held)
+    held = {example.digest for example in test if len(example.boxes)}
+    rest = tuple(e for i, e in enumerate(found.examples) if i in order[number:] and e.digest not in held)
     return found._replace(examples=rest), found._replace(examples=test)
 
 

@@ -100,7 +100,13 @@ class Results(NamedTuple):
                 "photographs": self.photographs.get(name),
                 "coco": {key: round(value, 6) for key, value in self.coco[name].items()},
             }
-        return {"rows": rows, "baselines": list(self.baselines), **self.counts, "budget": self.budget}
+        return {
+            "rows": rows,
+            "order": list(self.rows),
+            "baselines": list(self.baselines),
+            **self.counts,
+            "budget": self.budget,
+        }
 
     def _differences(self, name: str, other: str) -> dict[str, dict[str, Any]]:
         figures: dict[str, dict[str, Any]] = {}

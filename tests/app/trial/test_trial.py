@@ -5,11 +5,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-import safetensors.torch
 import torch
-from torchvision.models import resnet50
 
-import probscene as ps
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
@@ -53,18 +50,6 @@ def undisturbed(drawn, tmp_path_factory) -> Path:
     return out
 
 
-def test_a_detector_learns_what_is_drawn(drawn, tmp_path):
-    found = ps.trial(
-        drawn / "test", tmp_path / "out", {"drawn": drawn / "train"},
-        seeds=1, resamples=50, size=(64, 64), budget=Budget(presentations=200), progress=False,
-    )  # fmt: skip
-    assert found.precision("drawn").value > 0.6
-    record = json.loads((tmp_path / "out" / "results.json").read_text())
-    figure = record["rows"]["drawn"]["precision"]["AP50"]["mean"]
-    assert figure["low"] <= figure["value"] <= figure["high"]
-    assert record["rows"]["drawn"]["coco"]["AP50"] == pytest.approx(figure["value"], abs=1e-6)
-
-
 def test_the_folder_holds_all(undisturbed):
     there = set(contents(undisturbed))
     names = {f"trainings/{name}-{s}.safetensors" for name in ("four", "then") for s in (0, 1)}
@@ -84,11 +69,6 @@ def test_an_interrupted_trial_goes_on_to_the_same_bytes(undisturbed, drawn, sets
         assert len(list((out / "trainings").iterdir())) == after
     trial(drawn / "test", out, sets, **SMALL)
     assert contents(out) == contents(undisturbed)
-
-
-def test_two_workers_give_the_same_bytes(undisturbed, drawn, sets, tmp_path):
-    trial(drawn / "test", tmp_path / "out", sets, **SMALL, workers=2)
-    assert contents(tmp_path / "out") == contents(undisturbed)
 
 
 def test_sets_can_be_added_and_not_changed(undisturbed, drawn, sets, tmp_path):
@@ -138,24 +118,10 @@ def test_a_run_is_generated_beside_photographs_on_the_command_line(run, discs, t
     assert "Points more than 'prior'" in done.out and "results.png" in done.out and "Detectors: 40 images" in done.err
     record = json.loads((tmp_path / "out" / "results.json").read_text())
     rows = record["rows"]
-    assert list(rows) == sorted(rows) and set(rows) == {"real 4", "real all", "prior", "learnt", "learnt then 4"}
+    assert record["order"] == ["real 4", "real all", "prior", "learnt", "learnt then 4"]
     assert [rows[name]["photographs"] for name in ("real 4", "real all", "learnt")] == [4, 12, None]
     assert rows["prior"]["precision"]["AP50"]["mean"]["worth"]["number"]
     assert {path.name for path in (tmp_path / "out" / "sets").iterdir()} == {"prior", "learnt"}
-
-
-def test_mask_rcnn_is_trained_from_the_weights_of_a_user(drawn, tmp_path):
-    file = tmp_path / "resnet50.safetensors"
-    safetensors.torch.save_file(resnet50(weights=None).state_dict(), file)
-    found = trial(
-        drawn / "test", tmp_path / "out", {"two": f"{drawn / 'train'}:2"}, detector=f"maskrcnn={file}",
-        budget=Budget(presentations=2), seeds=1, resamples=5, size=(64, 64),
-    )  # fmt: skip
-    assert 0 <= found.precision("two").value <= 1
-    safetensors.torch.save_file({"x": torch.zeros(1)}, file)
-    with pytest.raises(DataError, match="maskrcnn_resnet50_fpn or resnet50"):
-        trial(drawn / "test", tmp_path / "other", {"two": drawn / "train"}, detector=f"maskrcnn={file}")
-    assert not (tmp_path / "other").exists()
 
 
 def test_test_images_in_a_set_are_named(drawn, tmp_path):
