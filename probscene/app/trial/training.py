@@ -162,7 +162,7 @@ def _run_stage(
     body = {id(p) for p in pretrained_part(detector).parameters()}
     groups = [[p for p in detector.parameters() if p.requires_grad and (id(p) in body) == of] for of in (False, True)]
     rates = (recipe.rate * stage.rate, recipe.rate * stage.rate * recipe.backbone)
-    adam = torch.optim.Adam([{"params": g, "lr": r} for g, r in zip(groups, rates, strict=True)])
+    adam = torch.optim.Adam([{"params": g, "lr": r} for g, r in zip(groups, rates, strict=True)], fused=True)
     steps = math.ceil(stage.presentations / recipe.batch)
     schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: _course((step + 1) / steps))
     detector.train()
