@@ -88,10 +88,11 @@ def worth(value: float, numbers: Sequence[int], reached: Sequence[float]) -> tup
         return (float(numbers[-1]), np.inf)
     at = int(np.searchsorted(level, value, side="left"))
     if level[at] == value or at == 0:
-        return (float(numbers[at]),) * 2
+        return (float(numbers[at]), float(numbers[at]))
     way = (value - level[at - 1]) / (level[at] - level[at - 1])
     low, high = np.log(numbers[at - 1]), np.log(numbers[at])
-    return (float(np.exp(low + way * (high - low))),) * 2
+    number = float(np.exp(low + way * (high - low)))
+    return (number, number)
 
 
 def worth_in_words(value: float, numbers: Sequence[int], reached: Sequence[float]) -> str:

@@ -106,11 +106,11 @@ class _Stages(nn.Module):
         net = EfficientNetLite().net
         starts = [i for i, block in enumerate(net._blocks) if block._depthwise_conv.stride[0] == 2]  # at 4, 8, 16, 32
         self.stem, self.relu = net._conv_stem, net._swish
+        ends = [*starts[1:], len(net._blocks)]
         self.stages = nn.ModuleList(
-            nn.ModuleList(net._blocks[first:end])
-            for first, end in zip([0, *starts[1:]], [*starts[1:], len(net._blocks)], strict=True)
+            nn.ModuleList(net._blocks[first:end]) for first, end in zip([0, *ends], ends, strict=False)
         )
-        self.channels = [stage[-1]._project_conv.out_channels for stage in list(self.stages)[1:]]
+        self.channels = [net._blocks[end - 1]._project_conv.out_channels for end in ends[1:]]
         self.stages[1:].requires_grad_(True)
         for block in net._blocks:  # on a CPU a quarter of a step, and hardly any of the weights
             block._depthwise_conv.requires_grad_(False)
@@ -142,7 +142,7 @@ class _Backbone(nn.Module):
 
 
 def _fcos(classes: int, size: tuple[int, int]) -> FCOS:
-    detector = FCOS(
+    detector: Any = FCOS(
         _Backbone(),
         classes,
         min_size=min(size),

@@ -40,10 +40,10 @@ class Row(NamedTuple):
     @property
     def photographs(self) -> int | None:
         """How many, where it is shown ``REAL`` alone; -1 for all of them."""
-        if len(self.stages) > 1 or len(self.stages[0]) > 1 or self.stages[0][0].source != REAL:
+        parts = [part for stage in self.stages for part in stage]
+        if len(parts) > 1 or parts[0].source != REAL:
             return None
-        number = self.stages[0][0].number
-        return -1 if number is None else number
+        return -1 if parts[0].number is None else parts[0].number
 
     def record(self) -> list[list[list[str | int | None]]]:
         """For JSON."""

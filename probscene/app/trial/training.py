@@ -122,7 +122,7 @@ def augmented(
     ``(N, 4)`` and classes ``(N,)`` of its objects."""
     image, fit = pictures(example)
     height, width = pictures.size
-    scale = math.exp(random.uniform(*map(math.log, SCALES)))
+    scale = math.exp(random.uniform(math.log(SCALES[0]), math.log(SCALES[1])))
     across = -scale if random.random() < 0.5 else scale
     # The frame's middle comes near the frame's middle.
     x = width / 2 + random.uniform(-SHIFT, SHIFT) * width - across * width / 2
@@ -192,7 +192,7 @@ def _course(way: float) -> float:
     return way / WARM if way < WARM else 0.5 * (1 + math.cos(math.pi * (way - WARM) / (1 - WARM)))
 
 
-def _lit(image: NDArray[np.uint8], random: np.random.Generator) -> NDArray[np.uint8]:
+def _lit(image: NDArray, random: np.random.Generator) -> NDArray[np.uint8]:
     gain, contrast, colour = random.uniform(1 - LIGHT, 1 + LIGHT, 3)
     pixels = image.astype(np.float32) * gain
     pixels = (pixels - pixels.mean()) * contrast + pixels.mean()

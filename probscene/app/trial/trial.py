@@ -109,7 +109,9 @@ def trial(
         MachineError: the disk is full, or a worker was killed.
     """
     choice, recipe = detector, _recipe(detector, budget)
-    positive(seeds, "seeds"), checked_seed(seed), positive(workers, "workers"), positive(resamples, "resamples")
+    checked_seed(seed)
+    for number, what in ((seeds, "seeds"), (workers, "workers"), (resamples, "resamples")):
+        positive(number, what)
     if size is not None and any(side < STEP or side % STEP for side in size):
         raise ProbsceneError(f"Expected a size of multiples of {STEP}, actual {size[1]}x{size[0]}.")
     if hold_out is not None and real is not None:
@@ -167,7 +169,8 @@ def _recipe(choice: str, budget: Budget):
     recipe = RECIPES[checked(choice)]
     given = {"presentations": budget.presentations, "batch": budget.batch, "rate": budget.rate}
     recipe = recipe._replace(**{key: value for key, value in given.items() if value is not None})
-    positive(recipe.presentations, "presentations"), positive(recipe.batch, "images a step")
+    positive(recipe.presentations, "presentations")
+    positive(recipe.batch, "images a step")
     if not (recipe.rate > 0 and math.isfinite(recipe.rate)):
         raise ProbsceneError(f"Expected a positive learning rate, actual {recipe.rate}.")
     return recipe
