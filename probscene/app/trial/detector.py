@@ -2,8 +2,8 @@
 
 ``efficientnet``
     FCOS [1] on EfficientNet-Lite0, whose ImageNet weights came with the install, with a feature pyramid [2] at strides
-    8, 16 and 32. What is before stride 8, depthwise filters and all batch norms stay as they were on ImageNet. Small, so that a table of
-    forty trainings is an afternoon on two cores.
+    8, 16 and 32. What is before stride 8, depthwise filters and all batch norms stay as they were on ImageNet. Small,
+    so that a table of forty trainings is an afternoon on two cores.
 
 ``maskrcnn=FILE``
     Mask R-CNN's [3] box detector on ResNet-50 with a feature pyramid, which is Meta-Sim2's: weights of torchvision's

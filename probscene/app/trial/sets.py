@@ -70,12 +70,18 @@ class LabelledSet(NamedTuple):
     kitti: bool = False
 
 
-def read_set(path: Path, classes: Iterable[str] | None = None, progress: Progress = lambda *_: None) -> LabelledSet:
+def read_set(
+    path: Path,
+    classes: Iterable[str] | None = None,
+    progress: Progress = lambda *_: None,
+    same: bool = False,
+) -> LabelledSet:
     """All of a set, its images decoded and its labels checked.
 
     Args:
         classes: those to keep; all that it has where None. KITTI's types count as classes of their names, whatever the
             case, or by ``kitti_labels.TYPES``.
+        same: a set of COCO must have no others.
         progress: called with the number of images read, and of all.
 
     Raises:
@@ -91,7 +97,7 @@ def read_set(path: Path, classes: Iterable[str] | None = None, progress: Progres
             f"Expected labelled images in {path}: annotations.json (COCO) with its images, or KITTI's image_2 and "
             "label_2, actual neither; name the folder of a data set."
         )
-    return _read_coco(path, file, None if classes is None else tuple(sorted(classes)), progress)
+    return _read_coco(path, file, None if classes is None else tuple(sorted(classes)), progress, same)
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -117,7 +123,7 @@ def digest_of(found: LabelledSet) -> str:
     return made.hexdigest()
 
 
-def _read_coco(path: Path, file: Path, wanted: tuple[str, ...] | None, progress: Progress) -> LabelledSet:
+def _read_coco(path: Path, file: Path, wanted: tuple[str, ...] | None, progress: Progress, same: bool) -> LabelledSet:
     try:
         record = json.loads(file.read_text(encoding="utf-8-sig"))
         names = {category["id"]: category["name"] for category in record["categories"]}
@@ -141,7 +147,7 @@ def _read_coco(path: Path, file: Path, wanted: tuple[str, ...] | None, progress:
     _check_once(file, "categories", list(map(str, names.values())))
     if not images:
         raise DataError(f"Expected images in {file}, actual none.")
-    classes = _kept(path, wanted, tuple(sorted(map(str, names.values()))))
+    classes = _kept(path, wanted, tuple(sorted(map(str, names.values()))), same)
     folder = next(
         (f for f in (file.parent / "images", file.parent) if (f / files[0]).is_file()), file.parent / "images"
     )
@@ -222,8 +228,9 @@ def _class_of(type: str, classes: tuple[str, ...]) -> str | None:
     return next((own[name] for name in (type.casefold(), *TYPES.get(type, ())) if name in own), None)
 
 
-def _kept(path: Path, wanted: tuple[str, ...] | None, there: tuple[str, ...]) -> tuple[str, ...]:
+def _kept(path: Path, wanted: tuple[str, ...] | None, there: tuple[str, ...], same: bool = False) -> tuple[str, ...]:
     """The classes that are wanted of those there are."""
+    more = sorted(set(there) - set(wanted or there)) if same else []
     lacking = [] if wanted is None else sorted(set(wanted) - set(there))
     if lacking:
         near = {name.casefold(): name for name in there}
@@ -232,6 +239,11 @@ def _kept(path: Path, wanted: tuple[str, ...] | None, there: tuple[str, ...]) ->
             f"Expected the classes {', '.join(wanted or ())} in {path}, actual {', '.join(there) or 'none'}"
             f"{' (' + '; '.join(hints) + ')' if hints else ''}; rename {', '.join(lacking)} there, or name the classes "
             "that all sets have by --classes."
+        )
+    if more:
+        raise DataError(
+            f"Expected the classes {', '.join(wanted or ())} in {path}, actual {', '.join(more)}, too; name the "
+            "classes that all sets have by --classes."
         )
     return there if wanted is None else wanted
 

@@ -117,7 +117,7 @@ def trial(
     if hold_out is not None and real is not None:
         raise ProbsceneError("Expected photographs to train on from --hold-out or from --real, actual both; give one.")
     tested, photographs = _photographs(test, real, hold_out, seed, classes, show)
-    names = tested.classes
+    names, same = tested.classes, classes is None
     known = [] if generated is None else list(_sources(generated))
     if photographs is not None:
         known.insert(0, REAL)
@@ -130,10 +130,10 @@ def trial(
     planned = plan(sets, known, wanted)
     bases = baselines_of(planned, baselines)
     loaded = {} if photographs is None else {REAL: photographs}
-    loaded |= {key: _read(path, names, show) for key, path in planned.paths.items()}
+    loaded |= {key: _read(path, names, show, same) for key, path in planned.paths.items()}
     check(planned, loaded, tested, set(known) - {REAL})
     if generated is not None:
-        _check_classes(generated, names)
+        _check_classes(generated, names, same)
     size = size or _size(tested)
     shared = {
         "format": FORMAT, "classes": list(names), "detector": fingerprint(choice), "recipe": list(recipe),
@@ -176,9 +176,9 @@ def _recipe(choice: str, budget: Budget):
     return recipe
 
 
-def _read(path: Path, classes: Iterable[str] | None, show: Progress) -> LabelledSet:
+def _read(path: Path, classes: Iterable[str] | None, show: Progress, same: bool = False) -> LabelledSet:
     folder, names = list_of(path)
-    found = read_set(folder, classes, lambda done, total: show("labels", done, total))
+    found = read_set(folder, classes, lambda done, total: show("labels", done, total), same)
     return found if names is None else only(found, names)
 
 
@@ -190,7 +190,7 @@ def _photographs(
     if hold_out is not None:
         photographs, tested = split(tested, hold_out, seed)
     else:
-        photographs = None if real is None else _read(real, tested.classes, show)
+        photographs = None if real is None else _read(real, tested.classes, show, classes is None)
     labelled = {int(c) for e in tested.examples for c in e.classes[e.real]}
     lacking = [name for number, name in enumerate(tested.classes) if number not in labelled]
     if lacking:
@@ -212,9 +212,9 @@ def _sources(generated: Generated) -> tuple[str, ...]:
     return tuple(name for name in dict.fromkeys(generated.sources) if not (name == "start" and same))
 
 
-def _check_classes(generated: Generated, classes: tuple[str, ...]) -> None:
-    lacking = sorted(set(classes) - set(generated.run.model.classes))
-    if lacking:
+def _check_classes(generated: Generated, classes: tuple[str, ...], same: bool) -> None:
+    there = set(generated.run.model.classes)
+    if set(classes) - there or (same and there - set(classes)):
         raise DataError(
             f"Expected model {generated.run.model.name!r} to have the classes of the test images "
             f"({', '.join(classes)}), actual {', '.join(generated.run.model.classes)}; rename its classes or those of "

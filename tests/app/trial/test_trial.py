@@ -162,8 +162,10 @@ def test_settings_that_make_no_sense(drawn, sets, tmp_path, options, said):
 
 def test_sets_are_all_checked_before_any_is_trained(drawn, sets, tmp_path):
     other = draw_set(tmp_path / "other", 2, 3, classes=("Disc", "square"))
+    more = change(draw_set(tmp_path / "more", 2, 3), lambda r: r["categories"].append({"id": 3, "name": "ring"}))
     for sets_, said in (
         ({**sets, "other": other}, r"classes disc, square in .*other, actual Disc, square \('Disc' differs in case\)"),
+        ({**sets, "more": more}, r"classes disc, square in .*more, actual ring, too; name the classes"),
         ({**sets, "nine": f"{drawn / 'train'}:9"}, "at least 9 images .* 'nine', actual 8"),
     ):
         with pytest.raises(DataError, match=said):
