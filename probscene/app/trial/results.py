@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .bootstrap import Draws, Estimate, draw, estimate, over_seeds, worth, worth_in_words
 from .jobs import Job
 from .plan import Row
-from .scoring import average_precision, coco_figures, match, measures
+from .scoring import MAIN, average_precision, coco_figures, match, measures
 from .sets import LabelledSet
 
 MEAN = "mean"
@@ -33,7 +33,7 @@ class Results(NamedTuple):
 
     Attributes:
         rows: names, in their order.
-        columns: what is measured; the first of ``MEAN`` is what rows are compared by.
+        columns: what is measured.
         samples: by row and column, ``(1 + B,)``: the mean over the seeds, then its resamples.
         by_seed: by row and column, ``(S,)``.
         photographs: of a row that is shown labelled photographs alone, how many.
@@ -56,7 +56,7 @@ class Results(NamedTuple):
     @property
     def main(self) -> Column:
         """The column that rows are compared by."""
-        return next(column for column in self.columns if column[0] == MEAN)
+        return next((name, measure) for name, measure in self.columns if name == MEAN and measure in MAIN)
 
     def precision(self, row: str, column: Column | None = None) -> Estimate:
         """Average precision, 0 to 1."""

@@ -34,6 +34,7 @@ R40_RECALLS = np.linspace(1 / 40, 1, 40)
 MOST_FOUND = [1, 10, 100]  # of an image's detections, as COCO has it
 AT_ONCE = 64  # resamples: that many times the number of detections is held in memory
 LEVEL_NAMES = ("easy", "moderate", "hard")
+MAIN = ("AP50", "moderate AP50")  # the measure by which sets are compared, of COCO and of KITTI
 
 
 class Measure(NamedTuple):
@@ -71,7 +72,7 @@ class Matched(NamedTuple):
 
 
 def measures(kitti: bool, name: str) -> tuple[Measure, ...]:
-    """The ways to score a class, the first the one that means are taken of."""
+    """The ways to score a class, among them ``MAIN``."""
     if not kitti:
         return (Measure("AP50"),)
     strict = OVERLAP_OF_CARS if name.casefold() in ("car", "van", "truck", "tram") else OVERLAP
@@ -79,7 +80,7 @@ def measures(kitti: bool, name: str) -> tuple[Measure, ...]:
     official = [
         Measure(f"{word} R40", level, strict, R40_RECALLS, LEVELS[level][0]) for level, word in enumerate(LEVEL_NAMES)
     ]
-    return (usual[1], usual[0], usual[2], *official)
+    return (*usual, *official)
 
 
 def match(test: Sequence[Example], found: Sequence[Detections], number: int, measure: Measure) -> Matched:
