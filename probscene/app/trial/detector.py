@@ -18,7 +18,7 @@ References:
 import hashlib
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from torch import Tensor, nn
 from torchvision.models.detection.anchor_utils import AnchorGenerator
@@ -142,7 +142,7 @@ class _Backbone(nn.Module):
 
 
 def _fcos(classes: int, size: tuple[int, int]) -> FCOS:
-    detector: Any = FCOS(
+    detector = FCOS(
         _Backbone(),
         classes,
         min_size=min(size),
@@ -158,7 +158,7 @@ def _fcos(classes: int, size: tuple[int, int]) -> FCOS:
     detector.head.classification_head = FCOSClassificationHead(CHANNELS, 1, classes, CONVOLUTIONS)
     detector.head.regression_head = FCOSRegressionHead(CHANNELS, 1, CONVOLUTIONS)
     # Distances pass a ReLU: from 0, as torchvision has it, those to one side can die for good.
-    nn.init.constant_(detector.head.regression_head.bbox_reg.bias, START)
+    nn.init.constant_(cast(Tensor, detector.head.regression_head.bbox_reg.bias), START)
     return detector
 
 
