@@ -22,7 +22,7 @@ if (_checkout / "pyproject.toml").is_file():  # a plain checkout: probscene.mode
 __version__ = "0.2.0"
 
 _HOME = {
-    "api.calls": ("compare", "evaluate", "generate", "render", "report"),
+    "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
     "api.fit": ("fit",),
     "api.label": ("label",),
     "api.run": ("Run",),
@@ -61,7 +61,7 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 if TYPE_CHECKING:
-    from probscene.app.api.calls import compare, evaluate, generate, render, report
+    from probscene.app.api.calls import compare, evaluate, generate, render, report, trial
     from probscene.app.api.fit import fit
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
@@ -100,7 +100,7 @@ __all__ = [
     "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph",
     "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive",
     "evaluate", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report", "sample",
-    "scene_model", "seed_everything", "weights",
+    "scene_model", "seed_everything", "trial", "weights",
 ]  # fmt: skip
 
 

@@ -238,7 +238,7 @@ def weights_file(choice: str) -> Path | None:
 
 def _loaded(network: Callable[..., nn.Module], file: Path, **options) -> nn.Module:
     """A network of torchvision's with the file's weights and without its classifier."""
-    tensors = _tensors(file)
+    tensors = read_tensors(file)
     net = network(weights=None, **options)
     net.fc = nn.Identity()
     classes = getattr(tensors.get("fc.bias"), "shape", ())
@@ -259,7 +259,7 @@ def _named(net: str, number: int) -> tuple[str, ...]:
     return tuple(f"{net}_{i}" for i in range(number))
 
 
-def _tensors(file: Path) -> dict[str, Tensor]:
+def read_tensors(file: Path) -> dict[str, Tensor]:
     """The tensors of a ``torch.save`` or safetensors file."""
     if not file.is_file():
         raise DataError(f"Expected a file of weights at {file}, actual none; name one.")

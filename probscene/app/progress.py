@@ -38,6 +38,9 @@ STAGES = {
     "counting": ("Counting", "scenes"),
     "comparing": ("Comparing", "images"),
     "judging": ("Judging", "images"),
+    "labels": ("Labelled images", "images"),
+    "training": ("Detectors", "images"),
+    "scoring": ("Scoring", "sets"),
 }
 """By stage: what it does, and in what it counts."""
 EVERY = 30.0  # seconds without a line, at most, where there is no terminal

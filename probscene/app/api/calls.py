@@ -1,6 +1,6 @@
 """What is done with a run or a model: images, datasets, evaluations, reports."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -26,6 +26,8 @@ from ..fitting.run import RunFolder, is_run
 from ..fitting.session import Target
 from ..loading import load_model, renderer_for
 from ..progress import Display
+from ..trial import trial as trying
+from ..trial.results import Results
 from ..views import comparison as comparison_picture
 from ..views import report as reporting
 
@@ -180,6 +182,82 @@ def report(
     with display(progress) as show:
         where, truth = None if out is None else Path(out), None if labels is None else Path(labels)
         return reporting.report(opened, show, where, truth, num, scenes, visible, some_labels)
+
+
+def trial(
+    test: Path | str,
+    out: Path | str,
+    sets: Mapping[str, str | Path] | None = None,
+    *,
+    hold_out: int | None = None,
+    real: Path | str | None = None,
+    numbers: Iterable[int | None] | None = None,
+    run: RunFolder | Path | str | None = None,
+    sources: Sequence[str] = ("prior", "start", "learnt"),
+    generated: int = 600,
+    min_visible: float = 0.2,
+    classes: Iterable[str] | None = None,
+    detector: str = "efficientnet",
+    budget: trying.Budget | None = None,
+    size: tuple[int, int] | None = None,
+    seeds: int = 5,
+    seed: int = 0,
+    baselines: Iterable[str] = (),
+    resamples: int = 1000,
+    workers: int = 1,
+    progress: bool = True,
+) -> Results:
+    """What is a labelled set worth? Train one detector, from one start and with one budget, on each of several sets,
+    and test it on labelled real images; the same call goes on after an interruption.
+
+    Args:
+        test: labelled real images: a folder of COCO or KITTI, a JSON file, or ``FOLDER@LIST``.
+        out: the folder to write.
+        sets: what each detector is shown, by name, such as ``{"rendered": "dataset/", "then 20": "rendered,real:20"}``;
+            see ``trial.plan``.
+        hold_out: so many images of ``test`` are for testing, the others are ``"real"``.
+        real: other labelled photographs to train on.
+        numbers: of them, with a set each, None for all; 10, 20, 50 and all where not given.
+        run: a run or its folder, of which ``sources`` are generated, ``generated`` images each, without labels for
+            objects of which less than ``min_visible`` is visible.
+        classes: those that it is about; else all, which are then the same in all sets.
+        detector: ``"efficientnet"``, or ``"maskrcnn=FILE"`` with torchvision's weights.
+        budget: how each is trained.
+        size: height and width at which images come, multiples of 32.
+        seeds: trainings of each set.
+        seed: of everything random.
+        baselines: sets that the others are compared with; the first where there is none.
+        resamples: of test images and seeds, for intervals.
+        workers: processes; the results do not depend on their number. More than one are spawned: a script calls this
+            under ``if __name__ == "__main__":``.
+
+    Raises:
+        ProbsceneError: see ``trial.trial``.
+    """
+    made = None
+    if run is not None:
+        opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
+        made = trying.Generated(opened, tuple(sources), generated, min_visible)
+    with display(progress) as show:
+        return trying.trial(
+            Path(test),
+            Path(out),
+            sets or {},
+            show,
+            hold_out=hold_out,
+            real=None if real is None else Path(real),
+            numbers=numbers,
+            generated=made,
+            classes=classes,
+            detector=detector,
+            budget=budget or trying.Budget(),
+            size=size,
+            seeds=seeds,
+            seed=seed,
+            baselines=baselines,
+            resamples=resamples,
+            workers=workers,
+        )
 
 
 def display(progress: bool) -> Display:

@@ -8,10 +8,10 @@ import os
 import sys
 
 from ..memory import keep_freed_memory
-from . import fit_commands, model_commands, run_commands
+from . import fit_commands, model_commands, run_commands, trial_command
 from .application import app, explained
 
-__all__ = ["app", "explained", "fit_commands", "main", "model_commands", "run_commands"]
+__all__ = ["app", "explained", "fit_commands", "main", "model_commands", "run_commands", "trial_command"]
 
 
 def main() -> None:

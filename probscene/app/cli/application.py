@@ -22,7 +22,9 @@ class Call:
     debug: bool = field(default_factory=lambda: bool(os.environ.get("PROBSCENE_DEBUG")))
 
 
-ORDER = ("check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "demo", "version")
+ORDER = (
+    "check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "trial", "demo", "version",
+)  # fmt: skip
 
 
 class Commands(TyperGroup):

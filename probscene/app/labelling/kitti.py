@@ -37,13 +37,15 @@ DONT_CARE = "DontCare"
 
 
 class Object(NamedTuple):
-    """One line: its type and its box in pixels."""
+    """One line: its type, its box in pixels, and how much of it is cut by the image (a share) and hidden (0 to 3)."""
 
     type: str
     left: float
     top: float
     right: float
     bottom: float
+    truncated: float = 0.0
+    occluded: float = 0.0
 
 
 def read_objects(file: Path) -> list[Object]:
@@ -122,7 +124,7 @@ def _object(fields: list[str], where: str) -> Object:
             values.append(math.nan)
         if not math.isfinite(values[-1]):
             raise DataError(f"Expected a number for {name} {where}, actual {text!r}; mend the line.")
-    found = Object(fields[0], *values[3:7])
+    found = Object(fields[0], *values[3:7], *values[:2])
     if found.right < found.left or found.bottom < found.top:
         raise DataError(
             f"Expected a box from left to right and top to bottom {where}, actual {' '.join(fields[4:8])}; mend the "

@@ -1,0 +1,125 @@
+"""``probscene trial``: what is a labelled set worth to a detector?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from probscene.errors import ProbsceneError
+
+from .application import app
+from .options import Seed
+
+
+@app.command()
+def trial(
+    test: Annotated[
+        Path, typer.Option(metavar="PATH", help="Labelled real images: COCO or KITTI; PATH@LIST for some.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    sets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=SET",
+            help="PATH, PATH:N, A,B (B after A), A+B (mixed), real:N, learnt; again for more.",
+        ),
+    ] = None,
+    hold_out: Annotated[
+        int | None, typer.Option(metavar="N", help="Test on N images of --test alone; the others are 'real'.")
+    ] = None,
+    real: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Labelled photographs to train on, where not by --hold-out.")
+    ] = None,
+    real_numbers: Annotated[
+        str | None, typer.Option(metavar="N,...", help="Sets of so many of them; 10,20,50,all if not given, or none.")
+    ] = None,
+    run: Annotated[Path | None, typer.Option(metavar="RUN", help="A fit of which sets are generated.")] = None,
+    sources: Annotated[
+        str, typer.Option(metavar="NAME,...", help="Which of its sets: prior, start (of pretraining), learnt.")
+    ] = "prior,start,learnt",
+    generate: Annotated[int, typer.Option(metavar="N", help="How many images of each.")] = 600,
+    min_visible: Annotated[
+        float, typer.Option(metavar="FRACTION", help="No label there for objects of which less is visible.")
+    ] = 0.2,
+    classes: Annotated[
+        str | None, typer.Option(metavar="NAME,...", help="What it is about; all classes if not given.")
+    ] = None,
+    detector: Annotated[str, typer.Option(metavar="NET", help="efficientnet or maskrcnn=FILE.")] = "efficientnet",
+    presentations: Annotated[
+        int | None, typer.Option(metavar="N", help="Images shown in a training; 2400, of maskrcnn 10000.")
+    ] = None,
+    batch: Annotated[int | None, typer.Option(metavar="N", help="Images a step; 4, of maskrcnn 2.")] = None,
+    rate: Annotated[float | None, typer.Option(metavar="X", help="Of Adam; the detector's if not given.")] = None,
+    last: Annotated[float, typer.Option(metavar="SHARE", help="Of the presentations, for the last of A,B.")] = 0.5,
+    chain: Annotated[
+        bool, typer.Option("--chain", help="Each set goes on from the detector of the set before.")
+    ] = False,
+    size: Annotated[
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Images come so large; about 256x192 if not given.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(metavar="N", help="Trainings of each set.")] = 5,
+    seed: Seed = 0,
+    baseline: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Compare the sets with this one; the first if not given.")
+    ] = None,
+    resamples: Annotated[int, typer.Option(metavar="N", help="Of test images and seeds, for intervals.")] = 1000,
+    workers: Annotated[int, typer.Option(metavar="W", help="Processes; the results do not depend on it.")] = 1,
+) -> None:
+    """Say what labelled sets are worth: train one detector on each, test it on labelled real images."""
+    from rich.console import Console
+
+    from ..api import calls
+    from ..trial.tables import show
+    from ..trial.trial import Budget
+
+    named: dict[str, str | Path] = {}
+    for words in sets or []:
+        name, equals, said = words.partition("=")
+        if not equals or not said:
+            raise ProbsceneError(f"Expected --set NAME=SET, actual {words!r}.")
+        if name.strip() in named:
+            raise ProbsceneError(f"Expected a name for each set of a trial, actual {name.strip()!r} twice; rename one.")
+        named[name.strip()] = said.strip()
+    found = calls.trial(
+        test,
+        out,
+        named,
+        hold_out=hold_out,
+        real=real,
+        numbers=None if real_numbers is None else _numbers(real_numbers),
+        run=run,
+        sources=_words(sources),
+        generated=generate,
+        min_visible=min_visible,
+        classes=None if classes is None else _words(classes),
+        detector=detector,
+        budget=Budget(presentations, batch, rate, last, chain),
+        size=None if size is None else _size(size),
+        seeds=seeds,
+        seed=seed,
+        baselines=baseline or (),
+        resamples=resamples,
+        workers=workers,
+    )
+    show(found, Console(highlight=False))
+    print(f"All figures are in {out / 'results.json'}, the picture is {out / 'results.png'}")
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _numbers(text: str) -> list[int | None]:
+    words = [] if text == "none" else _words(text)
+    if not all(word == "all" or (word.isdecimal() and int(word) > 0) for word in words):
+        raise ProbsceneError(f"Expected numbers of photographs such as 10,20,50,all, or none, actual {text!r}.")
+    return [None if word == "all" else int(word) for word in words]
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Height and width."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ProbsceneError(f"Expected a size WIDTHxHEIGHT such as 256x192, actual {text!r}.")
+    return int(height), int(width)

@@ -1,0 +1,1 @@
+"""``probscene trial``: what is a labelled set worth to a detector?"""

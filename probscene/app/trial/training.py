@@ -1,0 +1,205 @@
+"""Train a detector on labelled images, the same number of presentations whatever the set, and detect with it.
+
+Everything random comes from the training's seed: the same bytes on one thread, whatever the number of processes.
+Axis letters: N objects, H W.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probscene.errors import ProbsceneError
+
+from .detector import Recipe, pretrained_part
+from .sets import Example, read_image
+
+SCALES = (0.75, 1.33)  # images are shown at
+SHIFT = 0.1  # of the image's sides
+LEAST_SIDE, LEAST_PART = 2.0, 0.35  # pixels, and a share of its box: of objects that the frame cuts, less is no object
+LIGHT = 0.25  # brightness, contrast and saturation change by so much
+FILL = 127  # around the image
+WARM = 0.05  # of the steps, in which the rate rises
+CLIP = 10.0  # of the gradient's norm
+KEPT = 256 * 2**20  # bytes of images that are kept in memory
+
+
+class Stage(NamedTuple):
+    """What is shown for a number of presentations.
+
+    Attributes:
+        parts: examples by set; each part has the same share of the presentations.
+        presentations: of images.
+        rate: what the recipe's is times that.
+    """
+
+    parts: tuple[tuple[Example, ...], ...]
+    presentations: int
+    rate: float = 1.0
+
+
+class Detections(NamedTuple):
+    """What was found in one image: boxes ``(N, 4)`` in pixels of its file, left top right bottom; classes ``(N,)`` from
+    0; scores ``(N,)``, from the highest."""
+
+    boxes: NDArray[np.float32]
+    classes: NDArray[np.int64]
+    scores: NDArray[np.float32]
+
+
+def train(
+    detector: nn.Module,
+    stages: Sequence[Stage],
+    recipe: Recipe,
+    size: tuple[int, int],
+    seed: Sequence[int],
+    shown: Callable[[int], None] = lambda number: None,
+) -> None:
+    """Train in place, stage after stage, each with an optimiser and a schedule of its own.
+
+    Args:
+        size: height and width at which images come.
+        seed: words of it.
+        shown: called with the number of presentations of each step.
+
+    Raises:
+        ProbsceneError: the loss is not finite.
+    """
+    pictures = Pictures(size)
+    for number, stage in enumerate(stages):
+        random = np.random.default_rng([*seed, number])
+        _run_stage(detector, stage, recipe, pictures, random, shown)
+
+
+def detect(detector: nn.Module, path: Path, size: tuple[int, int], first: int) -> Detections:
+    """What a trained detector finds in an image's file; ``first`` as of its ``Recipe``."""
+    image = read_image(path)
+    small, scale = fitted(image, size)
+    with torch.no_grad():
+        found = detector.eval()([_tensor(small)])[0]
+    boxes = found["boxes"].numpy() / scale
+    boxes = np.clip(boxes, 0, np.array([image.shape[1], image.shape[0]] * 2, np.float32))
+    return Detections(boxes.astype(np.float32), found["labels"].numpy() - first, found["scores"].numpy())
+
+
+def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> tuple[NDArray[np.uint8], float]:
+    """An image ``(H, W, 3)`` at the top left of a frame of ``size``, as large as it goes in there, and its scale."""
+    scale = min(size[0] / image.shape[0], size[1] / image.shape[1])
+    height, width = (max(1, round(side * scale)) for side in image.shape[:2])
+    frame = np.full((*size, 3), FILL, np.uint8)
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    frame[:height, :width] = cv2.resize(image, (width, height), interpolation=how)
+    return frame, scale
+
+
+class Pictures:
+    """Images as they are shown: each is read once, as far as memory goes."""
+
+    def __init__(self, size: tuple[int, int]):
+        self.size, self._kept = size, {}
+        self._room = KEPT // (3 * math.prod(size))
+
+    def __call__(self, example: Example) -> tuple[NDArray[np.uint8], float]:
+        """See ``fitted``."""
+        if example.path not in self._kept:
+            found = fitted(read_image(example.path), self.size)
+            if len(self._kept) >= self._room:
+                return found
+            self._kept[example.path] = found
+        return self._kept[example.path]
+
+
+def augmented(
+    example: Example, pictures: Pictures, random: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
+    """An image ``(H, W, 3)`` as a training sees it once, mirrored, moved, scaled and lit by chance, and the boxes
+    ``(N, 4)`` and classes ``(N,)`` of its objects."""
+    image, fit = pictures(example)
+    height, width = pictures.size
+    scale = math.exp(random.uniform(math.log(SCALES[0]), math.log(SCALES[1])))
+    across = -scale if random.random() < 0.5 else scale
+    # The frame's middle comes near the frame's middle.
+    x = width / 2 + random.uniform(-SHIFT, SHIFT) * width - across * width / 2
+    y = height / 2 + random.uniform(-SHIFT, SHIFT) * height - scale * height / 2
+    move = np.array([[across, 0, x + (across - 1) / 2], [0, scale, y + (scale - 1) / 2]])  # of pixels' middles
+    image = cv2.warpAffine(image, move, (width, height), flags=cv2.INTER_LINEAR, borderValue=(FILL,) * 3)
+    boxes, classes = example.boxes[example.real] * fit, example.classes[example.real]
+    ends = np.sort(boxes[:, [0, 2]] * across + x, 1), boxes[:, [1, 3]] * scale + y
+    whole = np.stack([ends[0][:, 0], ends[1][:, 0], ends[0][:, 1], ends[1][:, 1]], 1)
+    cut = np.clip(whole, 0, [width, height, width, height])
+    sides, before = cut[:, 2:] - cut[:, :2], whole[:, 2:] - whole[:, :2]
+    stay = (sides.min(1, initial=np.inf) >= LEAST_SIDE) & (sides.prod(1) >= LEAST_PART * before.prod(1))
+    return _lit(image, random), cut[stay].astype(np.float32), classes[stay]
+
+
+def order(parts: tuple[tuple[Example, ...], ...], number: int, random: np.random.Generator) -> Iterator[Example]:
+    """``number`` examples, the parts in turn, each part's again and again in an order by chance."""
+    streams = [_again(part, random) for part in parts]
+    for i in range(number):
+        yield next(streams[i % len(streams)])
+
+
+def _again(part: tuple[Example, ...], random: np.random.Generator) -> Iterator[Example]:
+    while True:
+        for i in random.permutation(len(part)):
+            yield part[i]
+
+
+def _run_stage(
+    detector: Any,
+    stage: Stage,
+    recipe: Recipe,
+    pictures: Pictures,
+    random: np.random.Generator,
+    shown: Callable[[int], None],
+) -> None:
+    body = {id(p) for p in pretrained_part(detector).parameters()}
+    groups = [[p for p in detector.parameters() if p.requires_grad and (id(p) in body) == of] for of in (False, True)]
+    rates = (recipe.rate * stage.rate, recipe.rate * stage.rate * recipe.backbone)
+    adam = torch.optim.Adam([{"params": g, "lr": r} for g, r in zip(groups, rates, strict=True)], fused=True)
+    steps = math.ceil(stage.presentations / recipe.batch)
+    schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: _course((step + 1) / steps))
+    detector.train()
+    examples, left = order(stage.parts, stage.presentations, random), stage.presentations
+    while left:
+        batch = [next(examples) for _ in range(min(recipe.batch, left))]
+        images, targets = [], []
+        for example in batch:
+            image, boxes, classes = augmented(example, pictures, random)
+            images.append(_tensor(image))
+            labels = torch.from_numpy(classes) + recipe.first
+            targets.append({"boxes": torch.from_numpy(boxes).reshape(-1, 4), "labels": labels})
+        loss = torch.stack([*detector(images, targets).values()]).sum()
+        if not torch.isfinite(loss):
+            raise ProbsceneError("Expected a finite loss of the detector, actual one that is not; give a lower --rate.")
+        adam.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_([p for group in groups for p in group], CLIP)
+        adam.step()
+        schedule.step()
+        left -= len(batch)
+        shown(len(batch))
+
+
+def _course(way: float) -> float:
+    """The rate, as a share of its highest, at a share of the steps: up in a line, down as a cosine."""
+    return way / WARM if way < WARM else 0.5 * (1 + math.cos(math.pi * (way - WARM) / (1 - WARM)))
+
+
+def _lit(image: NDArray, random: np.random.Generator) -> NDArray[np.uint8]:
+    gain, contrast, colour = random.uniform(1 - LIGHT, 1 + LIGHT, 3)
+    pixels = image.astype(np.float32) * gain
+    pixels = (pixels - pixels.mean()) * contrast + pixels.mean()
+    pale = pixels.mean(2, keepdims=True)
+    return np.clip((pixels - pale) * colour + pale, 0, 255).astype(np.uint8)
+
+
+def _tensor(image: NDArray[np.uint8]) -> Tensor:
+    """``(3, H, W)`` in 0..1."""
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255

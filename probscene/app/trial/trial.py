@@ -1,0 +1,290 @@
+"""What is a set worth? One detector, from one start and with one budget, is trained on each of several sets and tested
+on labelled real images; see ``trial``.
+
+    trial.json     what the trial is bound to
+    sets/          what was generated of a run
+    trainings/     what each detector found in the test images
+    results.json, table.txt, results.png
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from probscene.errors import DataError, ProbsceneError, RunError
+
+from ..arguments import checked_seed, positive
+from ..datasets.generate import generate, generate_scenes
+from ..files import make_folder, write_json, write_text
+from ..fitting.run import RunFolder
+from ..progress import Progress, silent
+from .detector import RECIPES, checked, fingerprint
+from .jobs import Job
+from .pictures import draw
+from .plan import REAL, Plan, Row, baselines_of, check, list_of, only, plan, split
+from .results import Results, score
+from .sets import LabelledSet, digest_of, read_set
+from .tables import text
+
+FORMAT = 1
+AREA, STEP = 256 * 192, 32  # pixels at which images come where no size is given, and what sides are multiples of
+NUMBERS = (10, 20, 50, None)
+
+
+class Budget(NamedTuple):
+    """How each detector is trained; the detector's recipe where None, see ``detector.RECIPES``.
+
+    Attributes:
+        presentations: of images.
+        batch: images a step.
+        rate: of Adam, at its highest.
+        last: the share of the presentations that the last of several stages has.
+        chain: every row goes on from the row before, as in the paper, at half the rate and then at a tenth.
+    """
+
+    presentations: int | None = None
+    batch: int | None = None
+    rate: float | None = None
+    last: float = 0.5
+    chain: bool = False
+
+
+AS_USUAL = Budget()
+
+
+class Generated(NamedTuple):
+    """What is generated of a run: its sources, how many images of each, the least visible fraction of a label."""
+
+    run: RunFolder
+    sources: tuple[str, ...] = ("prior", "start", "learnt")
+    number: int = 600
+    min_visible: float = 0.2
+
+
+def trial(
+    test: Path,
+    out: Path,
+    sets: Mapping[str, str | Path],
+    show: Progress = silent,
+    *,
+    hold_out: int | None = None,
+    real: Path | None = None,
+    numbers: Iterable[int | None] | None = None,
+    generated: Generated | None = None,
+    classes: Iterable[str] | None = None,
+    detector: str = "efficientnet",
+    budget: Budget = AS_USUAL,
+    size: tuple[int, int] | None = None,
+    seeds: int = 5,
+    seed: int = 0,
+    baselines: Iterable[str] = (),
+    resamples: int = 1000,
+    workers: int = 1,
+) -> Results:
+    """Train, test, compare; the same call goes on after an interruption. Nothing is trained before all is checked.
+
+    Args:
+        test: labelled real images, see ``sets``; ``FOLDER@LIST`` for some of them.
+        sets: what each row's detector is shown, see ``plan``.
+        hold_out: so many of ``test``'s images, by the seed, are for testing, the others are ``real``.
+        real: labelled photographs to train on.
+        numbers: of them, with a row each, None for all; (10, 20, 50, all), as far as there are, where not given.
+        classes: those that the trial is about; else all, which are then the same in all sets.
+        size: height and width at which images come, multiples of 32.
+        seeds: trainings of each row.
+        seed: of the trial: the split, the choices of photographs, the detectors' starts, the bootstrap.
+        baselines: rows that the others are compared with; the first where there is none.
+        resamples: of the bootstrap.
+        workers: processes; the results do not depend on their number.
+
+    Raises:
+        ProbsceneError: a setting that makes no sense.
+        DataError: a set that cannot be used; test images among those that are trained on.
+        RunError: the folder holds a trial of other settings.
+        MachineError: the disk is full, or a worker was killed.
+    """
+    choice, recipe = detector, _recipe(detector, budget)
+    checked_seed(seed)
+    for number, what in ((seeds, "seeds"), (workers, "workers"), (resamples, "resamples")):
+        positive(number, what)
+    if size is not None and any(side < STEP or side % STEP for side in size):
+        raise ProbsceneError(f"Expected a size of multiples of {STEP}, actual {size[1]}x{size[0]}.")
+    if hold_out is not None and real is not None:
+        raise ProbsceneError("Expected photographs to train on from --hold-out or from --real, actual both; give one.")
+    tested, photographs = _photographs(test, real, hold_out, seed, classes, show)
+    names, same = tested.classes, classes is None
+    known = [] if generated is None else list(_sources(generated))
+    if photographs is not None:
+        known.insert(0, REAL)
+        there = len(photographs.examples)
+        wanted = [n for n in NUMBERS if n is None or n < there] if numbers is None else list(numbers)
+    else:
+        wanted = list(numbers or ())
+        if wanted:
+            raise ProbsceneError("Expected --hold-out N or --real PATH for --real-numbers, actual neither.")
+    planned = plan(sets, known, wanted)
+    bases = baselines_of(planned, baselines)
+    loaded = {} if photographs is None else {REAL: photographs}
+    loaded |= {key: _read(path, names, show, same) for key, path in planned.paths.items()}
+    check(planned, loaded, tested, set(known) - {REAL})
+    if generated is not None:
+        _check_classes(generated, names, same)
+    size = size or _size(tested)
+    shared = {
+        "format": FORMAT, "classes": list(names), "detector": fingerprint(choice), "recipe": list(recipe),
+        "last": budget.last, "chain": budget.chain, "size": list(size), "seed": seed, "test": digest_of(tested),
+    }  # fmt: skip
+    _bind(out, shared)
+    if generated is not None:
+        for key, path in _generate(generated, out / "sets", seed, workers, show).items():
+            loaded[key] = _read(path, names, show)
+        check(planned, loaded, tested, set())
+    rows = {
+        row.name: tuple(tuple((loaded[p.source], p) for p in stage) for stage in row.stages) for row in planned.rows
+    }
+    digests = _digests(planned, loaded, shared)
+    job = Job(out, choice, recipe, size, names, rows, digests, tested.examples, seeds, seed, budget.last, budget.chain)
+    for row in planned.rows:
+        for s in range(seeds):
+            job.is_done(row.name, s)
+    write_json(out / "trial.json", {**shared, "rows": {row.name: row.record() for row in planned.rows}})
+    job.run(workers, lambda done, total: show("training", done, total))
+    there = 0 if photographs is None else len(photographs.examples)
+    found = score(job, tested, planned.rows, there, bases, resamples, lambda done, total: show("scoring", done, total))
+    write_json(out / "results.json", found.record() | {"settings": {**shared, "resamples": resamples}})
+    write_text(out / "table.txt", text(found))
+    draw(found, out / "results.png")
+    return found
+
+
+def _recipe(choice: str, budget: Budget):
+    """What a detector is trained with."""
+    if not 0 < budget.last < 1:
+        raise ProbsceneError(f"Expected a share of the last set between 0 and 1, actual {budget.last}.")
+    recipe = RECIPES[checked(choice)]
+    given = {"presentations": budget.presentations, "batch": budget.batch, "rate": budget.rate}
+    recipe = recipe._replace(**{key: value for key, value in given.items() if value is not None})
+    positive(recipe.presentations, "presentations")
+    positive(recipe.batch, "images a step")
+    if not (recipe.rate > 0 and math.isfinite(recipe.rate)):
+        raise ProbsceneError(f"Expected a positive learning rate, actual {recipe.rate}.")
+    return recipe
+
+
+def _read(path: Path, classes: Iterable[str] | None, show: Progress, same: bool = False) -> LabelledSet:
+    folder, names = list_of(path)
+    found = read_set(folder, classes, lambda done, total: show("labels", done, total), same)
+    return found if names is None else only(found, names)
+
+
+def _photographs(
+    test: Path, real: Path | None, hold_out: int | None, seed: int, classes: Iterable[str] | None, show: Progress
+) -> tuple[LabelledSet, LabelledSet | None]:
+    """What is tested on, and the photographs to train on, if there are any."""
+    tested = _read(test, classes, show)
+    if hold_out is not None:
+        photographs, tested = split(tested, hold_out, seed)
+    else:
+        photographs = None if real is None else _read(real, tested.classes, show, classes is None)
+    labelled = {int(c) for e in tested.examples for c in e.classes[e.real]}
+    lacking = [name for number, name in enumerate(tested.classes) if number not in labelled]
+    if lacking:
+        raise DataError(
+            f"Expected test images in {test} with objects of every class, actual none of {', '.join(lacking)}; name "
+            "the classes that there are by --classes, or test on more images."
+        )
+    return tested, photographs
+
+
+def _sources(generated: Generated) -> tuple[str, ...]:
+    """Those that are asked for; no start where guides begin from the prior."""
+    unknown = set(generated.sources) - {"prior", "start", "learnt"}
+    if unknown or not generated.sources:
+        actual = ", ".join(sorted(unknown)) or "none"
+        raise ProbsceneError(f"Expected sources of a run among prior, start and learnt, actual {actual}.")
+    generated.run.check_finished()
+    same = generated.run.model.pretraining is None
+    return tuple(name for name in dict.fromkeys(generated.sources) if not (name == "start" and same))
+
+
+def _check_classes(generated: Generated, classes: tuple[str, ...], same: bool) -> None:
+    there = set(generated.run.model.classes)
+    if set(classes) - there or (same and there - set(classes)):
+        raise DataError(
+            f"Expected model {generated.run.model.name!r} to have the classes of the test images "
+            f"({', '.join(classes)}), actual {', '.join(generated.run.model.classes)}; rename its classes or those of "
+            "the labels, or name the classes that both have by --classes."
+        )
+
+
+def _generate(generated: Generated, into: Path, seed: int, workers: int, show: Progress) -> dict[str, Path]:
+    """Write what is generated of a run, as far as it is not there; by source its folder."""
+    run, number, least = generated.run, positive(generated.number, "images to generate"), generated.min_visible
+    policies = {"prior": run.model.prior, "start": run.model.pretraining_policy}
+    folders = {}
+    for source in _sources(generated):
+        folders[source] = into / source
+
+        def said(done: int, total: int) -> None:
+            show("generating", done, total)
+
+        if source == "learnt":
+            generate(run, number, into / source, seed, 1 if run.objects else workers, "coco", said, least)
+        else:
+            generate_scenes(run.model, policies[source], number, into / source, seed, "coco", said, least)
+    return folders
+
+
+def _size(tested: LabelledSet) -> tuple[int, int]:
+    """Of ``AREA``, in the shape of the test images."""
+    shape = float(np.median([width / height for height, width in (e.size for e in tested.examples)]))
+    sides = math.sqrt(AREA / shape), math.sqrt(AREA * shape)
+    height, width = (max(STEP, STEP * round(side / STEP)) for side in sides)
+    return height, width
+
+
+def _digests(planned: Plan, loaded: Mapping[str, LabelledSet], shared: Mapping[str, Any]) -> dict[str, str]:
+    """By row, of what its trainings depend on; in a chain also of the rows before it."""
+    of_source = {name: digest_of(found) for name, found in loaded.items()}
+
+    def one(row: Row) -> str:
+        stages = [[(of_source[part.source], part.number) for part in stage] for stage in row.stages]
+        return hashlib.sha256(repr((stages, shared)).encode()).hexdigest()
+
+    digests: dict[str, str] = {}
+    for row in planned.rows:
+        before = "".join(digests.values()) if shared["chain"] else ""
+        digests[row.name] = hashlib.sha256((before + one(row)).encode()).hexdigest()[:32]
+    return digests
+
+
+def _bind(out: Path, shared: dict[str, Any]) -> None:
+    """Make the folder ready, or see that it holds a trial of the same settings."""
+    record = out / "trial.json"
+    make_folder(out)
+    if record.is_file():
+        try:
+            before = json.loads(record.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise RunError(
+                f"Expected a trial's settings in {record}, actual a damaged file; name another folder."
+            ) from error
+        differing = [key for key in shared if before.get(key) != shared[key]]
+        if differing:
+            was, now = (", ".join(f"{key} {str(s.get(key))[:60]}" for key in differing) for s in (before, shared))
+            raise RunError(
+                f"Expected the settings that the trial in {out} was begun with ({was}), actual {now}; give the "
+                "same, or name another folder. Sets and seeds can be added."
+            )
+        return
+    others = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith("."))
+    if others:
+        raise DataError(
+            f"Expected a new or empty folder for the trial, actual {out} with {', '.join(others[:5])} in it."
+        )
+    write_json(record, {**shared, "rows": {}})

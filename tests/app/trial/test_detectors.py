@@ -1,0 +1,81 @@
+"""That detectors learn, and that trainings are the same bytes in any process."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from torchvision.models import resnet50
+
+import probscene as ps
+from probscene.app.trial.detector import RECIPES, build
+from probscene.app.trial.sets import read_image, read_set
+from probscene.app.trial.training import Pictures, Stage, augmented, detect, fitted, order, train
+from probscene.app.trial.trial import Budget, trial
+from probscene.errors import DataError
+
+SMALL = {"budget": Budget(presentations=8), "seeds": 2, "resamples": 20, "size": (64, 64)}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_a_detector_learns_what_is_drawn(drawn, tmp_path):
+    found = ps.trial(
+        drawn / "test", tmp_path / "out", {"drawn": drawn / "train"},
+        seeds=1, resamples=50, size=(64, 64), budget=Budget(presentations=200), progress=False,
+    )  # fmt: skip
+    assert found.precision("drawn").value > 0.6
+    record = json.loads((tmp_path / "out" / "results.json").read_text())
+    figure = record["rows"]["drawn"]["precision"]["AP50"]["mean"]
+    assert figure["low"] <= figure["value"] <= figure["high"]
+    assert record["rows"]["drawn"]["coco"]["AP50"] == pytest.approx(figure["value"], abs=1e-6)
+
+
+def test_two_workers_give_the_same_bytes(drawn, tmp_path):
+    for workers in (1, 2):
+        trial(drawn / "test", tmp_path / str(workers), {"two": f"{drawn / 'train'}:2"}, **SMALL, workers=workers)
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+
+
+def test_mask_rcnn_is_trained_from_the_weights_of_a_user(drawn, tmp_path):
+    file = tmp_path / "resnet50.safetensors"
+    safetensors.torch.save_file(resnet50(weights=None).state_dict(), file)
+    detector, examples = build(f"maskrcnn={file}", 2, (64, 64)), read_set(drawn / "train").examples
+    frozen = detector.backbone.body.layer1[0].conv1.weight.clone()
+    recipe = RECIPES["maskrcnn"]
+    train(detector, [Stage((examples[:2],), 2)], recipe, (64, 64), (0,))
+    found = detect(detector, examples[0].path, (64, 64), recipe.first)
+    assert set(found.classes.tolist()) <= {0, 1} and (frozen == detector.backbone.body.layer1[0].conv1.weight).all()
+    safetensors.torch.save_file({"x": torch.zeros(1)}, file)
+    with pytest.raises(DataError, match="maskrcnn_resnet50_fpn or resnet50"):
+        build(f"maskrcnn={file}", 2, (64, 64))
+
+
+def test_boxes_go_with_the_image(drawn):
+    """What is drawn stands inside its box, however the image is mirrored, moved and scaled."""
+    pictures, random, right = Pictures((96, 128)), np.random.default_rng(0), []
+    for example in read_set(drawn / "train").examples:
+        for _ in range(5):
+            image, boxes, classes = augmented(example, pictures, random)
+            assert image.shape == (96, 128, 3) and len(boxes) == len(classes) <= len(example.boxes)
+            for (x0, y0, x1, y1), c in zip(boxes, classes, strict=True):
+                green = image[int((y0 + y1) / 2), int((x0 + x1) / 2), 1]
+                right.append((green > 140) if c == 0 else (green < 60))  # discs are light, squares dark
+    assert np.mean(right) > 0.85  # the rest are covered by others
+
+
+def test_an_image_keeps_its_shape_in_a_frame_of_another(drawn):
+    image = read_image(read_set(drawn / "train").examples[0].path)[:40]
+    frame, scale = fitted(image, (64, 128))
+    assert frame.shape == (64, 128, 3) and scale == pytest.approx(1.6)
+    assert (frame[:, 103:] == 127).all() and frame[:, :102].std() > 1
+
+
+def test_parts_are_shown_in_turn_and_all_of_each():
+    shown = list(order((tuple("abc"), tuple("XY")), 12, np.random.default_rng(0)))
+    assert "".join(shown[1::2]).isupper() and sorted(shown[0::2]) == sorted("abc" * 2)
+    assert sorted(shown[1::2]) == sorted("XY" * 3)
