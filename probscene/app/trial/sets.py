@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from probscene.errors import DataError
 
-from ..datasets.kitti_labels import DONT_CARE, TYPES, Object, read_objects
+from ..labelling.kitti import DONT_CARE, TYPES, Object, read_objects
 
 Progress = Callable[[int, int], None]
 
@@ -80,7 +80,7 @@ def read_set(
 
     Args:
         classes: those to keep; all that it has where None. KITTI's types count as classes of their names, whatever the
-            case, or by ``kitti_labels.TYPES``.
+            case, or by ``labelling.kitti.TYPES``.
         same: a set of COCO must have no others.
         progress: called with the number of images read, and of all.
 
