@@ -3,7 +3,7 @@
 Without labels a reading is believed where heads that agree on renders agree on the photographs too, where the rule
 counts right on renders that nothing was trained on, and where the mean count stays over a stretch of thresholds. With
 labels the rule is that with the least error on them, a little held by its error on renders, as ten labels alone would
-choose among fifty rules by luck. Where no rule predicts a label better than the other labels' histogram does, that
+choose among fifty rules by luck. Where the other labels' histogram predicts a label better than any rule does, that
 histogram is what is learnt. Axis letters: L photographs, V renders, K labelled images, S shares, R rules, C classes.
 """
 
@@ -22,7 +22,7 @@ SKILL = 0.8  # least correlation with the true counts of renders
 BASE = 0.3  # objects
 RENDERS = 1.0  # how many labelled images the error on renders is worth
 ENOUGH = 5  # labelled images from which on rules are chosen by them
-MUCH, LITTLE = 1.25, 0.1  # by which factor, and how many objects, a larger share must mend the error
+MUCH, LITTLE = 1.25, 0.1  # by which factor, and how many objects, errors on so few labels must differ
 GOES_WITH = 0.4  # least correlation of labels with a reading that is believed without them
 APART = 0.25  # relative difference of means from which on labels and such a reading are of different things
 Array = NDArray[np.float64]
@@ -142,7 +142,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     with_free = _correlation(read.labelled[:, 0, free.rule, c], labels)
     seen_mean, mean = float(read.labelled[:, 0, free.rule, c].mean()), float(y.mean())
     figures = f"leave-one-out error {error:.2f} an image, of the labels' histogram {histogram:.2f}"
-    if error <= histogram:
+    if error <= MUCH * histogram + LITTLE:
         found = read.photographs[:, share, rule, c]
         because = (
             f"readable by {len(y)} labels, {float(found.mean()):.1f} an image by {RULES[rule]}, of objects visible by "
