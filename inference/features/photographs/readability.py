@@ -154,7 +154,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     if free.readable and with_free < GOES_WITH and abs(seen_mean - mean) > APART * max(seen_mean, mean):
         because = (
             f"{free.because}; the labels do not go with what is seen (r = {with_free:.2f}, {mean:.1f} labelled for "
-            f"{seen_mean:.1f} read) and are not used: are all objects of this class labelled?"
+            f"{seen_mean:.1f} read) and are not used; see whether all objects of this class are labelled"
         )
         return free._replace(error=error, because=because)
     steps = _steps(read.photographs[:, share, 0, c].double().numpy(), y)

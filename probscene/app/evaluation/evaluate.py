@@ -10,6 +10,7 @@ weigh, and totals hide.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,18 @@ class Evaluation:
     piled: tuple[Piled, ...] = ()
     inexpressible: tuple[Inexpressible, ...] = ()
 
+    @cached_property
+    def unread(self) -> tuple[str, ...]:
+        """Classes that the network cannot count in the target's images: nothing is compared with an estimate of them,
+        nor of all objects."""
+        return tuple(name for name in self.classes if name in self.run.unread)
+
+    @cached_property
+    def readings(self) -> tuple[str, ...]:
+        """Of each class how it is read in the target's images, in a sentence; empty for features that do not say so."""
+        records = self.run.readings.get("classes", {})
+        return tuple(f"{name}: {records[name]['because']}." for name in self.classes if name in records)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the model is too narrow for, with what to change."""
@@ -84,18 +97,21 @@ class Evaluation:
         ``kinds`` and ``children`` have both distances with their intervals, of each class's counts and, where kinds
         nest, of the children by ``structure_counts.GROUPS``; None where a source has no such node."""
         one, other = self.sources[a], self.sources[b]
+        unread = self.unread if "estimate" in (a, b) else ()
         number = histogram(one.total), histogram(other.total)
         shares = pooled_shares(one.counts), pooled_shares(other.counts)
         each = {
             name: total_variation(histogram(one.counts[:, c]), histogram(other.counts[:, c]))
             for c, name in enumerate(self.classes)
+            if name not in unread
         }
+        kinds = zip(self.classes, one.kinds, other.kinds, strict=True)
         return {
-            "number": total_variation(*number),
-            "number_wasserstein": wasserstein(*number),
-            "classes": total_variation(*shares) if shares[0].any() and shares[1].any() else None,
+            "number": None if unread else total_variation(*number),
+            "number_wasserstein": None if unread else wasserstein(*number),
+            "classes": total_variation(*shares) if shares[0].any() and shares[1].any() and not unread else None,
             "each_class": each,
-            "kinds": {name: _apart(x, y) for name, x, y in zip(self.classes, one.kinds, other.kinds, strict=True)},
+            "kinds": {name: None if name in unread else _apart(x, y) for name, x, y in kinds},
             "children": {
                 _key(relation): {group: _apart(found, other.nested[relation][group]) for group, found in each.items()}
                 for relation, each in one.nested.items()
@@ -118,6 +134,8 @@ class Evaluation:
             "target": str(self.target),
             "classes": list(self.classes),
             "notes": list(self.notes),
+            "readings": self.run.readings.get("classes", {}),
+            "outcome": self.run.outcome,
             "distances": self.distances(),
             "walls": {
                 "lists": [found.record() for found in self.piled],
@@ -205,7 +223,7 @@ def evaluate(
     path = run.target if target is None else target.path
     classes = tuple(run.model.classes[c] for c in columns)
     notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
-    short = piled(run.model, run.guide, estimate, seed)
+    short = piled(run.model, run.guide, None if run.unread else estimate, seed)
     beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
     return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond)
 
@@ -224,7 +242,7 @@ def _inexpressible(
         return ()
     source = sources[by]
     if by == "estimate":
-        columns = [c for c, name in enumerate(classes) if name not in run.model.stuff]
+        columns = [c for c, name in enumerate(classes) if name not in (*run.model.stuff, *run.unread)]
         classes, source = tuple(classes[c] for c in columns), source.only(columns)
     names = [] if target is None else [file.name for file in target.paths]
     names = names if len(names) == len(source.counts) else []

@@ -31,7 +31,7 @@ from ..labelling.few import FewLabels, PartlyLabelled
 from ..progress import Progress
 from .cache import NetworkCache
 from .observer import RENDERED_AT_ONCE, Observer
-from .outcome import conclude
+from .outcome import compared, conclude, give_up
 from .parts import inner
 from .run import RunFolder
 from .scene_features import fingerprint
@@ -73,9 +73,13 @@ def fit(
         net.finish(cache_in, use_cache, say or (lambda text: None))
         run.keep_network(net.net)
         real = _real_features(run, net.net, progress, images)
+    which = compared(net.net)
     with threads(1):  # the guide's tensors are tiny: a second thread only waits
-        guide = _learn(run, observer, net.net, real, progress)
-        said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
+        if which is not None and not which.any():
+            said = give_up(run)
+        else:
+            guide = _learn(run, observer, net.net, real, progress)
+            said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
     if said and say is not None:
         say(said)
@@ -187,7 +191,9 @@ def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: 
     features, *others = (
         embed_all(net, images.batches(RENDERED_AT_ONCE, view), each, real=True) for view in range(views)
     )
-    check_features(features)
+    which = compared(net)
+    if which is None or which.any():
+        check_features(features)
     kept = {"features": features, "fingerprint": fingerprint(images)}
     run.write_tensors("real", kept | ({"views": torch.cat(others)} if others else {}))
     return torch.cat([features, *others])

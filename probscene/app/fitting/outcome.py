@@ -23,6 +23,18 @@ SCENES = 500  # of each policy, at most; fewer where the fit's batches are small
 REJECTED = "guide-rejected"
 
 
+def compared(net: FeatureNet) -> Tensor | None:
+    """``(D,)`` whether a feature says anything of the target's images; None where all do."""
+    return getattr(net, "compared", None)
+
+
+def give_up(run: RunFolder) -> str:
+    """Keep the prior, as no feature can be read; why, in a sentence."""
+    because = "Nothing can be read in the target's images, so that nothing can be learnt from them"
+    _keep_prior(run, {"kept": "prior", "because": because})
+    return f"{because}; the prior is kept."
+
+
 def conclude(
     run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, guide: Guide, progress: Progress
 ) -> str:
@@ -32,11 +44,8 @@ def conclude(
         net: what it learnt by.
         real: ``(L, D)``.
     """
-    compared = _compared(net, real)
-    if not compared.any():
-        because = "No feature can be read in the target's images, so that nothing can be learnt from them"
-        _keep_prior(run, guide, {"kept": "prior", "because": because})
-        return f"{because}; the prior is kept."
+    which = compared(net)
+    which = slice(None) if which is None else which
     found = []
     number = min(SCENES, 2 * run.preset.num_scenes)
     policies: tuple[Policy, ...] = (guide.eval(), run.model.prior)
@@ -46,8 +55,8 @@ def conclude(
         for first in range(0, number, RENDERED_AT_ONCE):
             parts.append(observe(sample(run.model, policy, min(RENDERED_AT_ONCE, number - first))))
             progress("outcome", i * number + first + len(parts[-1]), 2 * number, "")
-        found.append(torch.cat(parts)[:, compared].double().numpy())
-    apart = farther(found[0], found[1], real[:, compared].double().numpy())
+        found.append(torch.cat(parts)[:, which].double().numpy())
+    apart = farther(found[0], found[1], real[:, which].double().numpy())
     record: dict[str, Any] = {"kept": "learnt", "scenes": number, "learnt": apart.one, "prior": apart.other}
     if not apart.sure:
         run.write_outcome(record)
@@ -57,16 +66,11 @@ def conclude(
         f"Learnt scenes are farther from the target than the prior's, {apart.one:.2f} against {apart.other:.2f} in "
         "energy distance of the features"
     )
-    _keep_prior(run, guide, record | {"kept": "prior", "because": because})
+    run.write_tensors(REJECTED, guide.state_dict())
+    _keep_prior(run, record | {"kept": "prior", "because": because})
     return f"{because}; the prior is kept. What was learnt is in {run.path / REJECTED}.safetensors."
 
 
-def _keep_prior(run: RunFolder, guide: Guide, record: dict[str, Any]) -> None:
+def _keep_prior(run: RunFolder, record: dict[str, Any]) -> None:
     run.write_outcome(record)
-    run.write_tensors(REJECTED, guide.state_dict())
     run.write_tensors("guide", {PRIOR_KEPT: torch.ones(1)})
-
-
-def _compared(net: FeatureNet, real: Tensor) -> Tensor:
-    """``(D,)`` whether a feature says anything."""
-    return getattr(net, "compared", torch.ones(real.shape[1], dtype=torch.bool))

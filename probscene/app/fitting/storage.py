@@ -58,16 +58,12 @@ class Storage:
         Raises:
             RunError: ``readings.json`` is damaged.
         """
-        file = self.path / "readings.json"
-        if not file.is_file():
-            return {}
-        try:
-            classes = json.loads(file.read_text(encoding="utf-8"))["classes"]
-            return {name: float(found["visible"]) for name, found in classes.items() if "visible" in found}
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise RunError(
-                f"Expected what was read of each class in {file}, actual something else; fit again."
-            ) from error
+        return {name: float(found["visible"]) for name, found in self.readings.get("classes", {}).items()}
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """Classes that its features cannot count in the target's images."""
+        return tuple(name for name, found in self.readings.get("classes", {}).items() if not found["readable"])
 
     @property
     def is_finished(self) -> bool:

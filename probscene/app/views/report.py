@@ -140,7 +140,8 @@ def _headline(evaluation: Evaluation) -> str:
         for key, what in (("number", "number of objects"), ("classes", "classes")):
             prior, learnt = (_figure(found[a][key]) for a in ("prior", "learnt"))
             rows.append(f'<div class="card">{what}, {to}<b>{prior} → {learnt}</b></div>')
-    walls = "".join(f"<p>{html.escape(text)}</p>" for text in evaluation.warnings)
+    kept = [evaluation.run.outcome["because"]] if "because" in evaluation.run.outcome else []
+    walls = "".join(f"<p>{html.escape(text)}</p>" for text in (*kept, *evaluation.warnings))
     if not rows:
         return f"<p>There are neither labels nor an estimate to compare with.</p>{walls}"
     note = "Total variation: first the prior's, then that of what was learnt."
@@ -172,6 +173,7 @@ def _picture(images: list[Pixels], caption: str) -> str:
 
 def _note(evaluation: Evaluation) -> str:
     notes = [f"Labels: {html.escape(note)}" for note in evaluation.notes]
+    notes += [f"Read: {html.escape(line)}" for line in evaluation.readings]
     if "estimate" in evaluation.sources:
         notes.append(
             "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; "

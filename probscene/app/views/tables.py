@@ -15,6 +15,7 @@ from probscene.inference.judging.tally import Interval, Tally
 from ..evaluation.compare import ESTIMATE, Comparison, Row
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.likelihood import Likelihood
+from ..evaluation.sources import Source
 from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, label
 
 NAMES = {"prior": "prior", "learnt": "learnt", "truth": "truth", "estimate": "estimate *"}
@@ -40,12 +41,16 @@ def show(evaluation: Evaluation, console: Console) -> None:
     notes = {figure.note for each in evaluation.images.values() for found in each.values() for figure in found} - {""}
     if "estimate" in evaluation.sources:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
+    for line in evaluation.readings:
+        console.print(f"Read: {line}", style="dim", soft_wrap=True)
     if evaluation.images:
         console.print(FLOOR, style="dim", soft_wrap=True)
     for note in evaluation.notes:
         console.print(f"Labels: {note}", style="dim", soft_wrap=True)
     for note in sorted(notes):
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
+    if "because" in evaluation.run.outcome:
+        console.print(f"The prior is kept: {evaluation.run.outcome['because']}.", soft_wrap=True)
     for warning in evaluation.warnings:
         console.print(warning, soft_wrap=True)
 
@@ -57,6 +62,8 @@ def apart(evaluation: Evaluation, spread: bool = False) -> list[Table]:
         | {kind: found.mean() for kind, found in zip(evaluation.classes, source.kinds, strict=True)}
         for name, source in evaluation.sources.items()
     }
+    if evaluation.unread and ESTIMATE in means:
+        means[ESTIMATE] |= dict.fromkeys((ALL_OBJECTS, *evaluation.unread))
     return distances(evaluation.distances(), means, spread)
 
 
@@ -105,7 +112,7 @@ def _add(table: Table, words: str, values: list[tuple[Any, Any]], means: list[An
 
 
 def _numbers(evaluation: Evaluation) -> Table:
-    sources = evaluation.sources
+    sources = _whole(evaluation)
     table = _table("Images by number of objects, %", "objects", [NAMES[name] for name in sources])
     rows = ranges(source.total for source in sources.values())
     firsts = [first for first, _ in rows]
@@ -121,12 +128,17 @@ def _numbers(evaluation: Evaluation) -> Table:
 
 
 def _classes(evaluation: Evaluation) -> Table:
-    sources = evaluation.sources
+    sources = _whole(evaluation)
     table = _table("Objects by class, %", "class", [NAMES[name] for name in sources])
     each = [source.classes() for source in sources.values()]
     for c, name in enumerate(evaluation.classes):
         table.add_row(name, *(_percent(found, c) for found in each))
     return table
+
+
+def _whole(evaluation: Evaluation) -> dict[str, Source]:
+    """The sources that count all classes."""
+    return {name: source for name, source in evaluation.sources.items() if name != ESTIMATE or not evaluation.unread}
 
 
 def nested_counts(evaluation: Evaluation) -> dict[str, dict[str, Tally]]:

@@ -72,7 +72,7 @@ def test_a_network_is_given_what_is_labelled(call, discs, target, parts, few, tm
 
 def test_labels_are_checked_before_anything_is_written(call, discs, target, parts, few, tmp_path):
     out = tmp_path / "run"
-    done = call(*words(discs, target, out, "--labels", few))
+    done = call(*words(discs, target, out, "--labels", few, "--features", "count"))
     assert done.code == 2 and not out.exists()
     assert "Expected features that labels can calibrate, actual 'count'" in done.err
     assert all(f"--features {name}" in done.err for name in takers_of_labels())

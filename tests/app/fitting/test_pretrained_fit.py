@@ -138,18 +138,28 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
         net.load_state_dict(state)
 
 
-def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call, discs, target, tmp_path):
-    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=2"]
-    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
-    assert done.code == 0 and "Looking at images" in done.err and "epochs" in done.err, done.err
-    run = RunFolder.at(tmp_path / "run")
+COUNTING = ["--features", "count=efficientnet", "--set", "pairs=60", "--set", "head_epochs=12"]
+
+
+@pytest.fixture(scope="module")
+def counting(call, discs, target, tmp_path_factory):
+    out = tmp_path_factory.mktemp("counting") / "run"
+    done = call("fit", discs.file, "--target", target.images, "--out", out, *WORDS, *COUNTING)
+    assert done.code == 0, done.err
+    return RunFolder.at(out), done.err
+
+
+def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(counting, call, target, tmp_path):
+    run, said = counting
+    assert "Looking at images" in said and "Readings" in said and "epochs" in said
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
-    seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
-    assert len(net.names) == len(run.model.classes) + 3
+    seen = net.embed_photographs(torch.stack([images.load(i) for i in range(9)]))
+    assert net.names == run.model.classes
     assert torch.allclose(seen, run.read_tensors("real")["features"][:9], atol=1e-3)
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
-    assert [line["stage"] for line in lines] == ["features"] * 3 + ["counts"] + ["structure"] * 2
-    assert len(lines[3]["correlation"]) == len(run.model.classes) and len(lines[3]["ratio"]) == 3
+    assert [line["stage"] for line in lines] == ["features"] * 12 + ["counts"] + ["structure"] * 2
+    assert len(lines[12]["correlation"]) == len(run.model.classes)
+    assert all(f"{name}: {found['because']}." in said for name, found in run.readings["classes"].items())
     guide = (run.path / "guide.safetensors").read_bytes()
     for name in ("guide", "real", "features"):
         (run.path / f"{name}.safetensors").unlink()
@@ -158,15 +168,38 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(call,
     words = ["--target", target.images, "--num", 50, "--scenes", 40, "--json", tmp_path / "e.json"]
     done = call("evaluate", run.path, *words)
     assert done.code == 0, done.err
-    estimate = json.loads((tmp_path / "e.json").read_text())["sources"]["estimate"]
-    counts = run.read_tensors("real")["features"][:, :2]
-    number = (counts * net.unit[:2]).round().sum(1)  # objects, whatever the unit of the features is
-    assert estimate["mean_number"] == pytest.approx(number.mean().item(), abs=1e-6)
-    assert not torch.equal(number, counts.round().sum(1))
+    found = json.loads((tmp_path / "e.json").read_text())
+    number = (run.read_tensors("real")["features"] * net.unit).round().sum(1)  # objects, whatever the features' unit is
+    assert found["sources"]["estimate"]["mean_number"] == pytest.approx(number.mean().item(), abs=1e-6)
+    assert found["readings"] == run.readings["classes"] and found["outcome"]["kept"] in ("learnt", "prior")
+    assert "Read: " in done.out
     assert call("report", run.path, "--num", 50, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
 
 
-def test_heads_that_taught_themselves_are_of_the_runs_images(call, discs, target, tmp_path):
+def test_labels_choose_how_classes_are_read(counting, call, discs, target, tmp_path):
+    few = tmp_path / "few.csv"
+    few.write_text("".join(target.labels.read_text().splitlines(keepends=True)[:13]))
+    words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *WORDS, *COUNTING]
+    done = call(*words, "--labels", few)
+    assert done.code == 0, done.err
+    found = RunFolder.at(tmp_path / "run").readings["classes"]
+    assert all(each["error"] is not None and "12 labels" in each["because"] for each in found.values())
+
+
+def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs, target, tmp_path):
+    """Heads that are hardly trained."""
+    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=1"]
+    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
+    assert done.code == 0 and done.err.count("not readable") == 2 and "the prior is kept" in done.err, done.err
+    run = RunFolder.at(tmp_path / "run")
+    assert run.guide is run.model.prior and run.outcome["kept"] == "prior"
+    assert set(run.unread) == set(run.model.classes)
+    assert call("generate", run.path, "--num", 3, "--out", tmp_path / "d").code == 0
+    done = call("evaluate", run.path, "--target", target.images, "--num", 50, "--scenes", 0)
+    assert done.code == 0 and "The prior is kept" in done.out, done.err
+
+
+def test_readings_are_of_the_runs_images(call, discs, target, tmp_path):
     images = tmp_path / "images"
     shutil.copytree(target.images, images)
     words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=1"]
