@@ -1,7 +1,10 @@
 """Can a run be trusted? Its scenes, the prior's and the target's images through its own network, judged without labels.
 
 Scenes are drawn and looked at as the fit has looked at them. For another domain the images' looks are asked, by
-EfficientNet-Lite: counts of a strange image may be quite ordinary. Axis letters: N scenes, L images, D features.
+EfficientNet-Lite: counts of a strange image may be quite ordinary. They are not asked where the features were suited to
+the target's images and say what can be read in them: those are another domain, and were read as such.
+
+Axis letters: N scenes, L images, D features.
 """
 
 from dataclasses import dataclass
@@ -13,7 +16,7 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.base import Examples, FeatureNet
 from probscene.inference.judging.trust import Trust, trust
 from probscene.inference.judging.two_sample import NEEDED
 from probscene.policy import Policy
@@ -23,6 +26,7 @@ from probscene.threads import threads
 from ..chunks import CHUNK, chunk_randomness
 from ..fitting.fit import Progress
 from ..fitting.observer import Observer
+from ..fitting.outcome import compared
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..pictures import Pixels, pixels, shrunk
@@ -46,6 +50,7 @@ class Judged:
         generated_unmatched: the generated scenes farthest from any real image, ``(H, W, 3)``.
         names: the files of ``real_unmatched``.
         agreement: with the labels, where there are such.
+        usable: which classes can be used, in a sentence, where the features say so.
         walls: what the model is too narrow for, one sentence, where that is known.
     """
 
@@ -56,12 +61,13 @@ class Judged:
     names: tuple[str, ...] = ()
     agreement: Agreement | None = None
     walls: str = ""
+    usable: str = ""
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
         if self.trust is None:
             return {"verdict": None, "because": self.absent}
-        more: dict[str, Any] = {"unlike_images": list(self.names)}
+        more: dict[str, Any] = {"unlike_images": list(self.names)} | ({"usable": self.usable} if self.usable else {})
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
         return self.trust.record() | more
@@ -89,6 +95,8 @@ def judge(
         raise ProbsceneError(f"Expected at least {NEEDED} scenes to judge by, actual {num}; or 0 for no verdict.")
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
+    if run.readings and set(run.unread) == set(run.model.classes):
+        return Judged(None, usable(run))
     if len(target) < NEEDED:
         return Judged(
             None, f"Expected at least {NEEDED} real images for a verdict, actual {len(target)} in {target.path}."
@@ -110,14 +118,16 @@ def judge(
     with threads(run.record["threads"]):
         spread = np.linspace(0, len(target) - 1, min(2 * LOOKS, len(target))).astype(int)
         seen = looks.embed(torch.stack([target.load(i) for i in spread]))
+    which = compared(net)
+    which = torch.ones(real.shape[1], dtype=torch.bool) if which is None else which
     try:
         found = trust(
-            scenes[0].numpy(),
-            real.numpy(),
-            scenes[1].numpy(),
-            tuple(net.names),
+            scenes[0][:, which].numpy(),
+            real[:, which].numpy(),
+            scenes[1][:, which].numpy(),
+            tuple(name for name, some in zip(net.names, which.tolist(), strict=True) if some),
             resolution=run.features.resolution,
-            looks=(seen.numpy(), torch.cat([look for eye in eyes for look in eye.looks]).numpy()),
+            looks=None if run.readings else (seen.numpy(), torch.cat([x for eye in eyes for x in eye.looks]).numpy()),
             seed=seed,
             pretrained=run.features.pretrained,
         )
@@ -130,7 +140,18 @@ def judge(
     if evaluation is not None and "truth" in evaluation.sources:
         by_labels = agreement(evaluation.sources["learnt"], evaluation.sources["truth"], evaluation.classes)
     walls = "" if evaluation is None else evaluation.walls
-    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls)
+    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls, usable(run))
+
+
+def usable(run: RunFolder) -> str:
+    """Which classes can be used, in a sentence; empty where the features do not say so."""
+    classes = run.readings.get("classes", {})
+    good = ", ".join(name for name in run.model.classes if name in classes and name not in run.unread)
+    bad = ", ".join(name for name in run.model.classes if name in run.unread)
+    if not classes or not bad:
+        return f"All classes can be read in the target's images: {good}." if good else ""
+    cannot = f"{bad} cannot be read in the target's images and keep the prior: label ten of them (probscene label)."
+    return f"Can be used: {good}; {cannot}" if good else f"No class can be used: {cannot}"
 
 
 class _Eyes:
@@ -139,8 +160,18 @@ class _Eyes:
     def __init__(self, net: FeatureNet, appearance: FeatureNet, each, keep: bool):
         self.net, self.appearance, self.each, self.keep = net, appearance, each, keep
         self.names, self.thumbs, self.looks, self.looked = net.names, [], [], 0
+        if hasattr(net, "embed_drawn"):
+            self.embed_drawn = self._embed_drawn
 
     def embed(self, images: Tensor) -> Tensor:
+        self._look(images)
+        return self.net.embed(images)
+
+    def _embed_drawn(self, drawn: Examples) -> Tensor:
+        self._look(drawn.image)
+        return self.net.embed_drawn(drawn)  # pyright: ignore[reportAttributeAccessIssue]: asked for before
+
+    def _look(self, images: Tensor) -> None:
         if self.keep:
             self.thumbs += [shrunk(image, THUMB).copy() for image in pixels(images)]
         some = images[: max(0, LOOKS - self.looked)]
@@ -148,7 +179,6 @@ class _Eyes:
             self.looks.append(self.appearance.embed(some))
             self.looked += len(some)
         self.each(len(images))
-        return self.net.embed(images)
 
 
 def _features(run: RunFolder, policy: Policy, net: FeatureNet, draws_per_structure: int, num: int, seed: int) -> Tensor:

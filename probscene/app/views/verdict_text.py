@@ -83,7 +83,7 @@ def _sentences(judged: Judged) -> list[str]:
     found = judged.trust
     if found is None:
         return [judged.absent]
-    out = [found.because, found.remedy]
+    out = [found.because, found.remedy, *([judged.usable] if judged.usable else [])]
     out += [] if judged.agreement is None else [judged.agreement.sentence(found.verdict)]
     return [*out, judged.walls] if judged.walls else out
 
