@@ -55,7 +55,8 @@ class Policy:
 
 def masked(grammar: Grammar, logits: Tensor, frontier: Frontier, support: "Support | None" = None) -> Tensor:
     """Logits ``(..., K)`` with the rules masked that do not expand the symbol of ``frontier (...)`` (section 3.2), or
-    that are outside a support."""
+    that are outside a support, and those of a prior where a support holds it."""
+    logits = logits if support is None else support.settled(frontier, logits)
     return torch.where(_allowed(grammar, frontier, support), logits, MASKED)
 
 

@@ -22,6 +22,25 @@ from .grammar import Grammar
 from .policy import Policy
 from .structure import StructurePrior
 
+LEAST = -1e9  # as a logit of probability 0: infinity has no gradient
+
+
+def only_of(grammar: Grammar, kinds: Sequence[str]) -> list[int]:
+    """The nonterminals that derive objects, and none but those of some kinds."""
+    below = [
+        {int(k) for k in grammar.objects[grammar.legal[v]].unique() if k >= 0} for v in range(len(grammar.nonterminals))
+    ]
+    while True:
+        grown = [
+            own.union(*(below[int(c)] for c in grammar.children[grammar.legal[v]].unique() if c >= 0))
+            for v, own in enumerate(below)
+        ]
+        if grown == below:
+            break
+        below = grown
+    wanted = {grammar.kind(name) for name in kinds}
+    return [v for v, own in enumerate(below) if own and own <= wanted]
+
 
 class Support:
     """The rules that may be taken, by state.
@@ -34,10 +53,14 @@ class Support:
     Attributes:
         rows: ``(U, K)`` bool, the different masks.
         row: ``(V + 1, P, C)`` int64, which of them a state has.
+        held: the prior that some nonterminals keep; None where none does.
+        holds: ``(V + 1,)`` bool, which of them.
     """
 
     def __init__(self, grammar: Grammar, possible: Tensor):
         self.grammar, self.possible = grammar, possible
+        self.held: StructurePrior | None = None
+        self.holds = torch.zeros(len(possible), dtype=torch.bool)
         self.rows, row = possible.flatten(0, 2).unique(dim=0, return_inverse=True)
         self.row = row.view(possible.shape[:3])
 
@@ -58,6 +81,26 @@ class Support:
         never = ~possible.any(-1, keepdim=True)  # nothing reaches it; a mask of nothing would be NaN
         written = torch.stack([_grown(table, P, C) > -torch.inf for table in tables]).any(0)
         return Support(grammar, possible | (never & written))
+
+    def holding(self, prior: Policy, kinds: Sequence[str]) -> "Support":
+        """This one with a prior's probabilities for all nonterminals that derive objects of some kinds alone, whatever
+        a guide's logits are: nothing is learnt of them. As it is where the prior is no table."""
+        symbols = only_of(self.grammar, kinds)
+        if not symbols or not isinstance(prior, StructurePrior):
+            return self
+        made = Support(self.grammar, self.possible)
+        made.held = prior
+        made.holds[symbols] = True
+        return made
+
+    def settled(self, frontier: Frontier, logits: Tensor) -> Tensor:
+        """Logits ``(..., K)`` with the prior's in the states of the nonterminals that keep it."""
+        if self.held is None:
+            return logits
+        _, P, C, _ = self.held.table.shape
+        place = frontier.parent_repeat.clamp(max=P - 1), frontier.repeat.clamp(max=C - 1)
+        kept = self.held.table[frontier.symbol, *place].clamp(min=LEAST)
+        return torch.where(self.holds[frontier.symbol].unsqueeze(-1), kept.to(logits.dtype), logits)
 
     def allowed(self, frontier: Frontier) -> Tensor:
         """``(..., K)`` bool, the rules that may be taken from ``frontier (...)``."""

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pyro import poutine
 
 from probscene.derivation import Derivation
-from probscene.derive import derive_complete
+from probscene.derive import derive, derive_complete
 from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
 from probscene.inference.guides.lstm import GUIDES, make_guide
@@ -16,7 +16,7 @@ from probscene.inference.guides.scenario import ScenarioGuide
 from probscene.policy import Policy
 from probscene.scenarios import JointGrammar
 from probscene.structure import StructurePrior, counts, ranked, weights
-from probscene.support import Support
+from probscene.support import Support, only_of
 
 LISTS = Grammar("Scene -> bg Items\nItems -> Item Items | ε\nItem -> x(Things) | y\nThings -> z Things | ε")
 MOST = 16
@@ -165,3 +165,30 @@ def test_scenarios_have_their_own_parts():
     with torch.no_grad():
         drawn, failed = derive_complete(grammar, guide, 100, 8)
     assert possible(prior, drawn).all() and not failed.any()
+
+
+def test_what_is_held_has_the_priors_probabilities_whatever_a_guide_says():
+    """Reds are held, whites are free: a guide's distribution of reds is the prior's, and log q is exact."""
+    grammar = Grammar("Scene -> Reds Whites\n Reds -> red Reds | ε\n Whites -> white Whites | ε")
+    prior = StructurePrior(grammar, Reds=counts(3, 2, 1), Whites=counts(1, 1, 1))
+    support = Support.of(grammar, (prior,))
+    assert support is not None and only_of(grammar, ["red"]) == [grammar.nonterminals.index("Reds")]
+    assert only_of(grammar, ["red", "white"]) == [0, 1, 2] and only_of(grammar, []) == []
+    torch.manual_seed(0)
+    for kind in GUIDES:
+        guide = make_guide(kind, grammar=grammar, max_steps=8)
+        with torch.no_grad():
+            for parameter in guide.parameters():
+                parameter.normal_(0, 1.5)
+        guide.bind(support.holding(prior, ["red"]))
+        every = enumerate_derivations(grammar, 8)
+        every = every[prior.log_prob(every) > -torch.inf]
+        probability = guide.log_prob(every).exp()
+        assert probability.sum().item() == pytest.approx(1, abs=1e-5)
+        reds = every.counts(len(grammar.kinds))[:, grammar.kind("red")]
+        shares = torch.stack([probability[reds == k].sum() for k in range(3)])
+        assert shares.tolist() == pytest.approx([1 / 2, 1 / 3, 1 / 6], abs=1e-5)
+        drawn = derive(grammar, guide, 4000, 8).counts(len(grammar.kinds))[:, grammar.kind("red")]
+        assert (drawn.bincount(minlength=3) / 4000).tolist() == pytest.approx([1 / 2, 1 / 3, 1 / 6], abs=0.04)
+        guide.bind(support.holding(prior, []))
+        assert guide.support is support
