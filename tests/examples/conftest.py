@@ -18,6 +18,7 @@ SHORT = {
     "width": "4,8,8",
     "pretrain_derivations": 100,
     "pretrain_epochs": 1,
+    "prior_if_worse": "false",
     "batches": 2,
     "num_scenes": 20,
 }

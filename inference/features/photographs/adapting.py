@@ -36,7 +36,11 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
     counts = {} if labelled is None else dict(zip(labelled.classes, labelled.counts.T, strict=True))
     records: dict[str, Any] = {}
     for c, name in enumerate(net.classes):
-        if net.size[c] < SMALLEST:
+        if name in net.stuff:
+            found = without_labels(read, c)
+            because = f"{found.mean:.1f} an image, not compared: stuff has no definite number"
+            found = found._replace(readable=True, because=because)
+        elif net.size[c] < SMALLEST:
             found = without_labels(read, c)._replace(readable=False, because=_too_small(net, c))
         elif name in counts:
             found = with_labels(read, c, counts[name])
@@ -66,7 +70,7 @@ def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:
         net.rules[0, c] = error.argmin()
     net.steps[c] = torch.inf
     net.steps[c, : len(found.steps)] = torch.tensor(found.steps)
-    net.compared[net.order.index(c)] = found.readable
+    net.read[net.order.index(c)] = found.readable
 
 
 def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:

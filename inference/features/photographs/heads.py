@@ -57,7 +57,7 @@ class PretrainedCountNet(nn.Module):
         rules: ``(2, C)`` of ``RULES``, by which renders and photographs are read.
         share: ``(C,)`` of ``SHARES``.
         steps: ``(C, MOST)``, see ``readability.by_steps``; infinite for none.
-        compared: ``(D,)``, whether a feature is; those that are not are 0.
+        read: ``(D,)`` bool, whether a class can be read in photographs; features of others are 0.
         held_read, held_true: ``(V, S, R, C)`` and ``(V, S, C)``, what is read in those renders, and their counts.
         size: ``(C,)``, places that the longer side of such an object spans, the median; infinite where none was drawn.
     """
@@ -67,7 +67,7 @@ class PretrainedCountNet(nn.Module):
     rules: Tensor
     share: Tensor
     steps: Tensor
-    compared: Tensor
+    read: Tensor
     held_read: Tensor
     held_true: Tensor
     size: Tensor
@@ -97,11 +97,16 @@ class PretrainedCountNet(nn.Module):
         self.register_buffer("rules", torch.zeros(2, C, dtype=torch.int64))
         self.register_buffer("share", torch.zeros(C, dtype=torch.int64))
         self.register_buffer("steps", torch.full((C, MOST), math.inf))
-        self.register_buffer("compared", torch.ones(len(self.names), dtype=torch.bool))
+        self.register_buffer("read", torch.ones(len(self.names), dtype=torch.bool))
         self.register_buffer("held_read", torch.zeros(held, len(SHARES), len(RULES), C))
         self.register_buffer("held_true", torch.zeros(held, len(SHARES), C))
         self.register_buffer("size", torch.zeros(C))
         self.heads = nn.ModuleList(_Head(frozen.channels, (1 + C) * len(SHARES)) for _ in range(HEADS))
+
+    @property
+    def compared(self) -> Tensor:
+        """``(D,)`` bool, which features say anything of the target's images: things that can be read."""
+        return self.read & (torch.arange(len(self.names)) < self.blocks[0])
 
     @property
     def taught_by_fingerprint(self) -> str:
@@ -226,7 +231,7 @@ class PretrainedCountNet(nn.Module):
         return self._features(torch.cat(parts) if parts else torch.zeros(0, len(self.classes)))
 
     def _features(self, counts: Tensor) -> Tensor:
-        return counts[:, self.order] / self.unit * self.compared
+        return counts[:, self.order] / self.unit * self.read
 
 
 class _Head(nn.Module):

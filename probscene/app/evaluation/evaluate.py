@@ -76,6 +76,12 @@ class Evaluation:
         return tuple(f"{name}: {records[name]['because']}." for name in self.classes if name in records)
 
     @property
+    def kept(self) -> tuple[str, ...]:
+        """That the prior is kept, and why; empty where it is what was learnt."""
+        outcome = self.run.outcome
+        return (f"The prior is kept: {outcome['because']}.",) if "because" in outcome else ()
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What the model is too narrow for, with what to change."""
         return (*sentences(self.piled), *(f"Warning: {found}" for found in self.inexpressible))

@@ -95,7 +95,7 @@ def judge(
         raise ProbsceneError(f"Expected at least {NEEDED} scenes to judge by, actual {num}; or 0 for no verdict.")
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
-    if run.readings and set(run.unread) == set(run.model.classes):
+    if run.readings and set(run.unread) == set(run.model.classes) - set(run.model.stuff):
         return Judged(None, usable(run))
     if len(target) < NEEDED:
         return Judged(
@@ -146,8 +146,9 @@ def judge(
 def usable(run: RunFolder) -> str:
     """Which classes can be used, in a sentence; empty where the features do not say so."""
     classes = run.readings.get("classes", {})
-    good = ", ".join(name for name in run.model.classes if name in classes and name not in run.unread)
-    bad = ", ".join(name for name in run.model.classes if name in run.unread)
+    things = [name for name in run.model.classes if name not in run.model.stuff]
+    good = ", ".join(name for name in things if name in classes and name not in run.unread)
+    bad = ", ".join(name for name in things if name in run.unread)
     if not classes or not bad:
         return f"All classes can be read in the target's images: {good}." if good else ""
     cannot = f"{bad} cannot be read in the target's images and keep the prior: label ten of them (probscene label)."

@@ -33,22 +33,24 @@ class Preset:
         count: the count network's schedule.
         width, blocks: the count network's size.
         presence_images, presence_epochs: the presence network's training set and its longest training.
-        pairs, directions: of a pretrained network's projection: structures that are drawn twice, and features.
-        head_epochs: training of the heads that count on pretrained maps, on the same renders.
-        photographs: images of the target, at most, on which those heads teach themselves in one more epoch.
+        pairs: structures that are drawn twice, for a pretrained network's projection or for the heads that count on its
+            maps.
+        directions: features of a projection.
+        head_epochs: training of those heads.
+        photographs: images of the target, at most, by which it is chosen how those heads are read.
         views: of each real image in the density of their features, the image itself and parts of it
             (``Images.load``). Among few images they take some noise out of the density.
         guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``; ``FILE.py:NAME`` for one's own.
         objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
             value for each scene; ``"mmd"``, MMD as a reward that all scenes share; ``FILE.py:NAME`` for one's own.
-        variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first one also of ``MMD``. Marginals are of
-            counts alone where directions stand beside them.
+        variance, marginal_variance, leave_one_out: see ``KDELogRatio``; the first one also of ``MMD``.
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Trainer`` and ``ScoreFunction``.
         draws_per_structure: drawings of each structure, of which the clearest is looked at.
         baseline, scale, incompletion_weight, prior_kl_weight: see ``ScoreFunction``, whose prior is the policy
             that guides are pretrained on.
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
+        prior_if_worse: keep the prior where what was learnt is farther from the target, beyond chance.
     """
 
     features: str = "count"
@@ -84,6 +86,7 @@ class Preset:
     hidden: int = 50
     num_latents: int = 1
     index: bool = True
+    prior_if_worse: bool = True
 
     @staticmethod
     def of(record: dict[str, Any]) -> "Preset":

@@ -58,12 +58,20 @@ class Storage:
         Raises:
             RunError: ``readings.json`` is damaged.
         """
-        return {name: float(found["visible"]) for name, found in self.readings.get("classes", {}).items()}
+        try:
+            found = self.readings["classes"] if self.readings else {}
+            return {name: float(read["visible"]) for name, read in found.items() if "visible" in read}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RunError(
+                f"Expected what was read of each class in {self.path / READINGS}, actual something else; fit again."
+            ) from error
 
     @property
     def unread(self) -> tuple[str, ...]:
         """Classes that its features cannot count in the target's images."""
-        return tuple(name for name, found in self.readings.get("classes", {}).items() if not found["readable"])
+        return tuple(
+            name for name, found in self.readings.get("classes", {}).items() if not found.get("readable", True)
+        )
 
     @property
     def is_finished(self) -> bool:
@@ -102,7 +110,10 @@ class Storage:
     def _read_json(self, name: str) -> dict[str, Any]:
         file = self.path / name
         try:
-            return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+            found = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+            if not isinstance(found, dict):
+                raise ValueError(type(found).__name__)
+            return found
         except ValueError as error:
             raise RunError(f"Expected JSON in {file}, actual a damaged file ({error}); fit again.") from error
 

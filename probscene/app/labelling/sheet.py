@@ -118,7 +118,9 @@ def page(
     )
     about = {"classes": classes, "before": before}
     digest = hashlib.sha256(json.dumps([model, about, names]).encode()).hexdigest()[:16]
-    return Template(resources.files("probscene.app.labelling").joinpath("sheet.html").read_text("utf-8")).substitute(
+    return Template(
+        resources.files("probscene.app.labelling").joinpath("sheet.html").read_text(encoding="utf-8")
+    ).substitute(
         title=html.escape(f"Count in {len(names)} pictures: {model}"),
         classes=html.escape(", ".join(classes)),
         before=f"{len(before)} pictures that were labelled before are in the file, too." if before else "",

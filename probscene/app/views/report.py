@@ -140,8 +140,7 @@ def _headline(evaluation: Evaluation) -> str:
         for key, what in (("number", "number of objects"), ("classes", "classes")):
             prior, learnt = (_figure(found[a][key]) for a in ("prior", "learnt"))
             rows.append(f'<div class="card">{what}, {to}<b>{prior} → {learnt}</b></div>')
-    kept = [evaluation.run.outcome["because"]] if "because" in evaluation.run.outcome else []
-    walls = "".join(f"<p>{html.escape(text)}</p>" for text in (*kept, *evaluation.warnings))
+    walls = "".join(f"<p>{html.escape(text)}</p>" for text in (*evaluation.kept, *evaluation.warnings))
     if not rows:
         return f"<p>There are neither labels nor an estimate to compare with.</p>{walls}"
     note = "Total variation: first the prior's, then that of what was learnt."

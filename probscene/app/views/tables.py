@@ -49,9 +49,7 @@ def show(evaluation: Evaluation, console: Console) -> None:
         console.print(f"Labels: {note}", style="dim", soft_wrap=True)
     for note in sorted(notes):
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
-    if "because" in evaluation.run.outcome:
-        console.print(f"The prior is kept: {evaluation.run.outcome['because']}.", soft_wrap=True)
-    for warning in evaluation.warnings:
+    for warning in (*evaluation.kept, *evaluation.warnings):
         console.print(warning, soft_wrap=True)
 
 

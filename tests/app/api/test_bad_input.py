@@ -124,7 +124,7 @@ PARTS = {
     "random features": ({"features": Net(lambda x: x + torch.rand_like(x))}, r"Net\.embed to give .* the same"),
     "of the batch": ({"features": Net(lambda x: x - x.mean(0))}, r"Net\.embed to give .* the same .* alone"),
     "no network": ({"features": 5}, r"features with a name and build\(model\), .* actual int"),
-    "half of them": ({"features": Half()}, r"Half without training, divergence, .*; subclass probscene\.Features"),
+    "half of them": ({"features": Half()}, r"Half without training, adapt, .*; subclass probscene\.Features"),
     "built no network": ({"features": NoNet()}, r"NoNet\.build a network with names.* actual Linear"),
     "odd settings": ({"features": OddSettings()}, r"OddSettings\.settings a dict .* actual batchs"),
     "a class": ({"features": NeedsMore}, r"without arguments, actual NeedsMore\(size\)"),
@@ -162,7 +162,7 @@ def test_parts_that_are_wrong(quick, discs, name):
     options, message = PARTS[name]
     short = {**discs.short, "count.steps": 2}
     with pytest.raises(ps.ProbsceneError, match=f"^(At batch 1 of 4: )?Expected .*{message}"):
-        quick(discs.file, IMAGES, **{"settings": short, **options})
+        quick(discs.file, IMAGES, **{"settings": short, "features": "count", **options})
 
 
 class NoLength(torch.utils.data.IterableDataset):

@@ -22,6 +22,7 @@ import probscene
 from probscene.app.datasets import coco
 from probscene.app.datasets.generate import generate, generate_scenes, png
 from probscene.app.datasets.provenance import remake
+from probscene.app.files import write_json
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
@@ -371,6 +372,8 @@ def test_a_killed_worker_is_one_clear_message(run, undisturbed, tmp_path):
 
 def test_a_workers_error_is_the_same_as_without_workers(tmp_path):
     endless = a_run(tmp_path / "run", 50.0)
+    write_json(endless.path / "run.json", endless.record | {"within_support": False})
+    endless = RunFolder.at(endless.path)
     messages = []
     for workers in (1, 2):
         with pytest.raises(SamplingError, match="max_steps = 40") as error:

@@ -238,4 +238,6 @@ def test_the_benchmarks_own_labels(data_dir, tmp_path):
         image, read = dataset[k]
         image.close()
         own = read_objects(folder / "label_2" / f"{Path(dataset.images[k]).stem}.txt")
-        assert [(one["type"], *one["bbox"]) for one in read] == [tuple(one) for one in own]
+        assert [(one["type"], *one["bbox"], one["truncated"], one["occluded"]) for one in read] == [
+            tuple(one) for one in own
+        ]

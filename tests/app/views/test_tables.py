@@ -24,6 +24,8 @@ from probscene.relations import PerParent
 
 NAMES = ("prior", "learnt", "truth")
 
+RUN = SimpleNamespace(unread=(), readings={}, outcome={})
+
 
 def streets(seed: int, num: int = 80) -> Source:
     """Scenes with one street of one or two lanes, and up to three cars on each lane."""
@@ -45,7 +47,7 @@ def streets(seed: int, num: int = 80) -> Source:
 @pytest.fixture(scope="module")
 def found() -> Evaluation:
     sources = {name: streets(i) for i, name in enumerate(NAMES)}
-    return Evaluation(SimpleNamespace(), "images", ("car", "tree"), sources)
+    return Evaluation(RUN, "images", ("car", "tree"), sources)
 
 
 def printed(found: Evaluation, width: int = 80) -> str:
@@ -154,7 +156,7 @@ def test_a_comparisons_labels_never_touch():
     classes = ("car", "pedestrian", "cyclist", "traffic sign", "vegetation", "building", "pole")
     rng = np.random.default_rng(0)
     sources = {n: Source.of(rng.poisson(9, (60, len(classes)))) for n in ("prior", "one", "two", "truth")}
-    run = SimpleNamespace()
+    run = RUN
     figure = comparison.picture(Comparison(run, "images", classes, sources, runs={"one": run, "two": run}))
     for axes in figure.axes:
         labels_apart(axes)

@@ -95,7 +95,8 @@ def test_features_are_read_by_their_rules_in_units(dots):
         one = torch.cat([embed(image[None]) for image in images])
         assert torch.allclose(one, embed(images), rtol=1e-4, atol=1e-4)
         assert embed(images[:0]).shape == (0, 2)
-    net.compared[1] = False
+    net.read[1] = False
+    assert net.compared.tolist() == [True, False]
     assert (net.embed(images)[:, 1] == 0).all() and (net.embed_photographs(images)[:, 1] == 0).all()
     net.steps[0, :2] = torch.tensor([-1.0, 1e9])
     assert torch.allclose(net.embed_photographs(images)[:, 0] * net.unit[0], torch.ones(5))
@@ -106,6 +107,7 @@ def test_things_come_before_stuff_and_choose_the_unit(dots):
     plain, net = untrained(dots), untrained(dots, stuff=dots.classes[:1])
     net.load_state_dict(plain.state_dict())
     assert net.names == dots.classes[::-1] and net.blocks == (1, 1) and plain.blocks == (2, 0)
+    assert net.compared.tolist() == [True, False] and plain.compared.all()
     images = torch.randint(0, 256, (20, 3, 64, 96), dtype=torch.uint8)
     units = plain.unit[[1, 0]] / plain.unit
     assert torch.allclose(net.embed(images), plain.embed(images)[:, [1, 0]] * units, atol=1e-5)
