@@ -123,7 +123,7 @@ class _Stages(nn.Module):
         x = self.relu(self.stem(x))
         maps: OrderedDict[str, Tensor] = OrderedDict()
         for number, stage in enumerate(self.stages):
-            for block in stage:  # type: ignore[attr-defined]
+            for block in cast(nn.Sequential, stage):
                 x = block(x)
             if number:
                 maps[str(number)] = x

@@ -166,9 +166,9 @@ def _read_coco(path: Path, file: Path, wanted: tuple[str, ...] | None, progress:
 
 
 def _corners(annotation: Mapping[str, Any], file: Path) -> list[float]:
-    box = annotation.get("bbox")
+    box: Any = annotation.get("bbox")
     try:
-        x, y, w, h = map(float, box)  # type: ignore[arg-type]
+        x, y, w, h = map(float, box)
         if not (all(map(math.isfinite, (x, y, w, h))) and w > 0 and h > 0):
             raise ValueError
     except (TypeError, ValueError):
