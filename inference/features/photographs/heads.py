@@ -118,6 +118,11 @@ class PretrainedCountNet(nn.Module):
         height, width = self.frozen[0].entering(*self.canvas)
         return height // PLACE, width // PLACE
 
+    def scale(self) -> Tensor:
+        """Places a pixel of the canvas, along x and y, ``(2,)``."""
+        height, width = self.places()
+        return torch.tensor([width / self.canvas[1], height / self.canvas[0]])
+
     @torch.no_grad()
     def begin(self, maps: Maps, target: Tensor) -> None:
         """Take over channels' means and scales, and start from what places hold in the mean: from anywhere else the
@@ -165,9 +170,7 @@ class PretrainedCountNet(nn.Module):
         Args:
             drawn: their labels.
         """
-        height, width = self.places()
-        places = torch.tensor([width / self.canvas[1], height / self.canvas[0]])
-        small = (drawn.size * places).amax(-1) < SMALLEST
+        small = (drawn.size * self.scale()).amax(-1) < SMALLEST
         return drawn.label.masked_fill((drawn.visible < share) | small, -1)
 
     def true_counts(self, drawn: Examples) -> Tensor:

@@ -128,7 +128,7 @@ class PretrainedCountTraining:
             parts.append([*(some.half() for some in maps), self._target(drawn).half(), self.net.true_counts(drawn)])
             shown = drawn.label.masked_fill(drawn.visible < SHARES[0], -1)
             for c, of_class in enumerate(sizes):
-                of_class.append((drawn.size * self._scale(drawn)).amax(-1)[shown == c])
+                of_class.append((drawn.size * self.net.scale()).amax(-1)[shown == c])
             done += number
             if each is not None:
                 each(self, {"images": 2 * done, "of": 2 * total})
@@ -136,14 +136,9 @@ class PretrainedCountTraining:
         *maps, target, true = (torch.cat(column)[:last] for column in zip(*parts, strict=True))
         return maps, target, true, [torch.cat(of_class) for of_class in sizes]
 
-    def _scale(self, drawn: Examples) -> Tensor:
-        """Places a pixel of a render, along x and y."""
-        height, width = self.net.places()
-        return torch.tensor([width / drawn.image.shape[-1], height / drawn.image.shape[-2]])
-
     def _target(self, drawn: Examples) -> Tensor:
         """What the places should hold, ``(N, S, 1 + C, h, w)``."""
-        centre, size = drawn.centre * self._scale(drawn) * STRIDE, self.net.places()
+        centre, size = drawn.centre * self.net.scale() * STRIDE, self.net.places()
         return torch.stack(
             [cells(centre, self.net.seen(drawn, share), len(self.net.classes), *size) for share in SHARES], 1
         )
