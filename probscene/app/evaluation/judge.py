@@ -111,7 +111,7 @@ def judge(
         progress("judging", done, total, "")
 
     each(0)
-    eyes = [_Eyes(net, looks, each, keep) for keep in (True, False)]
+    eyes = [_Eyes(net, None if run.readings else looks, each, keep) for keep in (True, False)]
     draws = preset.draws_per_structure
     scenes = [_features(run, policy, eye, draws, num, seed) for policy, eye in zip(policies, eyes, strict=True)]
     real = _real(run, target, net, each)
@@ -158,7 +158,7 @@ def usable(run: RunFolder) -> str:
 class _Eyes:
     """A run's network that keeps small pictures of what it was shown, and the looks of the first few."""
 
-    def __init__(self, net: FeatureNet, appearance: FeatureNet, each, keep: bool):
+    def __init__(self, net: FeatureNet, appearance: FeatureNet | None, each, keep: bool):
         self.net, self.appearance, self.each, self.keep = net, appearance, each, keep
         self.names, self.thumbs, self.looks, self.looked = net.names, [], [], 0
         if hasattr(net, "embed_drawn"):
@@ -176,7 +176,7 @@ class _Eyes:
         if self.keep:
             self.thumbs += [shrunk(image, THUMB).copy() for image in pixels(images)]
         some = images[: max(0, LOOKS - self.looked)]
-        if len(some):
+        if len(some) and self.appearance is not None:
             self.looks.append(self.appearance.embed(some))
             self.looked += len(some)
         self.each(len(images))
