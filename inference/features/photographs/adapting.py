@@ -1,6 +1,6 @@
 """Suiting a ``PretrainedCountNet`` to photographs: a rule for each class, and which classes are compared.
 
-Axis letters: L photographs, K labelled images, S shares, R rules, C classes.
+Axis letters: L photographs, K labelled images, S scopes, R rules, C classes.
 """
 
 from typing import Any
@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from ..base import Photographs, Seen
-from .heads import PLACE, SMALLEST, PretrainedCountNet
-from .readability import Read, Reading, with_labels, without_labels
-from .reading import RULES, SHARES
+from .heads import SMALLEST, PretrainedCountNet
+from .readability import Read, Reading, rules_for_renders, with_labels, without_labels
+from .reading import RULES, SCOPES
 
 LOOKED_AT_ONCE = 64  # images
 
 
 def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Seen) -> dict[str, Any]:
-    """Choose rules, shares and what is compared, in place.
+    """Choose rules, scopes and what is compared, in place.
 
     Args:
         net: with trained heads.
@@ -53,7 +53,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
 
 
 def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: Seen) -> tuple[Tensor, Tensor]:
-    """Readings ``(L, S, R, C)``, and those of each head ``(heads, L, R, C)``."""
+    """Readings ``(L, S, R, C)``, and those of each head ``(heads, L, S, R, C)``."""
     parts = []
     for some in images.split(LOOKED_AT_ONCE):
         parts.append(net.readings(net.look(some)))
@@ -64,10 +64,13 @@ def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: 
 
 
 def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:
-    net.rules[1, c], net.share[c] = found.rule, found.share
-    if found.share:
-        error = (net.held_read[:, found.share, :, c] - net.held_true[:, found.share, None, c]).abs().mean(0)
-        net.rules[0, c] = error.argmin()
+    scope = found.scope
+    net.scope[c] = scope
+    net.rules[0, c] = rules_for_renders(
+        net.held_read[:, scope, :, c : c + 1].transpose(1, 2), net.held_true[:, scope, c : c + 1]
+    )[0]
+    net.rules[1, c] = False
+    net.rules[1, c, list(found.rules)] = True
     net.steps[c] = torch.inf
     net.steps[c, : len(found.steps)] = torch.tensor(found.steps)
     net.read[net.order.index(c)] = found.readable
@@ -79,19 +82,20 @@ def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:
         "readable": found.readable,
         "because": found.because,
         "by": found.by,
-        "rule": str(RULES[found.rule]),
-        "visible": SHARES[found.share],
+        "rules": [str(RULES[rule]) for rule in found.rules],
+        "visible": SCOPES[found.scope].visible,
+        "from_pixels": SCOPES[found.scope].pixels,
         "mean": found.mean,
         "disagreement": found.disagreement,
-        "change": found.change,
+        "spread": found.spread,
         "skill": found.skill,
         "error": found.error if found.error == found.error else None,
-        "pixels": float(net.size[c]) * PLACE,
+        "pixels": float(net.size[c]),
     }
 
 
 def _too_small(net: PretrainedCountNet, c: int) -> str:
-    pixels, needed = float(net.size[c]) * PLACE, SMALLEST * PLACE
+    pixels, needed = float(net.size[c]), SMALLEST
     height, width = net.canvas
     entering = net.frozen[0].entering(height, width)
     scale = needed / pixels * 1.1

@@ -1,10 +1,11 @@
 """Which classes can be counted in photographs, and by which rule: with a few labels, or without.
 
-Without labels a reading is believed where heads that agree on renders agree on the photographs too, where the rule
-counts right on renders that nothing was trained on, and where the mean count stays over a stretch of thresholds. With
-labels the rule is that with the least error on them, a little held by its error on renders, as ten labels alone would
-choose among fifty rules by luck. Where the other labels' histogram predicts a label better than any rule does, that
-histogram is what is learnt. Axis letters: L photographs, V renders, K labelled images, S shares, R rules, C classes.
+Without labels all rules that count renders about as well as the best one are taken, and their median is read. It is
+believed where heads that agree on renders agree on the photographs too, where it counts right on renders that nothing
+was trained on, and where those rules read about as much as each other. With labels the rule is that with the least
+error on them, a little held by its error on renders, as ten labels alone would choose among many rules by luck.
+Where the other labels' histogram predicts a label better than any rule does, that
+histogram is what is learnt. Axis letters: L photographs, V renders, K labelled images, S scopes, R rules, C classes.
 """
 
 from typing import NamedTuple
@@ -14,10 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .reading import PEAKS, RULES, SHARES
+from .reading import LARGE, RULES, SCOPES, SMALL
 
-AGREE = 0.12  # largest disagreement of heads, a mean difference over the mean count and ``BASE``
-STEADY = 0.2  # largest relative change of the mean count from one threshold to the next
+AGREE = 0.25  # largest disagreement of heads, a mean difference over the mean count and ``BASE``
+CLOSE = 0.7  # largest difference of the means that rules read, over their own mean and ``BASE``
+AS_WELL, NEARLY = 1.1, 0.02  # by which factor, and how many objects, errors on renders may exceed the least
+MOSTLY = 0.7  # of a class's objects must be in the scope of large ones for this to be read
 SKILL = 0.8  # least correlation with the true counts of renders
 BASE = 0.3  # objects
 RENDERS = 1.0  # how many labelled images the error on renders is worth
@@ -34,7 +37,7 @@ class Read(NamedTuple):
     Attributes:
         photographs: ``(L, S, R, C)``.
         labelled: ``(K, S, R, C)``, those of the photographs that have labels.
-        by_head: ``(heads, L, R, C)`` for the least share.
+        by_head: ``(heads, L, S, R, C)``.
         renders: ``(V, S, R, C)``.
         true: ``(V, S, C)`` counts of those renders.
     """
@@ -52,10 +55,10 @@ class Reading(NamedTuple):
     Attributes:
         readable: whether its counts are compared.
         by: ``"agreement"``, ``"labels"``, or ``"histogram"`` of the labels.
-        rule: of ``RULES``.
-        share: of ``SHARES``.
+        rules: of ``RULES``, whose median is read.
+        scope: of ``SCOPES``.
         mean: of the counts that are read.
-        disagreement, change, skill: see ``AGREE``, ``STEADY`` and ``SKILL``.
+        disagreement, spread, skill: see ``AGREE``, ``CLOSE`` and ``SKILL``.
         error: mean absolute leave-one-out error on the labelled images; NaN without labels.
         steps: counts are how many of these values the reading reaches, where the labels' histogram is learnt.
         because: one sentence.
@@ -63,25 +66,36 @@ class Reading(NamedTuple):
 
     readable: bool
     by: str
-    rule: int
-    share: int
+    rules: tuple[int, ...]
+    scope: int
     mean: float
     disagreement: float
-    change: float
+    spread: float
     skill: float
     error: float
     steps: tuple[float, ...]
     because: str
 
 
-def rules_for_renders(read: Tensor, true: Tensor) -> Tensor:
-    """``(C,)`` the rule with the least error on renders.
+def scopes_without_labels(true: Tensor) -> Tensor:
+    """``(C,)`` the scope by which each class is read where nothing is labelled: large objects, if most are.
 
     Args:
-        read: ``(V, R, C)``.
+        true: ``(V, S, C)`` counts of renders.
+    """
+    large = true[:, LARGE].sum(0) >= MOSTLY * true[:, SMALL].sum(0)
+    return torch.where(large, LARGE, SMALL)
+
+
+def rules_for_renders(read: Tensor, true: Tensor) -> Tensor:
+    """``(C, R)`` bool, for each class the rule with the least error on renders.
+
+    Args:
+        read: ``(V, C, R)``.
         true: ``(V, C)``.
     """
-    return (read - true[:, None]).abs().mean(0).argmin(0)
+    least = (read - true[..., None]).abs().mean(0).argmin(1)
+    return torch.arange(read.shape[2]) == least[:, None]
 
 
 def without_labels(read: Read, c: int) -> Reading:
@@ -90,36 +104,26 @@ def without_labels(read: Read, c: int) -> Reading:
     Args:
         read: by every rule.
     """
-    heads = read.by_head[..., c].double().numpy()  # (heads, L, R)
-    mean = read.photographs[:, 0, :, c].double().mean(0).numpy()
+    s = int(scopes_without_labels(read.true)[c])
+    true = read.true[:, s, c]
+    error = (read.renders[:, s, :, c] - true[:, None]).abs().mean(0)
+    rules = (error <= AS_WELL * error.min() + NEARLY).nonzero().flatten()
+    counts = read.photographs[:, s, rules, c].double().quantile(0.5, 1)
+    heads = read.by_head[:, :, s, rules, c].double().quantile(0.5, 2).numpy()
+    mean, means = float(counts.mean()), read.photographs[:, s, rules, c].double().mean(0)
     pairs = [(i, j) for i in range(len(heads)) for j in range(i)]
-    apart = np.mean([np.abs(heads[i] - heads[j]).mean(0) for i, j in pairs], 0) / (mean + BASE)
-    skill = np.array([_correlation(read.renders[:, 0, r, c], read.true[:, 0, c]) for r in range(len(RULES))])
-    change = _changes(mean)
-    good = (apart <= AGREE) & (change <= STEADY) & (skill >= SKILL)
-    cost = np.where(good, apart + change, np.inf if good.any() else apart + change + 10 * (skill < SKILL))
-    best = int(np.argmin(cost))
-    figures = (
-        f"heads differ by {apart[best]:.0%}, the mean changes by {change[best]:.0%} from one threshold to the next, "
-        f"r = {skill[best]:.2f} on renders"
-    )
-    word = "readable" if good[best] else "not readable"
-    because = f"{word}, {mean[best]:.1f} an image by {RULES[best]} ({figures})"
-    if not good[best]:
+    apart = float(np.mean([np.abs(heads[i] - heads[j]).mean() for i, j in pairs])) / (mean + BASE)
+    spread = float((means.max() - means.min()) / (means.mean() + BASE))
+    skill = _correlation(read.renders[:, s, rules, c].quantile(0.5, 1), true)
+    good = apart <= AGREE and spread <= CLOSE and skill >= SKILL
+    because = f"{'readable' if good else 'not readable'}, {mean:.1f} an image by {_by(tuple(rules.tolist()))}"
+    if s == LARGE and true.sum() < read.true[:, SMALL, c].sum():
+        because += f", of objects from {SCOPES[s].pixels:g} pixels"
+    because += f" (heads differ by {apart:.0%}, rules by {spread:.0%}, r = {skill:.2f} on renders)"
+    if not good:
         because += "; label ten images"
-    return Reading(
-        bool(good[best]),
-        "agreement",
-        best,
-        0,
-        float(mean[best]),
-        float(apart[best]),
-        float(change[best]),
-        float(skill[best]),
-        float("nan"),
-        (),
-        because,
-    )
+    nan = float("nan")
+    return Reading(good, "agreement", tuple(rules.tolist()), s, mean, apart, spread, skill, nan, (), because)
 
 
 def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
@@ -136,20 +140,30 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
         return free._replace(because=f"{free.because}; {why}")
     seen = read.labelled[..., c].double().numpy()  # (K, S, R)
     drawn = _errors(read.renders[..., c].double().numpy(), read.true[..., None, c].double().numpy())
-    share, rule = _choose(seen, y, drawn)
+    scope, rule = _choose(seen, y, drawn)
     left_out = np.array([seen[(i, *_choose(np.delete(seen, i, 0), np.delete(y, i), drawn))] for i in range(len(y))])
     error, histogram = float(np.abs(left_out - y).mean()), _histogram_error(y)
-    with_free = _correlation(read.labelled[:, 0, free.rule, c], labels)
-    seen_mean, mean = float(read.labelled[:, 0, free.rule, c].mean()), float(y.mean())
+    of_free = read.labelled[:, free.scope, :, c][:, list(free.rules)].quantile(0.5, 1)
+    with_free, seen_mean, mean = _correlation(of_free, labels), float(of_free.mean()), float(y.mean())
     figures = f"leave-one-out error {error:.2f} an image, of the labels' histogram {histogram:.2f}"
+    without = float((of_free - labels).abs().mean())
+    if free.readable and without <= MUCH * min(error, histogram) + LITTLE:
+        because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image; {figures})"
+        return free._replace(by="labels", error=without, because=because)
     if error <= MUCH * histogram + LITTLE:
-        found = read.photographs[:, share, rule, c]
+        found = read.photographs[:, scope, rule, c]
         because = (
-            f"readable by {len(y)} labels, {float(found.mean()):.1f} an image by {RULES[rule]}, of objects visible by "
-            f"{SHARES[share]:g} ({figures})"
+            f"readable by {len(y)} labels, {float(found.mean()):.1f} an image by {RULES[rule]}, of objects from "
+            f"{SCOPES[scope].pixels:.0f} pixels visible by {SCOPES[scope].visible:g} ({figures})"
         )
         return free._replace(
-            readable=True, by="labels", rule=rule, share=share, mean=float(found.mean()), error=error, because=because
+            readable=True,
+            by="labels",
+            rules=(rule,),
+            scope=scope,
+            mean=float(found.mean()),
+            error=error,
+            because=because,
         )
     if free.readable and with_free < GOES_WITH and abs(seen_mean - mean) > APART * max(seen_mean, mean):
         because = (
@@ -157,19 +171,19 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
             f"{seen_mean:.1f} read) and are not used; see whether all objects of this class are labelled"
         )
         return free._replace(error=error, because=because)
-    steps = _steps(read.photographs[:, share, 0, c].double().numpy(), y)
+    steps = _steps(read.photographs[:, scope, 0, c].double().numpy(), y)
     because = f"the histogram of {len(y)} labels is learnt, {mean:.1f} an image: no rule reads them better ({figures})"
     return free._replace(
-        readable=True, by="histogram", rule=0, share=share, mean=mean, error=error, steps=steps, because=because
+        readable=True, by="histogram", rules=(0,), scope=scope, mean=mean, error=error, steps=steps, because=because
     )
 
 
 def _choose(seen: Array, labels: Array, drawn: Array) -> tuple[int, int]:
-    """The share and the rule with the least error on labelled images ``(K, S, R)`` and on renders ``(S, R)``; of shares
-    that do about as well the least, which asks least of where objects stand."""
+    """The scope and the rule with the least error on labelled images ``(K, S, R)`` and on renders ``(S, R)``; of scopes
+    that do about as well the first, which asks least of where objects stand."""
     cost = _errors(seen, labels[:, None, None]) + RENDERS / len(labels) * drawn
-    share = int(np.argmax(cost.min(1) <= MUCH * cost.min() + LITTLE))
-    return share, int(np.argmin(cost[share]))
+    scope = int(np.argmax(cost.min(1) <= MUCH * cost.min() + LITTLE))
+    return scope, int(np.argmin(cost[scope]))
 
 
 def _errors(read: Array, true: Array) -> Array:
@@ -194,18 +208,8 @@ def _steps(read: Array, labels: Array) -> tuple[float, ...]:
     return tuple(float(ranked[n - 1]) for n in reached if n)
 
 
-def _changes(mean: Array) -> Array:
-    """``(R,)`` how much the mean count changes to the neighbouring thresholds, relative; that of the peaks is shared by
-    all rules that have no neighbours."""
-    at = {rule: i for i, rule in enumerate(RULES)}
-    change = np.full(len(RULES), np.inf)
-    families = [PEAKS] + [tuple(r for r in RULES if r.name == "soft" and r.window == window) for window in (3, 5)]
-    for family in families:
-        values = mean[[at[rule] for rule in family]]
-        steps = np.abs(np.diff(values)) / (np.minimum(values[1:], values[:-1]) + BASE)
-        for i, rule in enumerate(family):
-            change[at[rule]] = max(steps[max(0, i - 1) : i + 1])
-    return change
+def _by(rules: tuple[int, ...]) -> str:
+    return str(RULES[rules[0]]) if len(rules) == 1 else f"the median of {len(rules)} rules"
 
 
 def _correlation(one: Tensor, other: Tensor) -> float:

@@ -1,7 +1,7 @@
 """Rules by which counts are read from the probabilities that a network gives to the places of an image.
 
 On renders nearly any rule counts right. In photographs a network gives too little probability to some objects that are
-there and a little to many that are not, and by how much differs from class to class, so that each class needs a rule
+there and a little to many that are not, and by how much differs from class to class, so that each class needs rules
 of its own. Axis letters: N images, C classes, h w places, R rules.
 """
 
@@ -36,7 +36,22 @@ class Rule(NamedTuple):
         return f"objects from {self.nothing:g} to {self.whole:g} {around}"
 
 
-SHARES = (0.25, 0.6, 0.9)  # an object counts if at least so much of it is visible
+class Scope(NamedTuple):
+    """Which objects are counted, and where.
+
+    Attributes:
+        visible: least share of an object that can be seen.
+        pixels: that its longer side spans at least, of what enters the network.
+        stride: pixels from one place to the next.
+    """
+
+    visible: float
+    pixels: float
+    stride: int
+
+
+SCOPES = (Scope(0.25, 16, 16), Scope(0.25, 16 / 3, 8), Scope(0.6, 16 / 3, 8), Scope(0.9, 16 / 3, 8))
+LARGE, SMALL = 0, 1  # of the scopes, those that do without labels
 THRESHOLDS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.8)
 SOFT = ((0.03, 0.2), (0.05, 0.3), (0.1, 0.5), (0.2, 0.7), (0.4, 0.8), (0.6, 1.0))
 PEAKS = tuple(Rule("peaks", 3, threshold) for threshold in THRESHOLDS)
@@ -66,15 +81,17 @@ def read_all(probability: Tensor) -> Tensor:
 
 
 def read_each(probability: Tensor, rules: Tensor) -> Tensor:
-    """Counts ``(N, C)``, each class by its own rule.
+    """Counts ``(N, C)``, each class by the median of its own rules.
 
     Args:
-        rules: ``(C,)`` int64, of ``RULES``.
+        rules: ``(C, R)`` bool, at least one for each class.
     """
     counts = probability.new_zeros(probability.shape[:2])
-    for rule in rules.unique().tolist():
-        which = rules == rule
-        counts[:, which] = read(probability[:, which], RULES[rule])
+    if not len(counts):
+        return counts
+    for c, of_class in enumerate(rules):
+        some = [read(probability[:, c : c + 1], RULES[r]) for r in of_class.nonzero().flatten().tolist()]
+        counts[:, c] = torch.cat(some, 1).quantile(0.5, 1)
     return counts
 
 

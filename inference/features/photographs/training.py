@@ -3,17 +3,17 @@
 The frozen network sees each image once; its maps stay in memory as half-precision numbers, 0.2 MB an image of 320 x
 240, and the heads take many epochs on them. Every render looks as a camera might have taken it (``looks``).
 Photographs' maps are unlike renders' channel by channel, so the heads are kept from relying on any: channels are left
-out (``heads.DROPPED``) and shifted at random.
+out and shifted at random (``head.KINDS``).
 
-Axis letters: N images, M nodes, S shares.
+Axis letters: N images, M nodes, C classes, S scopes.
 """
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from probscene.sampling import seed_everything
 
@@ -21,12 +21,12 @@ from ...training import Report, batch_seed, check_finite, restore_training, trai
 from ..base import Draw, Examples
 from ..counting.batches import STRIDE, cells
 from ..counting.training import relative_count_loss
-from .heads import Maps, PretrainedCountNet
+from .head import KINDS, Kind, Maps
+from .heads import PretrainedCountNet
 from .looks import photographed
-from .reading import SHARES
+from .reading import SCOPES, SMALL
 
 DRAWN_AT_ONCE = 32  # structures
-SHIFT = 0.5  # of a channel over a whole image, in its standard deviations
 
 
 class PretrainedCountTraining:
@@ -73,17 +73,17 @@ class PretrainedCountTraining:
         Raises:
             ProbsceneError: the loss is no longer finite.
         """
-        maps, target, true, sizes = self._look(each)
+        maps, targets, true, sizes = self._look(each)
         n = 2 * self.pairs
         if self.done == 0:
             some = slice(0, n, max(1, n // 512))
-            self.net.begin([part[some] for part in maps], target[some])
+            self.net.begin([part[some] for part in maps], [target[some] for target in targets])
         while self.done < self.total:
             seed_everything(batch_seed(self.seed, 1, self.done))
             self.net.train()
             batches = torch.randperm(n).split(self.batch_size)
             losses = [
-                self._step([part[rows] for part in maps], target[rows], i / len(batches))
+                self._step([part[rows] for part in maps], [target[rows] for target in targets], i / len(batches))
                 for i, rows in enumerate(batches)
             ]
             self.done += 1
@@ -96,7 +96,8 @@ class PretrainedCountTraining:
         held = [part[n:] for part in maps]
         median = torch.stack([some.median() if len(some) else torch.tensor(math.inf) for some in sizes])
         self.net.finish(self.net.readings(held)[0], true[n:], median)
-        each_class = zip(self.net.counts(held).T, true[n:, 0].T, strict=True)
+        of_scope = true[n:, self.net.scope, torch.arange(len(self.net.scope))]
+        each_class = zip(self.net.counts(held).T, of_scope.T, strict=True)
         self.correlation = torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class])
 
     def summary(self) -> dict[str, Any]:
@@ -113,10 +114,10 @@ class PretrainedCountTraining:
         """Go on from a ``state``."""
         self.done = int(restore_training(self.net, {"adam": self.optimiser}, tensors)["done"])
 
-    def _look(self, each: Report | None) -> tuple[Maps, Tensor, Tensor, list[Tensor]]:
-        """Of renders: maps, float16, what the places should hold ``(N, S, 1 + C, h, w)`` float16 and the true counts
-        ``(N, S, C)``, of what is trained on and then of what is held out. Of each class the sizes of its objects,
-        places."""
+    def _look(self, each: Report | None) -> tuple[Maps, list[Tensor], Tensor, list[Tensor]]:
+        """Of renders: maps, float16, what the places of each of ``KINDS`` should hold ``(N, its scopes, 1 + C, h, w)``
+        float16 and the true counts ``(N, S, C)``, of what is trained on and then of what is held out. Of each class the
+        sizes of its objects, pixels of what enters."""
         seed_everything(batch_seed(self.seed, 0))
         rng = np.random.default_rng(batch_seed(self.seed, 2))
         total = self.pairs + (len(self.net.held_true) + 1) // 2
@@ -125,33 +126,38 @@ class PretrainedCountTraining:
             number = min(DRAWN_AT_ONCE, total - done, self.pairs - done if done < self.pairs else total)
             drawn = self.draw_twice(number)
             maps = self.net.look(photographed(drawn.image, rng))
-            parts.append([*(some.half() for some in maps), self._target(drawn).half(), self.net.true_counts(drawn)])
-            shown = drawn.label.masked_fill(drawn.visible < SHARES[0], -1)
+            targets = [self._target(drawn, kind).half() for kind in KINDS]
+            parts.append([*(some.half() for some in maps), *targets, self.net.true_counts(drawn)])
+            shown = drawn.label.masked_fill(drawn.visible < SCOPES[SMALL].visible, -1)
             for c, of_class in enumerate(sizes):
                 of_class.append((drawn.size * self.net.scale()).amax(-1)[shown == c])
             done += number
             if each is not None:
                 each(self, {"images": 2 * done, "of": 2 * total})
         last = 2 * self.pairs + len(self.net.held_true)
-        *maps, target, true = (torch.cat(column)[:last] for column in zip(*parts, strict=True))
-        return maps, target, true, [torch.cat(of_class) for of_class in sizes]
+        *both, true = (torch.cat(column)[:last] for column in zip(*parts, strict=True))
+        return both[: -len(KINDS)], both[-len(KINDS) :], true, [torch.cat(of_class) for of_class in sizes]
 
-    def _target(self, drawn: Examples) -> Tensor:
-        """What the places should hold, ``(N, S, 1 + C, h, w)``."""
-        centre, size = drawn.centre * self.net.scale() * STRIDE, self.net.places()
+    def _target(self, drawn: Examples, kind: Kind) -> Tensor:
+        """What the places should hold, ``(N, the kind's scopes, 1 + C, h, w)``."""
+        places = drawn.centre * self.net.scale() / kind.stride
+        size, number = self.net.places(kind.stride), len(self.net.classes)
         return torch.stack(
-            [cells(centre, self.net.seen(drawn, share), len(self.net.classes), *size) for share in SHARES], 1
+            [cells(places * STRIDE, self.net.seen(drawn, SCOPES[s]), number, *size) for s in kind.scopes], 1
         )
 
-    def _step(self, maps: Maps, target: Tensor, part: float) -> float:
+    def _step(self, maps: Maps, targets: list[Tensor], part: float) -> float:
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate * 0.5 * (1 + math.cos(math.pi * (self.done + part) / self.total))
-        flipped = torch.rand(len(target)) < 0.5
-        target = torch.where(flipped[:, None, None, None, None], target.flip(4), target).float()
+        flipped = torch.rand(len(maps[0])) < 0.5
         seen = [torch.where(flipped[:, None, None, None], some.flip(3), some) for some in self.net.normal(maps)]
-        seen = [some + SHIFT * torch.randn(*some.shape[:2], 1, 1) for some in seen]
-        logits = self.net(seen)  # (heads, N, S, 1 + classes, h, w)
-        loss = relative_count_loss(logits.flatten(0, 2), target.expand(len(logits), -1, -1, -1, -1, -1).flatten(0, 2))
+        loss = torch.zeros(())
+        for kind, heads, target in zip(KINDS, self.net.heads, targets, strict=True):
+            target = torch.where(flipped[:, None, None, None, None], target.flip(4), target).float()
+            shifted = [some + kind.shift * torch.randn(*some.shape[:2], 1, 1) for some in seen]
+            logits = torch.stack([head(shifted) for head in cast(nn.ModuleList, heads)])
+            each = target.expand_as(logits)  # (heads, N, scopes, 1 + C, h, w)
+            loss = loss + relative_count_loss(logits.flatten(0, 2), each.flatten(0, 2))
         self.optimiser.zero_grad()
         loss.backward()
         self.optimiser.step()

@@ -9,8 +9,9 @@ from efficientnet_lite_pytorch import EfficientNet
 from probscene.app.fitting.observer import Observer
 from probscene.errors import ProbsceneError
 from probscene.inference.features.counting.training import relative_count_loss
-from probscene.inference.features.photographs.heads import LEAST_UNIT, PLACE, SMALLEST, PretrainedCountNet
-from probscene.inference.features.photographs.reading import RULES, SHARES, read
+from probscene.inference.features.photographs.head import KINDS, STRIDES
+from probscene.inference.features.photographs.heads import LEAST_UNIT, PretrainedCountNet
+from probscene.inference.features.photographs.reading import LARGE, RULES, SCOPES, read
 from probscene.inference.features.photographs.training import PretrainedCountTraining
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.features.projection import bandwidth
@@ -68,29 +69,43 @@ def untrained(dots, **words) -> PretrainedCountNet:
     return net
 
 
-def test_a_head_is_a_convolution_of_all_maps_brought_to_one_place(dots):
+@pytest.mark.parametrize("k", range(len(KINDS)))
+def test_a_head_is_a_convolution_of_all_maps_brought_to_one_place(dots, k):
     """The first layer at each stride, then upsampled, is one layer of the upsampled maps beside one another."""
-    net = untrained(dots)
-    maps = net.normal(net.look(torch.randint(0, 256, (2, 3, 64, 96), dtype=torch.uint8)))
-    head = net.heads[0]
-    size = maps[0].shape[2:]
-    beside = torch.cat([maps[0], *(F.interpolate(each, size, mode="bilinear") for each in maps[1:])], 1)
+    net, kind = untrained(dots), KINDS[k]
+    maps = net.normal(net.look(torch.randint(0, 256, (2, 3, *dots.canvas), dtype=torch.uint8)))
+    head, maps_of_kind = net.heads[k][0], maps[STRIDES.index(kind.stride) :]
+    size = maps_of_kind[0].shape[2:]
+    upsampled = (F.interpolate(each, size, mode="bilinear") for each in maps_of_kind[1:])
+    beside = torch.cat([maps_of_kind[0], *upsampled], 1)
     weight = torch.cat([each.weight for each in head.enter], 1)
     x = F.relu(F.conv2d(beside, weight, head.enter[0].bias))
     expected = head.out(F.relu(head.mix(x)))
-    found = net(maps)[0].flatten(1, 2)
+    found = net(maps)[k][0].flatten(1, 2)
+    assert found.shape[2:] == net.places(kind.stride)
     assert torch.allclose(found, expected, atol=1e-4)
 
 
-def test_features_are_read_by_their_rules_in_units(dots):
+def test_every_scope_is_counted_by_one_kind_of_heads():
+    assert sorted(s for kind in KINDS for s in kind.scopes) == list(range(len(SCOPES)))
+    assert all(SCOPES[s].stride == kind.stride for kind in KINDS for s in kind.scopes)
+
+
+def only(*rules: int) -> torch.Tensor:
+    """One rule for each class, ``(C, R)``."""
+    return torch.arange(len(RULES)) == torch.tensor(rules)[:, None]
+
+
+def test_features_are_read_by_the_median_of_their_rules_in_units(dots):
     net = untrained(dots)
-    net.rules.copy_(torch.tensor([[3, 14], [0, 16]]))
-    net.share.copy_(torch.tensor([0, 2]))
+    net.rules.copy_(torch.stack([only(3, 14), only(0, 16) | only(4, 16) | only(9, 16)]))
+    net.scope.copy_(torch.tensor([0, 3]))
     images = torch.randint(0, 256, (5, 3, 64, 96), dtype=torch.uint8)
-    probability = net(net.normal(net.look(images))).softmax(3).mean(0)[:, :, 1:]
-    for embed, rules in ((net.embed, net.rules[0]), (net.embed_photographs, net.rules[1])):
-        counts = [read(probability[:, net.share[c], c : c + 1], RULES[rules[c]]) for c in range(2)]
-        expected = torch.cat(counts, 1) / net.unit
+    by_kind = [logits.softmax(3).mean(0)[:, :, 1:] for logits in net(net.normal(net.look(images)))]
+    seen = [by_kind[0][:, 0, :1], by_kind[1][:, 2, 1:]]  # scope 3 is the third of those 8 pixels apart
+    for embed, rules in ((net.embed, ([3], [14])), (net.embed_photographs, ([0, 4, 9], [16]))):
+        each = [torch.cat([read(seen[c], RULES[r]) for r in rules[c]], 1).quantile(0.5, 1) for c in range(2)]
+        expected = torch.stack(each, 1) / net.unit
         assert torch.allclose(embed(images), expected, rtol=1e-4, atol=1e-4)
         one = torch.cat([embed(image[None]) for image in images])
         assert torch.allclose(one, embed(images), rtol=1e-4, atol=1e-4)
@@ -100,7 +115,21 @@ def test_features_are_read_by_their_rules_in_units(dots):
     assert (net.embed(images)[:, 1] == 0).all() and (net.embed_photographs(images)[:, 1] == 0).all()
     net.steps[0, :2] = torch.tensor([-1.0, 1e9])
     assert torch.allclose(net.embed_photographs(images)[:, 0] * net.unit[0], torch.ones(5))
-    assert sum(value.numel() for value in net.state_dict().values()) < 400_000  # none of the frozen network's
+    assert sum(value.numel() for value in net.state_dict().values()) < 600_000  # none of the frozen network's
+
+
+def test_readings_of_all_scopes_are_those_of_each(dots):
+    net = untrained(dots)
+    maps = net.look(torch.randint(0, 256, (3, 3, 64, 96), dtype=torch.uint8))
+    whole, each = net.readings(maps)
+    assert whole.shape == (3, len(SCOPES), len(RULES), 2) and each.shape == (4, *whole.shape)
+    by_head = net.by_head(maps)
+    for s, scope in enumerate(SCOPES):
+        k = next(k for k, kind in enumerate(KINDS) if s in kind.scopes)
+        probability = by_head[k][:, :, KINDS[k].scopes.index(s)]
+        for r in (0, 5, 17):
+            assert torch.allclose(whole[:, s, r], read(probability.mean(0), RULES[r]), atol=1e-4), scope
+            assert torch.allclose(each[2, :, s, r], read(probability[2], RULES[r]), atol=1e-4), scope
 
 
 def test_things_come_before_stuff_and_choose_the_unit(dots):
@@ -111,24 +140,25 @@ def test_things_come_before_stuff_and_choose_the_unit(dots):
     images = torch.randint(0, 256, (20, 3, 64, 96), dtype=torch.uint8)
     units = plain.unit[[1, 0]] / plain.unit
     assert torch.allclose(net.embed(images), plain.embed(images)[:, [1, 0]] * units, atol=1e-5)
-    true = torch.randint(0, 9, (20, len(SHARES), 2)).float()
+    true = torch.randint(0, 9, (20, 1, 2)).float().expand(-1, len(SCOPES), -1)
     read = (true[:, :, None] + torch.arange(len(RULES))[:, None] - 13).abs()
     net.finish(read, true, torch.tensor([3.0, 4.0]))
     spread = true[:, 0].std(0)
     assert net.unit.tolist() == pytest.approx(
         (bandwidth(true[:, 0, 1:] / spread[1]) * spread).clamp(min=LEAST_UNIT)[[1, 0]].tolist(), rel=1e-5
     )
-    assert torch.equal(net.rules, torch.full((2, 2), 13)) and net.size.tolist() == [3, 4]
+    assert torch.equal(net.rules, only(13, 13).expand(2, -1, -1)) and net.size.tolist() == [3, 4]
+    assert net.scope.tolist() == [LARGE, LARGE]
 
 
 def test_renders_are_known_by_their_labels(learnt, draw_twice):
     net = learnt[0].net
-    drawn = draw_twice(20)
-    net.share.copy_(torch.tensor([0, 2]))
-    some = [(drawn.label == c) & (drawn.visible >= SHARES[s]) for c, s in enumerate([0, 2])]
+    drawn, before = draw_twice(20), net.scope.clone()
+    net.scope.copy_(torch.tensor([1, 3]))
+    some = [(drawn.label == c) & (drawn.visible >= SCOPES[s].visible) for c, s in enumerate([1, 3])]
     expected = torch.stack([each.sum(1) for each in some], 1) / net.unit
     assert torch.allclose(net.embed_drawn(drawn), expected)
-    net.share.zero_()
+    net.scope.copy_(before)
 
 
 @pytest.fixture(scope="module")
@@ -166,29 +196,31 @@ def test_it_learns_to_count(learnt, draw_twice):
 
 def test_the_renders_held_out_are_read_by_every_rule(learnt):
     net = learnt[0].net
-    assert net.held_read.shape == (64, len(SHARES), len(RULES), 2) and net.held_true.shape == (64, len(SHARES), 2)
-    chosen = (net.held_read[:, 0] - net.held_true[:, :1]).abs().mean(0).argmin(0)
-    assert torch.equal(net.rules, chosen.expand(2, 2))
-    assert (net.size * PLACE > 8).all() and net.size.isfinite().all()
+    assert net.held_read.shape == (64, len(SCOPES), len(RULES), 2) and net.held_true.shape == (64, len(SCOPES), 2)
+    for c, s in enumerate(net.scope.tolist()):
+        chosen = (net.held_read[:, s, :, c] - net.held_true[:, s, None, c]).abs().mean(0).argmin(0)
+        assert net.rules[:, c].nonzero()[:, 1].tolist() == [chosen, chosen]
+    assert (net.size > 8).all() and net.size.isfinite().all()
 
 
 def test_what_is_hidden_or_too_small_is_not_counted(dots, draw_twice):
     fit = training(dots, draw_twice, 4, 1, 2)
-    height, width = fit.net.places()
     canvas = torch.tensor([dots.canvas[1], dots.canvas[0]])
-    place = dots.canvas[1] / width
-    side = torch.tensor([1.5, 1.5, 0.9 * SMALLEST, 1.5]) * place
+    pixel = 1 / fit.net.scale()[0]
+    side = torch.tensor([17.0, 15.0, 5.0, 30.0]) * pixel
     at = torch.tensor([[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]]) * canvas
     drawings = draw_twice(1)._replace(
         label=torch.tensor([[0, 1, 1, 0]]), centre=at[None], size=side[None, :, None].expand(-1, -1, 2),
         visible=torch.tensor([[1.0, 0.7, 1.0, 0.2]]),
     )  # fmt: skip
-    target, true = fit._target(drawings), fit.net.true_counts(drawings)
-    assert target.shape == (1, len(SHARES), 3, height, width)
-    assert torch.allclose(target[0, :, 1:].sum((2, 3)), torch.tensor([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]), atol=1e-5)
-    assert torch.equal(true[0], torch.tensor([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]))
-    row, column = (target[0, 0, 1] == target[0, 0, 1].max()).nonzero()[0].tolist()
-    assert abs(row + 0.5 - height / 4) <= 0.5 and abs(column + 0.5 - width / 4) <= 0.5
+    expected = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 1.0], [1.0, 0.0]])  # by scope
+    assert torch.equal(fit.net.true_counts(drawings)[0], expected)
+    for kind in KINDS:
+        target, (height, width) = fit._target(drawings, kind), fit.net.places(kind.stride)
+        assert target.shape == (1, len(kind.scopes), 3, height, width)
+        assert torch.allclose(target[0, :, 1:].sum((2, 3)), expected[list(kind.scopes)], atol=1e-5)
+        row, column = (target[0, 0, 1] == target[0, 0, 1].max()).nonzero()[0].tolist()
+        assert abs(row + 0.5 - height / 4) <= 0.5 and abs(column + 0.5 - width / 4) <= 0.5
 
 
 def test_a_loss_that_is_not_finite_is_said(dots, draw_twice):

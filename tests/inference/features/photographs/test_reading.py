@@ -13,13 +13,16 @@ from probscene.inference.features.photographs.readability import (
     AGREE,
     Read,
     rules_for_renders,
+    scopes_without_labels,
     with_labels,
     without_labels,
 )
 from probscene.inference.features.photographs.reading import (
+    LARGE,
     PEAKS,
     RULES,
-    SHARES,
+    SCOPES,
+    SMALL,
     Rule,
     by_steps,
     read,
@@ -77,11 +80,13 @@ def test_an_object_is_taken_to_whole():
     assert grain.sum() == pytest.approx(9, rel=1e-4) and read(grain, rule).sum() == 0
 
 
-def test_each_class_has_its_own_rule():
+def test_each_class_has_its_own_rules_and_their_median():
     maps = torch.rand(4, 3, 8, 8, generator=torch.manual_seed(1)) * 0.2
-    rules = torch.tensor([5, 0, PEAK])
+    rules = torch.zeros(3, len(RULES), dtype=torch.bool)
+    rules[0, 5] = rules[1, [0, 3, PEAK]] = rules[2, [2, 8]] = True
     every = read_all(maps)
-    assert torch.allclose(read_each(maps, rules), torch.stack([every[:, r, c] for c, r in enumerate(rules)], 1))
+    expected = [every[:, 5, 0], every[:, [0, 3, PEAK], 1].median(1).values, every[:, [2, 8], 2].mean(1)]
+    assert torch.allclose(read_each(maps, rules), torch.stack(expected, 1))
 
 
 def test_steps_are_reached_or_not():
@@ -92,21 +97,27 @@ def test_steps_are_reached_or_not():
 
 def test_renders_are_read_by_what_errs_least():
     true = torch.tensor([[1.0, 2.0], [3.0, 0.0]])
-    read = torch.stack([true + 1, true * torch.tensor([1.0, 0.5]), true + torch.tensor([0.4, 0.1])], 1)
-    assert rules_for_renders(read, true).tolist() == [1, 2]
+    read = torch.stack([true + 1, true * torch.tensor([1.0, 0.5]), true + torch.tensor([0.4, 0.1])], 2)
+    assert rules_for_renders(read, true).tolist() == [[False, True, False], [False, False, True]]
+
+
+def test_small_objects_are_in_the_scope_without_labels_unless_few_are():
+    true = torch.ones(4, len(SCOPES), 2)
+    true[:, LARGE, 1] = 0.5
+    assert scopes_without_labels(true).tolist() == [LARGE, SMALL]
 
 
 def made(true: np.ndarray, seen: np.ndarray, apart: float = 0.02, ramp: float = 0.0, seed: int = 0) -> Read:
     """What heads read of one class: ``seen (L,)`` by each rule, but for noise of ``apart`` between heads and a level
     that changes by ``ramp`` from one threshold to the next; on renders the truth."""
     rng = np.random.default_rng(seed)
-    R, S, L = len(RULES), len(SHARES), len(seen)
+    R, S, L = len(RULES), len(SCOPES), len(seen)
     level = np.ones(R)
     for start in (1, 7, 13):
         level[start : start + 6] = (1 + ramp) ** -np.arange(6)
     whole = torch.from_numpy(np.broadcast_to((seen[:, None] * level)[:, None, :, None], (L, S, R, 1)).copy()).float()
-    heads = torch.stack([whole[:, 0] + apart * torch.from_numpy(rng.normal(size=(L, R, 1))).float() for _ in range(4)])
-    drawn = torch.from_numpy(rng.integers(0, 6, (50, S, 1))).float()
+    heads = torch.stack([whole + apart * torch.from_numpy(rng.normal(size=(L, 1, 1, 1))).float() for _ in range(4)])
+    drawn = torch.from_numpy(rng.integers(0, 6, (50, 1, 1))).float().expand(-1, S, -1)
     return Read(whole, whole[: len(true)], heads, drawn[:, :, None].expand(-1, -1, R, -1), drawn)
 
 
@@ -119,10 +130,20 @@ def test_heads_that_agree_are_believed():
     assert found.because.startswith("readable, ") and found.disagreement < AGREE
 
 
-@pytest.mark.parametrize("spoilt", [{"apart": 1.0}, {"ramp": 0.8}], ids=str)
-def test_heads_that_differ_or_thresholds_that_change_the_mean_are_not(spoilt):
+@pytest.mark.parametrize("spoilt", [{"apart": 1.5}, {"ramp": 0.8}], ids=str)
+def test_heads_that_differ_or_rules_that_differ_are_not(spoilt):
     found = without_labels(made(COUNTS, COUNTS, **spoilt), 0)
     assert not found.readable and found.because.startswith("not readable, ") and "label ten images" in found.because
+
+
+def test_rules_that_count_renders_badly_are_left_out():
+    """Of rules that read from once to seven times as much, one counts the renders right: the others do not matter."""
+    read = made(COUNTS, COUNTS, ramp=0.5)
+    wrong = read.renders + 1
+    wrong[:, :, 2] = read.renders[:, :, 2]
+    found = without_labels(read._replace(renders=wrong), 0)
+    assert found.rules == (2,) and found.spread == 0 and found.readable
+    assert found.mean == pytest.approx(COUNTS.mean() / 1.5, rel=1e-4)
 
 
 def test_what_cannot_count_renders_is_not_believed():
@@ -138,12 +159,21 @@ def test_labels_choose_the_rule_that_reads_them():
     assert found.mean == pytest.approx(COUNTS.mean(), rel=0.1)
 
 
+def test_labels_that_bear_out_what_is_read_without_them_change_nothing():
+    """Ten labels would choose another rule by luck."""
+    rng = np.random.default_rng(2)
+    read = made(COUNTS[:10], COUNTS + rng.normal(0, 0.5, len(COUNTS)), ramp=0.05)
+    free, found = without_labels(read, 0), with_labels(read, 0, torch.from_numpy(COUNTS[:10]))
+    assert free.readable and found.by == "labels" and (found.rules, found.scope) == (free.rules, free.scope)
+    assert "10 labels bear it out" in found.because and 0 < found.error < 1
+
+
 def test_the_labels_histogram_is_learnt_where_nothing_reads_them():
     rng = np.random.default_rng(1)
     read = made(COUNTS[:10], rng.permutation(COUNTS) * 3, apart=2.0)
     labels = torch.tensor([0.0, 1, 1, 1, 1, 1, 1, 2, 2, 1])
     found = with_labels(read, 0, labels)
-    counts = by_steps(read.photographs[:, found.share, found.rule], torch.tensor([found.steps]))
+    counts = by_steps(read.photographs[:, found.scope, found.rules[0]], torch.tensor([found.steps]))
     assert found.readable and found.by == "histogram" and found.error > 0
     assert counts.mean().item() == pytest.approx(labels.mean().item(), abs=0.35)
 
