@@ -8,6 +8,7 @@ Where the other labels' histogram predicts a label better than any rule does, th
 histogram is what is learnt. Axis letters: L photographs, V renders, K labelled images, S scopes, R rules, C classes.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ BASE = 0.3  # objects
 RENDERS = 1.0  # how many labelled images the error on renders is worth
 ENOUGH = 5  # labelled images from which on rules are chosen by them
 MUCH, LITTLE = 1.25, 0.1  # by which factor, and how many objects, errors on so few labels must differ
+BIASED = 2  # standard errors by which the mean of a reading may differ from that of labels which bear it out
 GOES_WITH = 0.4  # least correlation of labels with a reading that is believed without them
 APART = 0.25  # relative difference of means from which on labels and such a reading are of different things
 Array = NDArray[np.float64]
@@ -146,8 +148,9 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     of_free = read.labelled[:, free.scope, :, c][:, list(free.rules)].quantile(0.5, 1)
     with_free, seen_mean, mean = _correlation(of_free, labels), float(of_free.mean()), float(y.mean())
     figures = f"leave-one-out error {error:.2f} an image, of the labels' histogram {histogram:.2f}"
-    without = float((of_free - labels).abs().mean())
-    if free.readable and without <= MUCH * min(error, histogram) + LITTLE:
+    off = (of_free - labels).double().numpy()
+    without, surely = float(np.abs(off).mean()), BIASED * float(off.std(ddof=1)) / math.sqrt(len(y))
+    if free.readable and without <= MUCH * min(error, histogram) + LITTLE and abs(off.mean()) <= surely + LITTLE:
         because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image; {figures})"
         return free._replace(by="labels", error=without, because=because)
     if error <= MUCH * histogram + LITTLE:
