@@ -3,9 +3,11 @@
 Without labels all rules that count renders about as well as the best one are taken, and their median is read. It is
 believed where heads that agree on renders agree on the photographs too, where it counts right on renders that nothing
 was trained on, and where those rules read about as much as each other. With labels the rule is that with the least
-error on them, a little held by its error on renders, as ten labels alone would choose among many rules by luck.
-Where the other labels' histogram predicts a label better than any rule does, that
-histogram is what is learnt. Axis letters: L photographs, V renders, K labelled images, S scopes, R rules, C classes.
+error on them, a little held by its error on renders, as ten labels alone would choose among many rules by luck; where
+they bear out what is read without them, nothing changes. Where the other labels' histogram predicts a label better than
+any rule does, that histogram is what is learnt.
+
+Axis letters: L photographs, V renders, K labelled images, S scopes, R rules, C classes.
 """
 
 import math
