@@ -1,8 +1,11 @@
 """What a fit leaves: the learnt guide, or the prior where the guide's scenes are farther from the target.
 
-New scenes of both are looked at through the run's own features.
+New scenes of both are looked at through the run's own features. A class that cannot be read keeps the prior's
+probability at every choice; where its number changes all the same, as it goes with what was learnt of others, that is
+said.
 """
 
+import math
 from typing import Any
 
 import torch
@@ -21,6 +24,7 @@ from .run import PRIOR_KEPT, RunFolder
 
 SCENES = 500  # of each policy, at most; fewer where the fit's batches are smaller
 REJECTED = "guide-rejected"
+SURELY, MUCH = 4.0, 0.1  # standard errors by which means differ that are told, and what part of the larger one
 
 
 def compared(net: FeatureNet) -> Tensor | None:
@@ -38,7 +42,8 @@ def give_up(run: RunFolder) -> str:
 def conclude(
     run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, guide: Guide, progress: Progress
 ) -> str:
-    """Keep the guide or the prior; a sentence where it is the prior, else nothing.
+    """Keep the guide or the prior; a sentence where it is the prior, or where a class that cannot be read has another
+    number than in the prior, else nothing.
 
     Args:
         net: what it learnt by.
@@ -49,22 +54,27 @@ def conclude(
         return ""
     which = compared(net)
     which = slice(None) if which is None else which
-    found = []
+    found, numbers = [], []
     number = min(SCENES, 2 * run.preset.num_scenes)
     policies: tuple[Policy, ...] = (guide.eval(), run.model.prior)
     for i, policy in enumerate(policies):
         seed_everything(batch_seed(run.record["seed"], 4, i))
-        observe, parts = observer.observe(net, run.preset.draws_per_structure), []
+        observe, parts, counts = observer.observe(net, run.preset.draws_per_structure), [], []
         for first in range(0, number, RENDERED_AT_ONCE):
-            parts.append(observe(sample(run.model, policy, min(RENDERED_AT_ONCE, number - first))))
+            scenes = sample(run.model, policy, min(RENDERED_AT_ONCE, number - first))
+            parts.append(observe(scenes))
+            counts.append(scenes.derivation.counts(len(run.model.grammar.kinds)))
             progress("outcome", i * number + first + len(parts[-1]), 2 * number, "")
         found.append(torch.cat(parts)[:, which].double().numpy())
+        numbers.append(torch.cat(counts).double())
     apart = farther(found[0], found[1], real[:, which].double().numpy())
     record: dict[str, Any] = {"kept": "learnt", "scenes": number, "learnt": apart.one, "prior": apart.other}
     if not apart.sure:
-        run.write_outcome(record)
+        kinds = {kind: i for i, kind in enumerate(run.model.grammar.kinds) if kind in run.unread}
+        changed = moved(numbers[0], numbers[1], kinds)
+        run.write_outcome(record | ({"moved": changed} if changed else {}))
         run.write_tensors("guide", guide.state_dict())
-        return ""
+        return _said(changed)
     because = (
         f"Learnt scenes are farther from the target than the prior's, {apart.one:.2f} against {apart.other:.2f} in "
         "energy distance of the features"
@@ -72,6 +82,36 @@ def conclude(
     run.write_tensors(REJECTED, guide.state_dict())
     _keep_prior(run, record | {"kept": "prior", "because": because})
     return f"{because}; the prior is kept. What was learnt is in {run.path / REJECTED}.safetensors."
+
+
+def moved(learnt: Tensor, prior: Tensor, kinds: dict[str, int]) -> dict[str, tuple[float, float]]:
+    """Kinds whose mean number in a structure has changed, by more than chance: the prior's mean and the learnt one.
+
+    Args:
+        learnt, prior: ``(N, K)`` counts of all kinds in structures.
+        kinds: names and numbers of those that are looked at.
+    """
+    means = {name: (float(prior[:, k].mean()), float(learnt[:, k].mean())) for name, k in kinds.items()}
+    chance = {
+        name: math.sqrt(sum(float(one[:, k].var()) / len(one) for one in (learnt, prior))) for name, k in kinds.items()
+    }
+    return {
+        name: (before, after)
+        for name, (before, after) in means.items()
+        if abs(after - before) > SURELY * chance[name] and abs(after - before) > MUCH * max(before, after)
+    }
+
+
+def _said(changed: dict[str, tuple[float, float]]) -> str:
+    if not changed:
+        return ""
+    each = ", ".join(
+        f"{name} (from {before:.2f} to {after:.2f} in a structure)" for name, (before, after) in changed.items()
+    )
+    return (
+        f"Not readable in the target's images, and yet of another number than in the prior, as they go with what was "
+        f"learnt of other classes: {each}. Label ten images to have them compared."
+    )
 
 
 def _keep_prior(run: RunFolder, record: dict[str, Any]) -> None:
