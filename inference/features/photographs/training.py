@@ -96,8 +96,9 @@ class PretrainedCountTraining:
         held = [part[n:] for part in maps]
         median = torch.stack([some.median() if len(some) else torch.tensor(math.inf) for some in sizes])
         self.net.finish(self.net.readings(held)[0], true[n:], median)
-        of_scope = true[n:, self.net.scope, torch.arange(len(self.net.scope))]
-        each_class = zip(self.net.counts(held).T, of_scope.T, strict=True)
+        scope, rule, classes = self.net.scope, self.net.rules[0].int().argmax(1), torch.arange(len(self.net.scope))
+        seen, known = self.net.held_read[:, scope, rule, classes], self.net.held_true[:, scope, classes]
+        each_class = zip(seen.T, known.T, strict=True)
         self.correlation = torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class])
 
     def summary(self) -> dict[str, Any]:
