@@ -70,7 +70,8 @@ def conclude(
     apart = farther(found[0], found[1], real[:, which].double().numpy())
     record: dict[str, Any] = {"kept": "learnt", "scenes": number, "learnt": apart.one, "prior": apart.other}
     if not apart.sure:
-        kinds = {kind: i for i, kind in enumerate(run.model.grammar.kinds) if kind in run.unread}
+        unread = run.unread
+        kinds = {kind: i for i, kind in enumerate(run.model.grammar.kinds) if kind in unread}
         changed = moved(numbers[0], numbers[1], kinds)
         run.write_outcome(record | ({"moved": changed} if changed else {}))
         run.write_tensors("guide", guide.state_dict())
@@ -91,15 +92,13 @@ def moved(learnt: Tensor, prior: Tensor, kinds: dict[str, int]) -> dict[str, tup
         learnt, prior: ``(N, K)`` counts of all kinds in structures.
         kinds: names and numbers of those that are looked at.
     """
-    means = {name: (float(prior[:, k].mean()), float(learnt[:, k].mean())) for name, k in kinds.items()}
-    chance = {
-        name: math.sqrt(sum(float(one[:, k].var()) / len(one) for one in (learnt, prior))) for name, k in kinds.items()
-    }
-    return {
-        name: (before, after)
-        for name, (before, after) in means.items()
-        if abs(after - before) > SURELY * chance[name] and abs(after - before) > MUCH * max(before, after)
-    }
+    found = {}
+    for name, k in kinds.items():
+        before, after = float(prior[:, k].mean()), float(learnt[:, k].mean())
+        chance = math.sqrt(sum(float(counts[:, k].var()) / len(counts) for counts in (learnt, prior)))
+        if abs(after - before) > max(SURELY * chance, MUCH * max(before, after)):
+            found[name] = before, after
+    return found
 
 
 def _said(changed: dict[str, tuple[float, float]]) -> str:
@@ -109,7 +108,7 @@ def _said(changed: dict[str, tuple[float, float]]) -> str:
         f"{name} (from {before:.2f} to {after:.2f} in a structure)" for name, (before, after) in changed.items()
     )
     return (
-        f"Not readable in the target's images, and yet of another number than in the prior, as they go with what was "
+        "Not readable in the target's images, and yet of another number than in the prior, as they go with what was "
         f"learnt of other classes: {each}. Label ten images to have them compared."
     )
 
