@@ -17,6 +17,7 @@ from probscene.dataset import ImageFolder, Images
 from probscene.errors import DataError, RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.guides.base import Guide
+from probscene.inference.holding import Held
 from probscene.inference.judging.two_sample import NEEDED, check_features
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
@@ -250,9 +251,10 @@ def _learn(run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, pr
     preset, model, seed = run.preset, run.model, run.record["seed"]
     seed_everything(batch_seed(seed, 2))
     guide = run.new_guide()
+    held = Held(model, {*run.unread, *(model.stuff if run.readings else ())}, preset.num_scenes)
     objective = ScoreFunction(
-        observer.observe(net, preset.draws_per_structure),
-        run.divergence(inner(net)),
+        held.beside(observer.observe(net, preset.draws_per_structure)),
+        held.added_to(run.divergence(inner(net))),
         baseline=preset.baseline,
         updates=preset.updates,
         scale=preset.scale,

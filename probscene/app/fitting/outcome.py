@@ -1,8 +1,7 @@
 """What a fit leaves: the learnt guide, or the prior where the guide's scenes are farther from the target.
 
-New scenes of both are looked at through the run's own features. A class that cannot be read keeps the prior's
-probability at every choice; where its number changes all the same, as it goes with what was learnt of others, that is
-said.
+New scenes of both are looked at through the run's own features. The number of a class that cannot be read is held
+(``inference.holding``); where it changes all the same, as it goes with what was learnt of others, that is said.
 """
 
 import math
