@@ -1,0 +1,1 @@
+"""Learning the parameters of scenes: where things stand and how they look."""

@@ -1,0 +1,194 @@
+"""``ParameterGuide``: a Pyro guide whose sites are the program's own.
+
+It runs the model's program with other distributions at the sites that are learnt. A value of such a site is
+``alpha = F^-1(u)``, with F the CDF of its prior given everything before it, and u from a mixture on 0..1 that depends
+on the structure and on the values before (``net``). So
+
+    log q(T, alpha) = log q(T) + sum over sites and nodes of log q(u | before) + log p(alpha | before),
+
+exactly, and with all of the net's weights 0 it is the prior. A site's distribution covers all nodes at once, one after
+the other, so that ``poutine``, ``SVI`` and ``Predictive`` take it like any site. Sites that are not learnt are not
+touched: they draw the same random numbers as under the prior. Axis letters: N scenes, M nodes.
+"""
+
+from dataclasses import replace
+from typing import Any, cast
+
+import pyro
+import torch
+from pyro.distributions import TorchDistribution
+from pyro.poutine.messenger import Messenger
+from torch import Tensor, nn
+
+from probscene.drawing import Drawing
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.world import World
+
+from .net import Graph, ParameterNet, Seen
+from .sites import NEAR, Site
+
+
+class ParameterGuide(nn.Module):
+    """Parameters of a model's sites, learnt; also a Pyro program, ``guide(num_scenes)``, over structure and parameters.
+
+    Args:
+        model: the scene model.
+        sites: those that are learnt, in the order of the program.
+        structure: the policy of the structures; the model's prior where None.
+        hidden: units of the network.
+    """
+
+    def __init__(self, model: SceneModel, sites: tuple[Site, ...], structure: Policy | None = None, hidden: int = 64):
+        super().__init__()
+        self.model, self.sites = model, sites
+        self.structure = model.prior if structure is None else structure
+        self.node_sites = tuple(site for site in sites if not site.of_scene)
+        self.scene_sites = tuple(site for site in sites if site.of_scene)
+        self.net = ParameterNet(len(model.grammar.kinds), len(self.node_sites), len(self.scene_sites), hidden)
+
+    def forward(self, num_scenes: int) -> Drawing | World:
+        """The Pyro program: the sites ``rule_t`` and the model's own."""
+        pyro.module("parameters", self.net)
+        if isinstance(self.structure, nn.Module):
+            pyro.module("guide", self.structure)
+        return self.program(num_scenes, self.structure)
+
+    def suited(self, model: SceneModel) -> SceneModel:
+        """The model with learnt parameters."""
+        return replace(model, program=self.program)
+
+    def program(self, num_scenes: int, structure: Policy) -> Drawing | World:
+        """The model's program with learnt parameters, as ``SceneModel.program`` is called."""
+        with Learnt(self):
+            return self.model.program(num_scenes, structure)
+
+
+class Learnt(Messenger):
+    """Inside it a program's learnt sites have the guide's distributions.
+
+    Args:
+        guide: the guide.
+
+    Attributes:
+        seen, graph: of what the program has derived.
+        scene, values: u of the scene's and of the seen nodes' learnt sites so far, ``(N, G)`` and ``(N, M', S)``; NaN
+            where there are none.
+    """
+
+    def __init__(self, guide: ParameterGuide):
+        super().__init__()
+        self.guide = guide
+        self.seen: Seen | None = None
+        self.graph = Graph.of(*torch.full((2, 0, 1), -1))
+        self.scene, self.values = torch.zeros(0), torch.zeros(0)
+
+    def _pyro_post_derive(self, msg: Any) -> None:
+        model = self.guide.model
+        self.seen = Seen.of(model.grammar, model.classes, msg["value"])
+        self.graph = Graph.of(self.seen.kind, self.seen.parent)
+        N, M = self.seen.kind.shape
+        self.scene = torch.full((N, len(self.guide.scene_sites)), torch.nan)
+        self.values = torch.full((N, M, len(self.guide.node_sites)), torch.nan)
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if self.seen is None:
+            return
+        for sites, made in ((self.guide.scene_sites, OfScenes), (self.guide.node_sites, OfNodes)):
+            names = [site.name for site in sites]
+            if msg["name"] in names:
+                mask = True if msg["mask"] is None else msg["mask"]
+                has = torch.as_tensor(mask).expand(msg["fn"].batch_shape)
+                msg["fn"] = made(msg["fn"], self, names.index(msg["name"]), has)
+
+    def _pyro_post_sample(self, msg: Any) -> None:
+        if isinstance(msg["fn"], _OfSites):
+            msg["fn"].keep(msg["value"])
+
+
+class _OfSites(TorchDistribution):
+    """A learnt site's distribution over all scenes and nodes, ``(N, M)`` or ``(N, 1)``.
+
+    Args:
+        base: the prior's.
+        learnt: of the program that runs.
+        index: of the site.
+        has: which nodes have it.
+    """
+
+    arg_constraints: Any = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    has_rsample = True
+
+    def __init__(self, base: Any, learnt: Learnt, index: int, has: Tensor):
+        self.base, self.learnt, self.index, self.has = base, learnt, index, has
+        self.net, self.graph, self.seen = learnt.guide.net, learnt.graph, cast(Seen, learnt.seen)
+        self.scene, self.values = learnt.scene, learnt.values
+        super().__init__(base.batch_shape, validate_args=False)
+
+    @property
+    def support(self) -> Any:
+        """The prior's."""
+        return self.base.support
+
+    def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+        """Values; their gradient by the net's parameters goes through u."""
+        if sample_shape:
+            raise NotImplementedError("Expected samples one batch at a time; put the number of scenes in the plate.")
+        drawn = self.base.sample()
+        v = self.base.cdf(drawn).clamp(NEAR, 1 - NEAR)
+        return torch.where(self.has, self.base.icdf(self.quantile(v)), drawn)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Of each node, given the nodes and sites before; 0 where a node has none."""
+        u = self.base.cdf(value).clamp(NEAR, 1 - NEAR)
+        return (self.density(u) + self.base.log_prob(value)).where(self.has, 0.0)
+
+    def quantile(self, v: Tensor) -> Tensor:
+        """u at quantiles v."""
+        raise NotImplementedError
+
+    def density(self, u: Tensor) -> Tensor:
+        """``log q(u | before)``."""
+        raise NotImplementedError
+
+    def keep(self, value: Tensor) -> None:
+        """Note what was sampled, for what comes after it."""
+        raise NotImplementedError
+
+    def _u(self, value: Tensor) -> Tensor:
+        return self.base.cdf(value).clamp(NEAR, 1 - NEAR).where(self.has, torch.nan)
+
+
+class OfNodes(_OfSites):
+    """Of a site of nodes."""
+
+    def quantile(self, v: Tensor) -> Tensor:
+        taken, has = self.seen.taken(v), self.seen.taken(self.has)
+        return self.seen.put(self.net.sample(self.graph, self.scene, self.values, self.index, taken, has), v)
+
+    def density(self, u: Tensor) -> Tensor:
+        taken = self.seen.taken(u)
+        values = _put(self.values, self.index, taken.where(self.seen.taken(self.has), torch.nan))
+        found = self.net.node_mixture(self.graph, self.scene, values, self.index).log_prob(taken)
+        return self.seen.put(found, torch.zeros_like(u))
+
+    def keep(self, value: Tensor) -> None:
+        self.learnt.values = _put(self.values, self.index, self.seen.taken(self._u(value)))
+
+
+class OfScenes(_OfSites):
+    """Of a site of the scene."""
+
+    def quantile(self, v: Tensor) -> Tensor:
+        return self.net.scene_mixture(self.graph, self.scene, self.index).icdf(v)
+
+    def density(self, u: Tensor) -> Tensor:
+        return self.net.scene_mixture(self.graph, self.scene, self.index).log_prob(u)
+
+    def keep(self, value: Tensor) -> None:
+        self.learnt.scene = _put(self.scene.unsqueeze(1), self.index, self._u(value)).squeeze(1)
+
+
+def _put(values: Tensor, index: int, column: Tensor) -> Tensor:
+    """``values (..., S)`` with another column."""
+    return torch.where(torch.arange(values.shape[-1]) == index, column.unsqueeze(-1), values)

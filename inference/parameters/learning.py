@@ -1,0 +1,215 @@
+"""Parameters from unlabelled images: a reader, maximum likelihood on what it reads, and rounds of both.
+
+1. A reader is trained on renders (``reader_training``), half of them arranged as the prior hardly arranges them.
+2. It is tried on renders of the prior: sites that it can read are learnt, the others keep their prior (``skill``).
+3. It reads the target; a guide learns the values by maximum likelihood (``likelihood``).
+4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
+   reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
+
+Axis letters: N scenes, L images, K objects.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import seed_everything
+
+from ..features.counting.net import CountNet
+from ..training import Report, Training, batch_seed
+from .guide import ParameterGuide
+from .likelihood import MaximumLikelihood, Values
+from .net import Graph
+from .reading.assembly import along_the_widest, assembly
+from .reading.reader import Found, Reader
+from .reading.skill import Skill
+from .reading.training import MIN_VISIBLE, ReaderTraining, Valued
+from .reading.valued import Label, ValuedRenders
+from .schedule import ParameterSchedule
+from .sites import Site, find_sites
+
+TRIED = 200  # renders that a reader is tried on
+OWN = 0.65  # of a round's steps look at the guide's own renders
+ARRANGED = 0.5  # of the other renders are arranged
+NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
+
+
+class ParameterLearning:
+    """A ``Training`` of a ``ParameterGuide``, made of trainings one after the other.
+
+    Args:
+        model: the scene model.
+        structure: the policy of the structures.
+        counts: a trained count network.
+        label: renders and labels scenes.
+        images: gives the target's, ``(L, C, H, W)`` uint8.
+        schedule: how long.
+        seed: of everything random.
+
+    Attributes:
+        unit, total, done: see ``Training``; steps of all trainings.
+        sites: of the model.
+        skill: of the reader, for the sites of nodes and then of scenes that are not kept; None before it is tried.
+        guide: what is learnt; None before it is known which sites are.
+    """
+
+    unit = "steps"
+
+    def __init__(
+        self,
+        model: SceneModel,
+        structure: Policy,
+        counts: CountNet,
+        label: Label,
+        images: Callable[[], Tensor],
+        schedule: ParameterSchedule,
+        seed: int = 0,
+    ):
+        self.model, self.structure, self.images, self.schedule, self.seed = model, structure, images, schedule, seed
+        seed_everything(batch_seed(seed, 0))
+        self.sites = find_sites(model)
+        open_to = [site for site in self.sites if not site.keeps]
+        self.node_sites = tuple(site for site in open_to if not site.of_scene)
+        self.scene_sites = tuple(site for site in open_to if site.of_scene)
+        self.renders = ValuedRenders(model, label, self.node_sites, self.scene_sites)
+        self.reader = Reader(counts, len(model.classes), len(self.node_sites), len(self.scene_sites))
+        self.lengths = [schedule.reader_steps, schedule.steps]
+        self.lengths += [schedule.round_reader_steps, schedule.round_steps] * schedule.rounds
+        self.total, self.done, self.phase = sum(self.lengths), 0, 0
+        self.skill: Skill | None = None
+        self.guide: ParameterGuide | None = None
+        self.inner: Training | None = None
+
+    @property
+    def learnt(self) -> tuple[Site, ...]:
+        """The sites that can be read, in the order of the program; empty before the reader was tried."""
+        if self.skill is None:
+            return ()
+        good = dict(zip((*self.node_sites, *self.scene_sites), self.skill.readable.tolist(), strict=True))
+        return tuple(site for site in self.sites if good.get(site))
+
+    def run(self, each: Report | None = None) -> None:
+        """Take the steps that are left.
+
+        Raises:
+            ProbsceneError: a loss is no longer finite.
+        """
+        while self.phase < len(self.lengths):
+            if self.phase % 2 and not self.learnt:  # nothing can be read
+                self.phase, self.done = len(self.lengths), self.total
+                return
+            if self.inner is None:
+                self.inner = self._begun()
+            before = sum(self.lengths[: self.phase])
+
+            def heard(training: Training, told: dict[str, float], before: int = before) -> None:
+                self.done = before + training.done
+                if each is not None:
+                    each(self, told)
+
+            self.inner.run(heard)
+            self.inner = None
+            self.phase += 1
+            self.done = sum(self.lengths[: self.phase])
+            if self.phase == 1:
+                self._try()
+
+    def summary(self) -> dict[str, Any]:
+        """Nothing more for the log."""
+        return {}
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        tensors = {f"reader.{key}": value for key, value in self.reader.state_dict().items()}
+        tensors["phase"] = torch.tensor(self.phase)
+        if self.skill is not None:
+            tensors |= {"skill.way": self.skill.way, "skill.share": self.skill.share}
+        if self.guide is not None:
+            tensors |= {f"guide.{key}": value for key, value in self.guide.net.state_dict().items()}
+        if self.inner is not None:
+            tensors |= {f"inner.{key}": value for key, value in self.inner.state().items()}
+        return tensors
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        self.phase = int(tensors["phase"])
+        self.reader.load_state_dict(_within(tensors, "reader."))
+        self.reader.eval()
+        if "skill.way" in tensors:
+            self.skill = Skill(tensors["skill.way"], tensors["skill.share"])
+            self.guide = ParameterGuide(self.model, self.learnt, self.structure)
+            self.guide.net.load_state_dict(_within(tensors, "guide."))
+        inner = _within(tensors, "inner.")
+        if inner:
+            self.inner = self._begun()
+            self.inner.restore(inner)
+        self.done = sum(self.lengths[: self.phase]) + (0 if self.inner is None else self.inner.done)
+
+    def _begun(self) -> Training:
+        """The training of this phase, from its first step."""
+        schedule, first = self.schedule, self.phase < 2
+        seed = batch_seed(self.seed, 1, self.phase)
+        if self.phase % 2 == 0:
+            steps = schedule.reader_steps if first else schedule.round_reader_steps
+            rate = schedule.reader_rate / (1 if first else 2)
+            return ReaderTraining(self.reader, self._drawn, steps, schedule.reader_images, rate, seed)
+        guide = self.guide
+        assert guide is not None
+        steps, rate = (schedule.steps, schedule.rate) if first else (schedule.round_steps, 0.6 * schedule.rate)
+        return MaximumLikelihood(guide.net, self._read(), steps, learning_rate=rate, seed=seed)
+
+    def _drawn(self, num: int) -> Valued:
+        """Renders for a step of the reader."""
+        if self.guide is not None and float(torch.rand(())) < OWN:
+            return self.renders.draw(num, self.structure, self.guide.suited(self.model))
+        return self.renders.draw(num, self.model.pretraining_policy, arranged=ARRANGED)
+
+    def _try(self) -> None:
+        """See what the reader can read in the prior's renders."""
+        seed_everything(batch_seed(self.seed, 2))
+        valued = self.renders.draw(TRIED, self.model.pretraining_policy)
+        found = self.reader.find(valued.drawn.image)
+        which = matched(found, valued)
+        of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
+        of_scenes = Skill.of(found.scene, valued.scene)
+        self.skill = Skill(*(torch.cat(pair) for pair in zip(of_nodes, of_scenes, strict=True)))
+        self.guide = ParameterGuide(self.model, self.learnt, self.structure)
+
+    def _read(self) -> Values:
+        """What the reader reads in the target."""
+        assert self.skill is not None
+        seed_everything(batch_seed(self.seed, 3, self.phase))
+        images = self.images()
+        found, S = self.reader.find(images), len(self.node_sites)
+        skills = Skill(*(part[:S] for part in self.skill)), Skill(*(part[S:] for part in self.skill))
+        node, scene = (skill.readable.nonzero().flatten() for skill in skills)
+        mean, sd = (part[:, node] for part in skills[0].read(found.raw))
+        scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.scene))
+        kind, parent, *nodes = along_the_widest(self._assembly(), found).values(found, len(images), mean, sd)
+        turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
+        return Values(kind, parent, nodes[0], nodes[1], scene_mean, scene_sd, turns)
+
+    def _assembly(self) -> Any:
+        """What the prior's scenes have in common."""
+        valued = self.renders.draw(TRIED, self.model.pretraining_policy)
+        label = valued.drawn.label
+        kinds = torch.tensor([self.model.grammar.kind(name) for name in self.model.classes] + [-1])
+        centre = valued.drawn.centre.where((label >= 0).unsqueeze(-1), torch.nan)
+        return assembly(self.model.grammar, self.model.classes, Graph.of(kinds[label], valued.parent), centre)
+
+
+def matched(found: Found, valued: Valued) -> Tensor:
+    """``(K,)`` the node nearest to each object that was found; -1 where none is near."""
+    drawn = valued.drawn
+    there = (drawn.label >= 0) & (drawn.visible >= MIN_VISIBLE)
+    away = (drawn.centre[found.image] - found.centre[:, None]).norm(dim=-1).masked_fill(~there[found.image], torch.inf)
+    least, which = away.min(1)
+    return torch.where(least < NEAR_ENOUGH, which, -1)
+
+
+def _within(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

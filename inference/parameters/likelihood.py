@@ -1,0 +1,191 @@
+"""Maximum likelihood of a parameter guide on values that were read.
+
+What is read of u has an error, which the reader tells: a normal distribution that is proportional to the likelihood of
+u, since u is uniform under the prior. Each step draws u anew from it. A guide of such draws would have the readings'
+errors in its own spread. So after the first steps each value is one of several draws, taken in proportion to the
+guide's density. That is a draw from the posterior of u under the guide, and each step is one of stochastic EM for the
+marginal likelihood of what was read [1].
+
+Axis letters: L images, M nodes, S sites of nodes, G sites of scenes.
+
+References:
+    [1] Celeux and Diebolt, *The SEM algorithm: a probabilistic teacher algorithm derived from the EM algorithm for the
+        mixture problem*, 1985.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from probscene.sampling import seed_everything
+
+from ..training import Report, batch_seed, check_finite, restore_training, training_state
+from .net import Graph, ParameterNet
+from .reading.reader import cut_draw
+from .sites import NEAR
+
+ALONE = 0.4  # of the steps, the first ones, take what was read as it is
+CANDIDATES = 8  # draws of which one is taken
+
+
+class Values(NamedTuple):
+    """Scene graphs and the u of their sites, read or known; NaN where there are none.
+
+    Attributes:
+        kind, parent: ``(L, M)`` int64, nodes in the order of a derivation; -1 pads.
+        nodes, nodes_sd: ``(L, M, S)`` u and its standard deviation.
+        scene, scene_sd: ``(L, G)``.
+        turns: ``(S + G,)`` bool, those read on a circle.
+    """
+
+    kind: Tensor
+    parent: Tensor
+    nodes: Tensor
+    nodes_sd: Tensor
+    scene: Tensor
+    scene_sd: Tensor
+    turns: Tensor
+
+    def of(self, rows: Tensor) -> "Values":
+        """Some images', without nodes that only pad."""
+        kind = self.kind[rows]
+        M = max(1, int((kind >= 0).sum(1).max()) if len(kind) else 1)
+        return Values(
+            kind[:, :M],
+            self.parent[rows, :M],
+            self.nodes[rows, :M],
+            self.nodes_sd[rows, :M],
+            self.scene[rows],
+            self.scene_sd[rows],
+            self.turns,
+        )
+
+    def drawn(self) -> "Values":
+        """u drawn from what was read."""
+        return self._replace(
+            nodes=_drawn(self.nodes, self.nodes_sd, self.turns[: self.nodes.shape[2]]),
+            scene=_drawn(self.scene, self.scene_sd, self.turns[self.nodes.shape[2] :]),
+        )
+
+
+def _drawn(mean: Tensor, sd: Tensor, turns: Tensor) -> Tensor:
+    v = torch.rand_like(mean)
+    line = cut_draw(mean, sd, v)
+    if not turns.any():
+        return line.clamp(NEAR, 1 - NEAR)
+    circle = (mean + sd * math.sqrt(2) * torch.erfinv(2 * v - 1)).remainder(1.0)
+    return torch.where(turns, circle, line).clamp(NEAR, 1 - NEAR)
+
+
+@torch.no_grad()
+def posterior_draws(net: ParameterNet, values: Values, candidates: int = CANDIDATES) -> Values:
+    """u drawn from what was read and from the guide together, site by site."""
+    drawn = values.drawn()
+    others = [values.drawn() for _ in range(candidates)]
+    graph = Graph.of(values.kind, values.parent)
+    scene, nodes = drawn.scene.clone(), drawn.nodes.clone()
+    for g in range(net.scene_sites):
+        some = torch.stack([other.scene[:, g] for other in others], -1)
+        mixture = net.scene_mixture(graph, scene, g)
+        scene[:, g] = _taken(some, mixture.log_prob(some.nan_to_num(0.5).T.unsqueeze(-1)).squeeze(-1).T)
+    for s in range(net.node_sites):
+        some = torch.stack([other.nodes[..., s] for other in others], -1)
+        mixture = net.node_mixture(graph, scene, nodes, s)
+        density = torch.stack([mixture.log_prob(one.nan_to_num(0.5)) for one in some.unbind(-1)], -1)
+        nodes[..., s] = _taken(some, density)
+    return drawn._replace(scene=scene, nodes=nodes)
+
+
+def _taken(candidates: Tensor, log_weight: Tensor) -> Tensor:
+    """One of the last axis's, by weight."""
+    which = torch.distributions.Categorical(logits=log_weight).sample()
+    return candidates.gather(-1, which.unsqueeze(-1)).squeeze(-1)
+
+
+def log_density(net: ParameterNet, values: Values) -> Tensor:
+    """``(L, S + G)`` nats of the u of each site, summed over the nodes that have it."""
+    graph = Graph.of(values.kind, values.parent)
+    parts = []
+    for s in range(net.node_sites):
+        u = values.nodes[..., s]
+        found = net.node_mixture(graph, values.scene, values.nodes, s).log_prob(u.nan_to_num(0.5))
+        parts.append(found.where(~u.isnan(), 0.0).sum(1))
+    for g in range(net.scene_sites):
+        u = values.scene[:, g]
+        found = net.scene_mixture(graph, values.scene, g).log_prob(u.nan_to_num(0.5)[:, None]).squeeze(1)
+        parts.append(found.where(~u.isnan(), 0.0))
+    return torch.stack(parts, 1)
+
+
+class MaximumLikelihood:
+    """Resumable training of a ``ParameterNet``.
+
+    Args:
+        net: trained in place.
+        values: what was read.
+        steps: of Adam, along a cosine.
+        images: a step.
+        learning_rate: the largest.
+        seed: of everything random.
+
+    Attributes:
+        unit, total, done: see ``Training``.
+    """
+
+    unit = "steps"
+
+    def __init__(
+        self,
+        net: ParameterNet,
+        values: Values,
+        steps: int = 700,
+        images: int = 200,
+        learning_rate: float = 5e-3,
+        seed: int = 0,
+    ):
+        self.net, self.values, self.total, self.images = net, values, steps, images
+        self.learning_rate, self.seed, self.done = learning_rate, seed, 0
+        self.optimiser = torch.optim.Adam(net.parameters(), lr=learning_rate)
+
+    def run(self, each: Report | None = None) -> None:
+        """Take the steps that are left; ``each`` hears the mean loss, nats an image, after every tenth.
+
+        Raises:
+            ProbsceneError: the loss is no longer finite.
+        """
+        losses = []
+        while self.done < self.total:
+            seed_everything(batch_seed(self.seed, self.done))
+            rate = self.learning_rate * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
+            for group in self.optimiser.param_groups:
+                group["lr"] = rate
+            rows = torch.randperm(len(self.values.kind))[: self.images]
+            some = self.values.of(rows)
+            drawn = some.drawn() if self.done < ALONE * self.total else posterior_draws(self.net, some)
+            loss = -log_density(self.net, drawn).sum(1).mean()
+            self.optimiser.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.net.parameters(), 10.0)
+            self.optimiser.step()
+            losses.append(loss.item())
+            self.done += 1
+            if self.done % 10 == 0 or self.done == self.total:
+                mean, losses = sum(losses) / len(losses), []
+                where = f"at step {self.done}"
+                check_finite(mean, self.net.parameters(), "the parameters", where, "begin again with a lower rate")
+                if each is not None:
+                    each(self, {"loss": mean})
+
+    def summary(self) -> dict[str, Any]:
+        """Nothing more for the log."""
+        return {}
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        return training_state(self.net, {"adam": self.optimiser}, done=self.done)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        self.done = int(restore_training(self.net, {"adam": self.optimiser}, tensors)["done"])

@@ -1,0 +1,64 @@
+"""Distributions on 0..1 that begin as the uniform one: mixtures of logistic distributions on the logit scale.
+
+A logistic distribution of location 0 and scale 1 is the logit of a uniform number, so all parameters 0 give the uniform
+distribution, exactly. Axis letters: K components; all else is batch.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .sites import NEAR
+
+LEAST = -6.0  # logarithm of the least scale
+FARTHEST = 20.0  # logits between which a quantile lies
+HALVINGS = 40
+
+
+class LogisticMixture(NamedTuple):
+    """A mixture for each entry of a batch.
+
+    Attributes:
+        weight: ``(..., K)`` logits of the components.
+        location: ``(..., K)``.
+        log_scale: ``(..., K)``.
+    """
+
+    weight: Tensor
+    location: Tensor
+    log_scale: Tensor
+
+    @staticmethod
+    def of(raw: Tensor) -> "LogisticMixture":
+        """From a network's ``(..., 3 K)``; zeros give the uniform distribution."""
+        weight, location, log_scale = raw.chunk(3, -1)
+        return LogisticMixture(weight, location, log_scale.clamp(LEAST, 2.0))
+
+    def log_prob(self, u: Tensor) -> Tensor:
+        """``(...)`` log density at ``u (...)``."""
+        logit = u.clamp(NEAR, 1 - NEAR).logit()
+        z = (logit.unsqueeze(-1) - self.location) * (-self.log_scale).exp()
+        each = F.logsigmoid(z) + F.logsigmoid(-z) - self.log_scale
+        return torch.logsumexp(F.log_softmax(self.weight, -1) + each, -1) - F.logsigmoid(logit) - F.logsigmoid(-logit)
+
+    def cdf(self, logit: Tensor) -> Tensor:
+        """``(...)`` probability of less than the sigmoid of ``logit (...)``."""
+        z = (logit.unsqueeze(-1) - self.location) * (-self.log_scale).exp()
+        return (self.weight.softmax(-1) * z.sigmoid()).sum(-1)
+
+    def icdf(self, v: Tensor) -> Tensor:
+        """``(...)`` the u below which a probability of ``v (...)`` lies, by bisection; its gradient by the parameters
+        is that of the implicit function."""
+        with torch.no_grad():
+            low = torch.full_like(v, -FARTHEST)
+            high = torch.full_like(v, FARTHEST)
+            for _ in range(HALVINGS):
+                middle = (low + high) / 2
+                below = self.cdf(middle) < v
+                low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+            u = ((low + high) / 2).sigmoid().clamp(NEAR, 1 - NEAR)
+        if not torch.is_grad_enabled() or not self.location.requires_grad:
+            return u
+        return u - (self.cdf(u.logit()) - v) / self.log_prob(u).exp().detach()

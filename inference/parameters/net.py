@@ -1,0 +1,228 @@
+"""The network of a parameter guide: what each site's mixture depends on.
+
+Sites come in the order of the program. Within a site, nodes come in the order of their derivation, parents before
+children. A node's mixture depends on the scene's sites and the number of nodes of each kind, its kind, its place among
+its siblings, its own earlier sites, its parent and its sibling before with all that is known of them, and, through a
+GRU, on all nodes before it. Axis letters: N scenes, M nodes, S sites of nodes, G sites of scenes, H units.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from probscene.derivation import Derivation
+from probscene.grammar import Grammar
+
+from .mixture import LogisticMixture
+
+COMPONENTS = 6
+MOST = 40  # ranks and numbers of siblings from here on are one
+LOGITS = 4.0  # a logit of this is 1 for the network
+SMALL = 0.3  # spread of the first components' locations, in logits: components that are equal stay equal
+
+
+class Graph(NamedTuple):
+    """What a scene's structure says of its nodes.
+
+    Attributes:
+        kind: ``(N, M)`` int64; -1 pads.
+        parent, before: ``(N, M)`` int64 node index of the parent and of the sibling before, -1 for none.
+        rank, number: ``(N, M)`` int64 place among its siblings, and how many they are with it.
+        same_rank, same_number: the same among siblings of its own kind.
+    """
+
+    kind: Tensor
+    parent: Tensor
+    before: Tensor
+    rank: Tensor
+    number: Tensor
+    same_rank: Tensor
+    same_number: Tensor
+
+    @staticmethod
+    def of(kind: Tensor, parent: Tensor) -> "Graph":
+        """Of nodes in the order of a derivation, each ``(N, M)``."""
+        there = kind >= 0
+        siblings = (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & there.unsqueeze(-1) & there.unsqueeze(-2)
+        same = siblings & (kind.unsqueeze(-1) == kind.unsqueeze(-2))
+        earlier = siblings.tril(-1)
+        index = torch.arange(kind.shape[1]).expand_as(earlier)
+        before = index.where(earlier, -1).amax(-1)
+        return Graph(kind, parent, before, earlier.sum(-1), siblings.sum(-1), same.tril(-1).sum(-1), same.sum(-1))
+
+
+class Seen(NamedTuple):
+    """The nodes of derivations that have a class, without gaps: only these can be read in an image.
+
+    Attributes:
+        kind, parent: ``(N, M')``, the parent the nearest that has a class.
+        slot: ``(N, M')`` int64, which node of the derivation each is.
+        place: ``(N, M)`` int64, the reverse; whatever for nodes without a class.
+    """
+
+    kind: Tensor
+    parent: Tensor
+    slot: Tensor
+    place: Tensor
+
+    @staticmethod
+    def of(grammar: Grammar, classes: Sequence[str], derivation: Derivation) -> "Seen":
+        """Of derivations."""
+        kind, parent = derivation.kind, derivation.parent
+        has_class = torch.zeros(len(grammar.kinds) + 1, dtype=torch.bool)
+        has_class[[grammar.kind(name) for name in classes]] = True
+        while True:
+            above = parent.clamp(min=0)
+            hidden = (parent >= 0) & ~has_class[kind.gather(1, above)]
+            if not hidden.any():
+                break
+            parent = torch.where(hidden, parent.gather(1, above), parent)
+        there = has_class[kind]
+        order = (~there).long().argsort(dim=1, stable=True)
+        place = order.argsort(1)
+        slot = order[:, : max(1, int(there.sum(1).max()) if len(kind) else 1)]
+        mapped = torch.where(parent >= 0, place.gather(1, parent.clamp(min=0)), -1)
+        seen = there.gather(1, slot)
+        return Seen(kind.gather(1, slot).where(seen, -1), mapped.gather(1, slot).where(seen, -1), slot, place)
+
+    def taken(self, values: Tensor) -> Tensor:
+        """``(N, M', ...)`` of values of the derivation's nodes ``(N, M, ...)``."""
+        index = self.slot.view(*self.slot.shape, *(1,) * (values.ndim - 2)).expand(-1, -1, *values.shape[2:])
+        return values.gather(1, index)
+
+    def put(self, values: Tensor, others: Tensor) -> Tensor:
+        """``(N, M)`` of values ``(N, M')``; ``others (N, M)`` where a node has no class."""
+        at = self.place.clamp(max=values.shape[1] - 1)
+        back = values.gather(1, at)
+        there = (self.place < values.shape[1]) & (self.kind.gather(1, at) >= 0)
+        return back.where(there, others)
+
+
+class ParameterNet(nn.Module):
+    """Mixtures for the sites of nodes and of scenes.
+
+    Args:
+        kinds: how many the grammar has.
+        node_sites, scene_sites: S and G, those that are learnt.
+        hidden: H.
+        components: of each mixture.
+    """
+
+    def __init__(self, kinds: int, node_sites: int, scene_sites: int, hidden: int = 64, components: int = COMPONENTS):
+        super().__init__()
+        self.kinds, self.node_sites, self.scene_sites = kinds, node_sites, scene_sites
+        S, G, K = node_sites, scene_sites, 3 * components
+        self.of_kind = nn.Embedding(kinds + 1, hidden)
+        self.of_site = nn.Embedding(max(S, 1), hidden)
+        self.of_rank, self.of_number = nn.Embedding(MOST + 1, hidden), nn.Embedding(MOST + 1, hidden)
+        self.of_scene = nn.Linear(kinds + 3 * G, hidden)
+        self.of_place = nn.Linear(6, hidden)
+        self.of_values = nn.Linear(9 * S, hidden)
+        self.read = nn.Linear(hidden + 3 * S, hidden)
+        self.cell = nn.GRU(hidden, hidden, batch_first=True)
+        self.join = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
+        self.out = nn.ModuleList(nn.Linear(hidden, K) for _ in range(S))
+        self.scene_join = nn.ModuleList(nn.Sequential(nn.Linear(hidden, hidden), nn.SiLU()) for _ in range(G))
+        self.scene_out = nn.ModuleList(nn.Linear(hidden, K) for _ in range(G))
+        for layer in (*self.out, *self.scene_out):
+            weight, bias = cast(nn.Linear, layer).weight, cast(nn.Linear, layer).bias
+            nn.init.zeros_(weight)
+            nn.init.zeros_(bias)
+            with torch.no_grad():
+                bias[components : 2 * components] = SMALL * torch.linspace(-1, 1, components)
+
+    def scene_mixture(self, graph: Graph, scene: Tensor, g: int) -> LogisticMixture:
+        """Of the scenes' site number ``g``, ``(N, 1)``, given those before it.
+
+        Args:
+            scene: ``(N, G)`` u, NaN where they are not known.
+        """
+        known = scene.where(torch.arange(self.scene_sites) < g, torch.nan)
+        return LogisticMixture.of(self.scene_out[g](self.scene_join[g](F.silu(self._scene(graph, known)))).unsqueeze(1))
+
+    def node_mixture(self, graph: Graph, scene: Tensor, values: Tensor, s: int) -> LogisticMixture:
+        """Of the nodes' site number ``s``, ``(N, M)``, given all before it.
+
+        Args:
+            scene: ``(N, G)`` u, NaN where they are not known.
+            values: ``(N, M, S)`` u, NaN where there are none; those of later sites are not looked at.
+        """
+        known = values.where(torch.arange(self.node_sites) <= s, torch.nan)
+        states, _ = self.cell(self._entering(graph, known, s))
+        memory = F.pad(states, (0, 0, 1, 0))[:, :-1]
+        own = known.where(torch.arange(self.node_sites) < s, torch.nan)
+        around = [own, _gathered(known, graph.parent), _gathered(known, graph.before)]
+        return self._mixture(self._place(graph, scene, s), torch.cat([_code(x) for x in around], -1), memory, s)
+
+    def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
+        """u of the nodes' site number ``s``, ``(N, M)``, at the quantiles ``v (N, M)``, one node after the other.
+
+        Args:
+            scene, values: as of ``node_mixture``, without site ``s``.
+            has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
+        """
+        N, M = v.shape
+        earlier = torch.arange(self.node_sites) < s
+        rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
+        place, memory, found = self._place(graph, scene, s), torch.zeros(N, self.cell.hidden_size), []
+        w: Any = self.cell  # torch names its weights as it makes them
+        for m in range(M):
+            around = [columns[m]]
+            for index in (graph.parent[:, m], graph.before[:, m]):
+                table = torch.stack(columns[: m + 1], 1)  # parents and siblings before come earlier
+                around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
+            code = torch.cat([_code(x) for x in around], -1)
+            u = self._mixture(place[:, m], code, memory, s).icdf(v[:, m])
+            found.append(u.where(has[:, m], v[:, m]))
+            at_s = torch.arange(self.node_sites) == s
+            columns[m] = torch.where(at_s, u.where(has[:, m], torch.nan)[:, None], columns[m])
+            x = self._entering_one(graph.kind[:, m], columns[m], s)
+            memory = torch.gru_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
+        return torch.stack(found, 1)
+
+    def _mixture(self, place: Tensor, code: Tensor, memory: Tensor, s: int) -> LogisticMixture:
+        x = torch.cat([place + self.of_values(code), memory], -1)
+        return LogisticMixture.of(self.out[s](self.join(F.silu(x))))
+
+    def _entering(self, graph: Graph, known: Tensor, s: int) -> Tensor:
+        return self._entering_one(graph.kind, known, s)
+
+    def _entering_one(self, kind: Tensor, known: Tensor, s: int) -> Tensor:
+        x = torch.cat([self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s], _code(known)], -1)
+        return F.silu(self.read(x))
+
+    def _place(self, graph: Graph, scene: Tensor, s: int) -> Tensor:
+        """``(N, M, H)``, what does not change from node to node."""
+        rank, number = (x.clamp(max=MOST) for x in (graph.rank, graph.number))
+        ranks = [graph.rank, graph.same_rank]
+        numbers = [graph.number.clamp(min=1), graph.same_number.clamp(min=1)]
+        part = [(r + 0.5) / n for r, n in zip(ranks, numbers, strict=True)] + [1 / n for n in numbers]
+        part += [1.0 * (graph.rank == 0), 1.0 * (graph.rank == graph.number - 1)]
+        return (
+            self.of_kind(graph.kind.remainder(self.kinds + 1))
+            + self.of_site.weight[s]
+            + self.of_rank(rank)
+            + self.of_number(number)
+            + self.of_place(torch.stack(part, -1))
+            + self._scene(graph, scene).unsqueeze(1)
+        )
+
+    def _scene(self, graph: Graph, scene: Tensor) -> Tensor:
+        counts = F.one_hot(graph.kind.remainder(self.kinds + 1), self.kinds + 1).sum(1)[:, : self.kinds]
+        return self.of_scene(torch.cat([counts.float().log1p(), _code(scene)], -1))
+
+
+def _code(u: Tensor) -> Tensor:
+    """``(..., 3 S)`` of u ``(..., S)``: whether it is known, and it, on both scales."""
+    there = ~u.isnan()
+    u = u.nan_to_num(0.5)
+    return torch.cat([there.float(), 2 * u - 1, u.clamp(1e-4, 1 - 1e-4).logit() / LOGITS], -1)
+
+
+def _gathered(values: Tensor, index: Tensor) -> Tensor:
+    """Entries ``(N, M, S)`` of ``values`` at nodes ``index (N, M)``; NaN for -1."""
+    at = index.clamp(min=0).unsqueeze(-1).expand(-1, -1, values.shape[2])
+    return values.gather(1, at).where((index >= 0).unsqueeze(-1), torch.nan)

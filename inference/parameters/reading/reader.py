@@ -1,0 +1,190 @@
+"""The reader: what stands where in an image, and with which values of its sites.
+
+A small network looks at the whole image and says of every cell which class has its middle there, where that object's
+parent is, and the u of each of its sites (``sites``): a normal distribution, cut off at 0 and 1, and, as some sites
+turn in a circle, where u = 0 and u = 1 look alike, the cosine and sine of one and of two turns of u. Cells see where
+they are, so that a place is read like any other site. Sites of the whole scene are read from all cells together. Axis
+letters: N images, C classes, S sites of nodes, G sites of scenes, h w cells.
+
+References:
+    [1] Seitzer et al., *On the pitfalls of heteroscedastic uncertainty estimation with probabilistic neural networks*,
+        ICLR 2022.
+"""
+
+import copy
+import math
+from typing import NamedTuple, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ...features.base import enter
+from ...features.counting.net import CountNet, conv
+
+STRIDE = 4  # pixels of a reduced image a cell
+WIDTH = 64  # channels
+HIDDEN = 96
+LEAST_MASS = 0.4  # of an object's unit, in four cells
+MOST = 200  # objects in an image
+LOG_SD = -6.0, 0.5  # of u, least and largest
+HARMONICS = 4  # cosine and sine of one turn, and of two
+
+
+class Found(NamedTuple):
+    """Objects found in N images, K of them in all, image by image.
+
+    Attributes:
+        image: ``(K,)`` int64 which image.
+        label: ``(K,)`` int64 class.
+        centre, parent: ``(K, 2)`` x and y of its middle, and of its parent's, pixels.
+        raw: ``(K, S, 2 + HARMONICS)`` what the network says of u.
+        scene: ``(N, G, 2 + HARMONICS)`` of the scenes' sites.
+    """
+
+    image: Tensor
+    label: Tensor
+    centre: Tensor
+    parent: Tensor
+    raw: Tensor
+    scene: Tensor
+
+
+class Reader(nn.Module):
+    """On a copy of a count network's convolutions, which know the classes.
+
+    Args:
+        counts: a trained count network.
+        classes, sites, scene_sites: C, S and G.
+    """
+
+    def __init__(self, counts: CountNet, classes: int, sites: int, scene_sites: int):
+        super().__init__()
+        self.classes, self.sites, self.scene_sites = classes, sites, scene_sites
+        self.channels, self.reduce = counts.channels, counts.reduce
+        fine, coarse, (b, c) = counts.stages()
+        self.fine, self.coarse = copy.deepcopy(fine), copy.deepcopy(coarse)
+        self.side, self.down = nn.Conv2d(b, WIDTH, 1, bias=False), nn.Conv2d(c, WIDTH, 1, bias=False)
+        self.both = nn.Sequential(nn.BatchNorm2d(WIDTH), nn.ReLU(inplace=True), *conv(WIDTH, WIDTH, 3, 1))
+        self.what = nn.Conv2d(WIDTH, 1 + classes, 1)
+        self.hidden = nn.Conv2d(WIDTH + 2, HIDDEN, 1)
+        self.values = nn.Conv2d(HIDDEN, 2 + sites * (2 + HARMONICS), 1)
+        self.overall = nn.Sequential(
+            nn.Linear(2 * WIDTH, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, scene_sites * (2 + HARMONICS))
+        )
+        with torch.no_grad():  # nearly every cell holds nothing
+            self.what.weight.mul_(0.3)
+            bias = cast(Tensor, self.what.bias)
+            bias.zero_()
+            bias[0] = 3.0
+
+    def enter(self, images: Tensor) -> Tensor:
+        """Reduced images, padded to whole cells."""
+        x = enter(images, self.channels, self.reduce)
+        return F.pad(x, (0, -x.shape[-1] % (2 * STRIDE), 0, -x.shape[-2] % (2 * STRIDE)))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of reduced images: logits ``(N, 1 + C, h, w)``; how many cells away an object's parent is ``(N, 2, h, w)``;
+        what is said of u of nodes ``(N, S, 2 + HARMONICS, h, w)`` and of scenes ``(N, G, 2 + HARMONICS)``."""
+        fine = self.fine(x.contiguous(memory_format=torch.channels_last))
+        coarse = F.interpolate(self.down(self.coarse(fine)), scale_factor=2, mode="nearest")
+        seen = self.both(self.side(fine) + coarse)
+        h, w = seen.shape[-2:]
+        y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+        place = torch.stack([x, y]).expand(len(seen), 2, h, w)
+        hidden = F.relu(self.hidden(torch.cat([seen, place], 1)))
+        parent, values = self.values(hidden).tensor_split([2], 1)
+        overall = self.overall(torch.cat([seen.mean((2, 3)), seen.amax((2, 3))], 1))
+        shapes = (self.sites, 2 + HARMONICS), (self.scene_sites, 2 + HARMONICS)
+        return self.what(seen), parent, values.unflatten(1, shapes[0]), overall.unflatten(1, shapes[1])
+
+    @torch.no_grad()
+    def find(self, images: Tensor) -> Found:
+        """Objects in ``(N, 1 or 3, H, W)`` uint8 images."""
+        parts = [self._find(some, i * 64) for i, some in enumerate(images.split(64))]
+        return Found(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+    def _find(self, images: Tensor, first: int) -> Found:
+        logits, parent, values, overall = self(self.enter(images))
+        mass = logits.softmax(1)[:, 1:]
+        n, y, x = blocks(mass.sum(1))
+        rows, columns = torch.stack([y, y, y + 1, y + 1], 1), torch.stack([x, x + 1, x, x + 1], 1)  # (K, 4)
+        image = n[:, None].expand(-1, 4)
+        label = mass[image, :, rows, columns].sum(1).argmax(1)
+        share = mass[image, label[:, None], rows, columns]
+        share = (share / share.sum(1, keepdim=True).clamp(min=1e-6)).unsqueeze(-1)  # of what each of the cells says
+        here = torch.stack([columns, rows], -1) + 0.5
+        scale = STRIDE * self.reduce
+        return Found(
+            n + first,
+            label,
+            scale * (share * here).sum(1),
+            scale * (share * (here + parent[image, :, rows, columns])).sum(1),
+            (share.unsqueeze(-1) * values[image, :, :, rows, columns]).sum(1),
+            overall,
+        )
+
+
+def blocks(mass: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Image, row and column of the first cell ``(K,)`` of blocks of 2 x 2 cells that hold an object each, image by
+    image: the fullest first, without the cells that were taken before.
+
+    Args:
+        mass: ``(N, h, w)`` how much of an object is in each cell; an object has its unit in four cells.
+    """
+    N, h, w = mass.shape
+    left, found = mass.clone(), []
+    for _ in range(MOST):
+        inside = 4 * F.avg_pool2d(left.unsqueeze(1), 2, 1).flatten(1)
+        most, at = inside.max(1)
+        there = most > LEAST_MASS
+        if not there.any():
+            break
+        n, y, x = there.nonzero().flatten(), at[there] // (w - 1), at[there] % (w - 1)
+        found.append((n, y, x))
+        for i in (0, 1):
+            for j in (0, 1):
+                left[n, y + i, x + j] = 0.0
+    n, y, x = (torch.cat(part) for part in zip(*found, strict=True)) if found else torch.zeros(3, 0, dtype=torch.int64)
+    order = n.argsort(stable=True)
+    return n[order], y[order], x[order]
+
+
+def value_loss(said: Tensor, u: Tensor) -> Tensor:
+    """``(...)`` of what is said of u, ``(..., 2 + HARMONICS)``: the negative log density of the normal distribution,
+    times its standard deviation without gradient [1], and the squared errors of the circles. Without the factor the
+    gradient of a site that is read sharply, a place, would be all that shared weights follow."""
+    mean, sd = normal(said)
+    z, whole = (u - mean) / sd, _phi((1 - mean) / sd) - _phi(-mean / sd)
+    nats = 0.5 * z.square().clamp(max=50.0) + sd.log() + whole.clamp(min=1e-6).log()
+    return 2 * sd.detach() * nats + (said[..., 2:] - circles(u)).square().sum(-1)
+
+
+def normal(said: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation ``(...)`` of the normal distribution, before it is cut off."""
+    return said[..., 0].clamp(-1.0, 2.0), said[..., 1].clamp(*LOG_SD).exp()
+
+
+def cut_mean(mean: Tensor, sd: Tensor) -> Tensor:
+    """The mean of a normal distribution that is cut off at 0 and 1."""
+    low, high = -mean / sd, (1 - mean) / sd
+    whole = (_phi(high) - _phi(low)).clamp(min=1e-6)
+    density = (-0.5 * torch.stack([low, high]).square()).exp() / math.sqrt(2 * math.pi)
+    return (mean + sd * (density[0] - density[1]) / whole).clamp(0, 1)
+
+
+def cut_draw(mean: Tensor, sd: Tensor, v: Tensor) -> Tensor:
+    """Its quantiles at ``v``."""
+    low, high = _phi(-mean / sd), _phi((1 - mean) / sd)
+    at = (low + v * (high - low)).clamp(1e-6, 1 - 1e-6)
+    return (mean + sd * math.sqrt(2) * torch.erfinv(2 * at - 1)).clamp(0, 1)
+
+
+def _phi(z: Tensor) -> Tensor:
+    return 0.5 * (1 + torch.erf(z / math.sqrt(2)))
+
+
+def circles(u: Tensor) -> Tensor:
+    """``(..., HARMONICS)`` cosine and sine of one turn and of two."""
+    turn = 2 * math.pi * u
+    return torch.stack([turn.cos(), turn.sin(), (2 * turn).cos(), (2 * turn).sin()], -1)

@@ -1,0 +1,99 @@
+"""Which sites can be read, and how: tried on renders of the prior that nothing was trained on.
+
+A site is read on a line, on a circle, where u = 0 and u = 1 look alike, or on a circle that u goes round twice, where
+two values look alike. Skill is the share of the variance of u that a reading explains. Axis letters: K objects, S
+sites.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .reader import cut_mean, normal
+
+LINE, CIRCLE, TWICE = range(3)
+READABLE = 0.2  # least skill of a site that is learnt
+CLEARLY = 0.05, 0.15  # by how much a circle, and one gone round twice, must explain more than what is simpler
+LEAST_SD = 2e-3
+
+
+class Skill(NamedTuple):
+    """Of each site.
+
+    Attributes:
+        way: ``(S,)`` int64, ``LINE``, ``CIRCLE`` or ``TWICE``.
+        share: ``(S,)`` of the variance that is explained; NaN where the site was never seen.
+    """
+
+    way: Tensor
+    share: Tensor
+
+    @property
+    def turns(self) -> Tensor:
+        """``(S,)`` bool, which are read on a circle."""
+        return self.way != LINE
+
+    @property
+    def readable(self) -> Tensor:
+        """``(S,)`` bool."""
+        return self.share > READABLE
+
+    @staticmethod
+    def of(raw: Tensor, u: Tensor) -> "Skill":
+        """Of objects ``(K, S, ...)`` that the reader found, whose u ``(K, S)`` is known; NaN where there is none."""
+        ways, shares = [], []
+        for s in range(u.shape[1]):
+            there = ~u[:, s].isnan()
+            true, said = u[there, s], raw[there, s]
+            if not len(true):
+                ways.append(LINE)
+                shares.append(torch.nan)
+                continue
+            errors = (
+                cut_mean(*normal(said)) - true,
+                _apart(_turned(said, 1), true, 1.0),
+                _apart(_turned(said, 2), true, 0.5),
+            )
+            each = [1 - 12 * float(errors[0].square().mean()), 1 - 12 * float(errors[1].square().mean())]
+            each.append(1 - 48 * float(errors[2].square().mean()))
+            way = CIRCLE if each[1] > each[0] + CLEARLY[0] else LINE
+            way = TWICE if each[2] > each[way] + CLEARLY[1] else way
+            ways.append(way)
+            shares.append(each[way])
+        return Skill(torch.tensor(ways), torch.tensor(shares))
+
+    def read(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation, ``(K, S)`` each, of what a reader says of u ``(K, S, ...)``. Where two values
+        look alike, one of them by what little tells them apart, at random."""
+        mean, sd = normal(raw)
+        for s, way in enumerate(self.way.tolist()):
+            if way == CIRCLE:
+                mean[:, s] = _turned(raw[:, s], 1).remainder(1.0)
+                sd[:, s] = _spread(raw[:, s, 2:4], 1)
+            if way == TWICE:
+                half = _turned(raw[:, s], 2).remainder(0.5)
+                toward = (raw[:, s, 2:4] * _direction(half)).sum(-1)  # -1 for the other one, 1 for this
+                other = torch.rand(len(raw)) > (1 + toward.clamp(-1, 1)) / 2
+                mean[:, s], sd[:, s] = half + 0.5 * other, _spread(raw[:, s, 4:6], 2)
+        return mean, sd.clamp(min=LEAST_SD)
+
+
+def _turned(said: Tensor, times: int) -> Tensor:
+    """u by the cosine and sine of so many turns, -0.5..0.5 over ``times``."""
+    cosine, sine = said[..., 2 * times], said[..., 2 * times + 1]
+    return torch.atan2(sine, cosine) / (2 * torch.pi * times)
+
+
+def _apart(one: Tensor, other: Tensor, whole: float) -> Tensor:
+    return (one - other + whole / 2).remainder(whole) - whole / 2
+
+
+def _direction(u: Tensor) -> Tensor:
+    return torch.stack([(2 * torch.pi * u).cos(), (2 * torch.pi * u).sin()], -1)
+
+
+def _spread(vector: Tensor, times: int) -> Tensor:
+    """The standard deviation of u on a circle, of the mean of its cosine and sine."""
+    length = vector.norm(dim=-1).clamp(0.05, 0.999)
+    return (-2 * length.log()).sqrt() / (2 * torch.pi * times)

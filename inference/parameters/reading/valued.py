@@ -1,0 +1,70 @@
+"""Renders with the values of their sites: what a reader is trained on and tried on. Axis letters: N scenes, M nodes."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import Scenes, sample
+
+from ...features.base import Examples
+from ..net import Seen
+from ..sites import Site, quantiles_of, within
+from .arrangements import Arranged
+from .training import Valued
+
+Label = Callable[[Scenes], Examples]
+"""Renders scenes and labels them."""
+
+
+class ValuedRenders:
+    """Renders of a model with the u of some sites.
+
+    Args:
+        model: with its prior's parameters.
+        label: renders and labels its scenes.
+        node_sites, scene_sites: whose values are wanted.
+    """
+
+    def __init__(self, model: SceneModel, label: Label, node_sites: tuple[Site, ...], scene_sites: tuple[Site, ...]):
+        self.model, self.label, self.node_sites, self.scene_sites = model, label, node_sites, scene_sites
+
+    @torch.no_grad()
+    def draw(self, num: int, policy: Policy, drawn_by: SceneModel | None = None, arranged: float = 0.0) -> Valued:
+        """``num`` scenes of a policy.
+
+        Args:
+            drawn_by: the same model with other parameters.
+            arranged: share of the scenes whose sites of nodes are arranged, see ``Arranged``.
+        """
+        model = self.model if drawn_by is None else drawn_by
+        if arranged:
+            model = within(model, Arranged(frozenset(site.name for site in self.node_sites), arranged))
+        return self.of(sample(model, policy, num))
+
+    def of(self, scenes: Scenes) -> Valued:
+        """Of scenes of the model, whatever drew their parameters."""
+        drawn, found = self.label(scenes), quantiles_of(self.model, scenes)
+        derivation = scenes.derivation.trimmed()
+        seen = Seen.of(self.model.grammar, self.model.classes, derivation)
+        N, M = derivation.kind.shape
+
+        def nodes(part: Tensor, empty: float) -> Tensor:
+            taken = seen.taken(part[:, :M])
+            return taken.where((seen.kind >= 0).view(*seen.kind.shape, *(1,) * (taken.ndim - 2)), empty)
+
+        u = torch.stack([found[site.name] for site in self.node_sites], -1) if self.node_sites else torch.zeros(N, M, 0)
+        scene = [found[site.name] for site in self.scene_sites]
+        return Valued(
+            drawn._replace(
+                label=nodes(drawn.label, -1),
+                centre=nodes(drawn.centre, 0.0),
+                size=nodes(drawn.size, 0.0),
+                visible=nodes(drawn.visible, 0.0),
+            ),
+            seen.parent,
+            nodes(u, torch.nan),
+            torch.cat(scene, 1) if scene else torch.zeros(N, 0),
+        )

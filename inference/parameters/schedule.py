@@ -1,0 +1,28 @@
+"""How long and how parameters are learnt."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ParameterSchedule:
+    """The defaults were chosen on Multi-MNIST.
+
+    Args:
+        reader_steps: of the reader's first training, on renders of the prior.
+        steps: of maximum likelihood on what is read first.
+        rounds: of training the reader further on the guide's own renders, reading again and learning again.
+        round_reader_steps, round_steps: of each.
+        images: of the target, at most, that are read.
+        reader_images: renders a step of the reader.
+        reader_rate, rate: largest learning rates.
+    """
+
+    reader_steps: int = 600
+    steps: int = 500
+    rounds: int = 2
+    round_reader_steps: int = 250
+    round_steps: int = 300
+    images: int = 1000
+    reader_images: int = 12
+    reader_rate: float = 4e-3
+    rate: float = 5e-3

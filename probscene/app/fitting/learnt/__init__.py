@@ -1,0 +1,1 @@
+"""What a fit leaves behind: parameters, and the guide or the prior."""

@@ -1,0 +1,172 @@
+"""The stage of a fit that learns parameters, and what a run keeps of it.
+
+``parameters.json`` says of each site whether it is learnt, and why not. The learnt network is kept with the guide, so
+that one digest is of both. Axis letters: L images, C H W.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from probscene.dataset import Images
+from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.counting.net import CountNet
+from probscene.inference.guides.base import Guide
+from probscene.inference.judging.farther import farther
+from probscene.inference.parameters.guide import ParameterGuide
+from probscene.inference.parameters.learning import ParameterLearning
+from probscene.inference.parameters.sites import Site
+from probscene.inference.training import Training, batch_seed
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import sample, seed_everything
+
+from ...progress import Progress
+from ..observer import RENDERED_AT_ONCE, Observer
+from ..parts import inner
+from ..storage import Keeper
+
+if TYPE_CHECKING:
+    from ..run import RunFolder
+
+NAME = "parameters"  # of the file with the record, and before the names of tensors beside a guide's
+HELD = 5  # one image of the target in so many is not learnt from, and judges
+JUDGED = 200  # images of each side, at most
+
+
+def learn_parameters(
+    run: "RunFolder",
+    observer: Observer,
+    net: FeatureNet,
+    guide: Guide,
+    images: Callable[[], Images],
+    progress: Progress,
+    say: Callable[[str], None],
+) -> None:
+    """Learn the parameters of the model's sites; from now on the guide's scenes have them, where they are kept.
+
+    Args:
+        net: what structure was learnt by.
+        guide: of the structures; its scenes are rendered.
+        images: opens the target.
+        say: is told which sites were learnt.
+
+    Raises:
+        ProbsceneError: a loss is no longer finite.
+    """
+    counts = inner(net)
+    if not isinstance(counts, CountNet):
+        say(f"Where things stand and how they look keeps the prior: {run.features.name} features do not read it yet.")
+        return
+    kept = run.read_tensors(NAME)
+    if kept is None:
+        target = images()
+        held = torch.arange(len(target)) % HELD == HELD - 1
+        learning = ParameterLearning(
+            run.model,
+            guide,
+            counts,
+            observer.labelled,
+            lambda: _some(target, ~held, run.preset.parameters.images),
+            run.preset.parameters,
+            batch_seed(run.record["seed"], 5),
+        )
+        keep = Keeper(run, NAME, learning)
+
+        def each(training: Training, line: dict[str, float]) -> None:
+            keep({"stage": NAME, "step": training.done, **line})
+            progress(NAME, training.done, training.total, f"loss {line['loss']:.3f}")
+
+        learning.run(each)
+        keep.finish()
+        kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
+        run.write_parameters(_record(learning) | _judged(run, guide, learning.guide, _some(target, held, JUDGED)))
+        run.write_tensors(NAME, kept)
+        (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
+    say(_said(run.parameters))
+    with_parameters(run, guide, beside(kept))
+
+
+def beside(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors of learnt parameters under the names that they have beside a guide's."""
+    return {f"{NAME}.{key}": value for key, value in tensors.items()}
+
+
+def apart(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """A guide's own tensors, and those of parameters beside them."""
+    own = {key: value for key, value in tensors.items() if not key.startswith(f"{NAME}.")}
+    return own, {key: value for key, value in tensors.items() if key not in own}
+
+
+def with_parameters(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> Policy:
+    """A policy whose scenes have the run's learnt parameters, in place; as it is where none are kept."""
+    record = run.parameters
+    if not tensors or record.get("kept") != "learnt":
+        return policy
+    sites = tuple(Site(name, tuple(found["kinds"])) for name, found in record["sites"].items() if found["learnt"])
+    guide = ParameterGuide(run.model, sites, policy)
+    guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
+    policy.suits = guide.eval().suited
+    return policy
+
+
+def _some(images: Images, which: Tensor, most: int) -> Tensor:
+    """At most so many of the chosen images, evenly spread, ``(L, C, H, W)`` uint8."""
+    rows = which.nonzero().flatten()
+    rows = rows[torch.linspace(0, len(rows) - 1, min(most, len(rows))).round().long()]
+    return torch.stack([images.load(row) for row in rows.tolist()])
+
+
+def _record(learning: ParameterLearning) -> dict[str, Any]:
+    """For JSON."""
+    assert learning.skill is not None
+    shares = learning.skill.share.tolist()
+    skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
+    sites = {}
+    for site in learning.sites:
+        share, is_learnt = skill.get(site, torch.nan), site in learning.learnt
+        because = site.keeps or ("" if is_learnt else "it cannot be read in renders")
+        known = share if share == share else None
+        sites[site.name] = {"kinds": site.kinds, "learnt": is_learnt, "skill": known, "because": because}
+    return {"sites": sites}
+
+
+def _judged(run: "RunFolder", guide: Guide, learnt: ParameterGuide | None, held: Tensor) -> dict[str, Any]:
+    """Whether learnt parameters come nearer to images that nothing was learnt from than the prior's, by EfficientNet's
+    pooled features."""
+    if learnt is None or not learnt.sites:
+        return {"kept": "prior"}
+    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
+
+    look = EfficientNetLite().embed
+    found = []
+    for i, model in enumerate((learnt.suited(run.model), run.model)):
+        seed_everything(batch_seed(run.record["seed"], 6, i))
+        found.append(torch.cat([look(images) for images in _renders(run, model, guide, len(held))]).double().numpy())
+    distances = farther(found[0], found[1], look(held).double().numpy())
+    kept = "learnt" if distances.one < distances.other else "prior"
+    return {"kept": kept, "learnt": distances.one, "prior": distances.other}
+
+
+def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> list[Tensor]:
+    observer = Observer(model, run.record["threads"])
+    starts = range(0, number, RENDERED_AT_ONCE)
+    return [observer.labelled(sample(model, guide, min(RENDERED_AT_ONCE, number - i))).image for i in starts]
+
+
+def _said(record: dict[str, Any]) -> str:
+    sites = record["sites"]
+    learnt = ", ".join(f"{name} ({found['skill']:.2f})" for name, found in sites.items() if found["learnt"])
+    others = ", ".join(name for name, found in sites.items() if not found["learnt"])
+    if not learnt:
+        return "No site can be read in renders, so where things stand and how they look keeps the prior."
+    said = f"Sites that are learnt, with the share of their variance that is read: {learnt}."
+    said += f" Keeping the prior: {others}." if others else ""
+    if record["kept"] != "learnt":
+        said += (
+            f" All keep the prior, as learnt scenes are farther from held-out images, {record['learnt']:.2f} against "
+            f"{record['prior']:.2f} in energy distance."
+        )
+    return said
