@@ -3,6 +3,7 @@
 Axis letters: N scenes, T steps, K rules, V nonterminals.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,6 +13,7 @@ from .derivation import Derivation, Frontier
 from .grammar import Grammar
 
 if TYPE_CHECKING:
+    from .model import SceneModel
     from .support import Support
 
 MASKED = -1e9  # finite, so that a masked logit has no gradient that is NaN
@@ -24,10 +26,12 @@ class Policy:
 
     Attributes:
         support: the rules that it may take, masked like illegal ones; all legal ones where None.
+        suits: the model that draws its structures, of a model, such as one with learnt parameters; the same where None.
     """
 
     grammar: Grammar
     support: "Support | None" = None
+    suits: "Callable[[SceneModel], SceneModel] | None" = None
 
     def start(self, num_scenes: int) -> Any:
         """The memory before the first step."""

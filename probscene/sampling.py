@@ -47,14 +47,15 @@ class Scenes:
 
 
 def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
-    """Scenes with complete structures from ``policy`` and parameters from the model's program.
+    """Scenes with complete structures from ``policy`` and parameters from the model's program, or from that of
+    ``policy.suits``.
 
     Raises:
         SamplingError: the policy hardly ever ends within the model's ``max_steps``.
         ModelError: see ``run_program``.
     """
     derivation, failures = derive_complete(model.grammar, policy, num_scenes, model.max_steps)
-    return run_program(model, derivation, failures=failures)
+    return run_program(model if policy.suits is None else policy.suits(model), derivation, failures=failures)
 
 
 def run_program(

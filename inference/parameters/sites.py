@@ -106,8 +106,9 @@ def find_sites(model: SceneModel) -> tuple[Site, ...]:
         elif value.shape[1] == 1 and not _masked_as_nodes(mask, kind):
             found.append(Site(name, ()))
         elif mask.shape == kind.shape:
-            with_it = kind[mask & (kind >= 0)].unique().tolist()
-            found.append(Site(name, tuple(model.grammar.kinds[k] for k in with_it)))
+            with_it = [model.grammar.kinds[k] for k in kind[mask & (kind >= 0)].unique().tolist()]
+            seen = any(name in model.classes for name in with_it)
+            found.append(Site(name, tuple(with_it), "" if seen else "it belongs to no node that has a class"))
         else:
             found.append(Site(name, (), "it belongs to no node of the scene"))
     return tuple(found)

@@ -32,6 +32,7 @@ STAGES = {
     "target": ("Target's features", "images"),
     "pretraining": ("Pretraining", "epochs"),
     "structure": ("Structure", "batches"),
+    "parameters": ("Parameters", "steps"),
     "outcome": ("Outcome", "scenes"),
     "drawing": ("Drawing a target", "images"),
     "generating": ("Generating", "images"),

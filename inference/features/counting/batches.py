@@ -203,7 +203,7 @@ def cells(centre: Tensor, label: Tensor, classes: int, height: int, width: int) 
     holds at most one between them.
     """
     mass = torch.zeros(len(label), classes, height, width)
-    for n, m, y, x, share in _shares(centre, label, height, width):
+    for n, m, y, x, share in shares(centre, label, height, width):
         mass.index_put_((n, label[n, m], y, x), share, accumulate=True)
     mass = mass / mass.sum(1, keepdim=True).clamp(min=1.0)
     return torch.cat([1 - mass.sum(1, keepdim=True), mass], 1)
@@ -221,14 +221,14 @@ def object_targets(
         axis: 0 for x, 1 for y.
     """
     mass, pull = torch.zeros(len(label), height, width), torch.zeros(len(label), height, width)
-    for n, m, y, x, share in _shares(centre, label, height, width):
+    for n, m, y, x, share in shares(centre, label, height, width):
         mass.index_put_((n, y, x), share, accumulate=True)
         away = middle[n, m] - ((x, y)[axis] + 0.5) * STRIDE
         pull.index_put_((n, y, x), share * away, accumulate=True)
     return mass, pull / mass.clamp(min=1e-6) / STRIDE
 
 
-def _shares(centre: Tensor, label: Tensor, height: int, width: int) -> Iterator[tuple[Tensor, ...]]:
+def shares(centre: Tensor, label: Tensor, height: int, width: int) -> Iterator[tuple[Tensor, ...]]:
     """The objects' shares of the four cells around their centres: image, node, row, column and share, each ``(S,)``."""
     at = centre / STRIDE - 0.5
     low = at.floor()

@@ -69,11 +69,11 @@ class CountNet(nn.Module):
         self.register_buffer("reduction", torch.tensor(reduction))
         a, b, c = width
         self.body = nn.Sequential(
-            *_conv(channels, a, 5, 2),
-            *_conv(a, b, 3, 2),
-            *(_Residual(b) for _ in range(blocks[0])),
-            *_conv(b, c, 3, 2),
-            *(_Residual(c) for _ in range(blocks[1])),
+            *conv(channels, a, 5, 2),
+            *conv(a, b, 3, 2),
+            *(Residual(b) for _ in range(blocks[0])),
+            *conv(b, c, 3, 2),
+            *(Residual(c) for _ in range(blocks[1])),
             nn.Conv2d(c, 1 + len(self.objects) + (0 if groups is None else 3), 1),
         )
         self.register_buffer("group_cells", torch.ones(()))  # cells that an ordinary group covers
@@ -89,6 +89,14 @@ class CountNet(nn.Module):
     def reduce(self) -> int:
         """By how much images are reduced."""
         return int(self.reduction)
+
+    def stages(self) -> tuple[nn.Sequential, nn.Sequential, tuple[int, int]]:
+        """Its convolutions to stride 4 and from there to stride 8, and how many channels each gives."""
+        parts = list(self.body)[:-1]
+        second = [i for i, part in enumerate(parts) if isinstance(part, nn.Conv2d)][2]
+        fine, coarse = parts[:second], parts[second:]
+        between = cast(nn.Conv2d, parts[second])
+        return nn.Sequential(*fine), nn.Sequential(*coarse), (between.in_channels, between.out_channels)
 
     def fit_to(self, size: float) -> None:
         """Reduce images so much less that objects of ``size`` pixels keep 6: below that too many share a cell."""
@@ -160,15 +168,15 @@ def _halve(x: Tensor, weight: Tensor) -> Tensor:
     return F.conv2d(blocks, F.pixel_unshuffle(F.pad(weight, (0, 1, 0, 1)), 2), padding=1)
 
 
-def _conv(inner: int, outer: int, size: int, stride: int) -> list[nn.Module]:
+def conv(inner: int, outer: int, size: int, stride: int) -> list[nn.Module]:
     convolution = nn.Conv2d(inner, outer, size, stride, size // 2, bias=False)
     return [convolution, nn.BatchNorm2d(outer), nn.ReLU(inplace=True)]
 
 
-class _Residual(nn.Module):
+class Residual(nn.Module):
     def __init__(self, width: int):
         super().__init__()
-        self.a, self.b = nn.Sequential(*_conv(width, width, 3, 1)), nn.Sequential(*_conv(width, width, 3, 1)[:2])
+        self.a, self.b = nn.Sequential(*conv(width, width, 3, 1)), nn.Sequential(*conv(width, width, 3, 1)[:2])
         nn.init.zeros_(cast(nn.BatchNorm2d, self.b[1]).weight)
 
     def forward(self, x: Tensor) -> Tensor:

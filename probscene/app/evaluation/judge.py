@@ -25,8 +25,8 @@ from probscene.threads import threads
 
 from ..chunks import CHUNK, chunk_randomness
 from ..fitting.fit import Progress
+from ..fitting.learnt.outcome import compared
 from ..fitting.observer import Observer
-from ..fitting.outcome import compared
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..pictures import Pixels, pixels, shrunk

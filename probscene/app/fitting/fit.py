@@ -31,8 +31,9 @@ from ..files import write_text
 from ..labelling.few import FewLabels, PartlyLabelled
 from ..progress import Progress
 from .cache import NetworkCache
+from .learnt.outcome import compared, conclude, give_up
+from .learnt.parameters import learn_parameters
 from .observer import RENDERED_AT_ONCE, Observer
-from .outcome import compared, conclude, give_up
 from .parts import inner
 from .run import RunFolder
 from .scene_features import fingerprint
@@ -80,6 +81,9 @@ def fit(
             said = give_up(run)
         else:
             guide = _learn(run, observer, net.net, real, progress)
+            if "parameters" in run.preset.learn:
+                with threads(run.record["threads"]):
+                    learn_parameters(run, observer, net.net, guide, images, progress, say or (lambda text: None))
             said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
     (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
     if said and say is not None:

@@ -40,21 +40,17 @@ class Observer:
 
     def draw(self, num: int) -> Examples:
         """``num`` labelled renders of the prior."""
-        return self._labelled(sample(self.model, self.model.prior, num))
+        return self.labelled(sample(self.model, self.model.prior, num))
 
     def draw_twice(self, num: int) -> Examples:
         """Labelled renders of ``num`` structures of the policy that guides are pretrained on, and as many more of the
         same structures, their parameters anew."""
         scenes = sample(self.model, self.model.pretraining_policy, num)
-        both = self._labelled(scenes), self._labelled(run_program(self.model, scenes.derivation))
+        both = self.labelled(scenes), self.labelled(run_program(self.model, scenes.derivation))
         return Examples(*(torch.cat(parts) for parts in zip(*both, strict=True)))
 
-    def embed_twice(self, num: int, net: FeatureNet) -> tuple[Tensor, Tensor]:
-        """Features, two times ``(num, D)``, of ``num`` structures of that policy and of the same drawn anew."""
-        observe, scenes = self.observe(net), sample(self.model, self.model.pretraining_policy, num)
-        return observe(scenes), observe(run_program(self.model, scenes.derivation))
-
-    def _labelled(self, scenes: Scenes, rows: slice = slice(None)) -> Examples:
+    def labelled(self, scenes: Scenes, rows: slice = slice(None)) -> Examples:
+        """Some of the scenes, rendered, with their labels."""
         groups, grammar = self.model.groups, self.model.grammar
         group, along = None, "y"
         if groups is not None:
@@ -63,6 +59,11 @@ class Observer:
             along = groups.along
         drawn = examples(self.render(scenes.drawing[rows]), self.classes, group, along)
         return drawn._replace(image=self._as_read(drawn.image))
+
+    def embed_twice(self, num: int, net: FeatureNet) -> tuple[Tensor, Tensor]:
+        """Features, two times ``(num, D)``, of ``num`` structures of that policy and of the same drawn anew."""
+        observe, scenes = self.observe(net), sample(self.model, self.model.pretraining_policy, num)
+        return observe(scenes), observe(run_program(self.model, scenes.derivation))
 
     def object_size(self, num: int = 64) -> float:
         """How small objects are in the prior's renders, pixels: a tenth of those that can be seen have boxes of less
@@ -87,7 +88,7 @@ class Observer:
             with threads(self.threads):
                 starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
                 if embed_drawn is not None:
-                    parts = (self._labelled(scenes, slice(i, i + RENDERED_AT_ONCE)) for i in starts)
+                    parts = (self.labelled(scenes, slice(i, i + RENDERED_AT_ONCE)) for i in starts)
                     return torch.cat([embed_drawn(some) for some in parts])
                 images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
                 return torch.cat([net.embed(self._as_read(some)) for some in images])

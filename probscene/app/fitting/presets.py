@@ -13,12 +13,14 @@ from probscene.inference.features.photographs.choices import COUNT_ON_PRETRAINED
 from probscene.inference.features.presence import PresenceFeatures
 from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.guides.lstm import GUIDES
+from probscene.inference.parameters.schedule import ParameterSchedule
 
 from .parts import CheckedDivergence, as_divergence, as_features, is_file_part, load_part
 
 FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
 TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, "presence")  # on the prior's renders
 _RENAMED = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
+LEARNT = ("structure", "structure,parameters")
 OBJECTIVES = ("kde", "js", "witness", "mmd")
 
 
@@ -51,6 +53,8 @@ class Preset:
             that guides are pretrained on.
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
         prior_if_worse: keep the prior where what was learnt is farther from the target, beyond chance.
+        learn: ``"structure"``, or ``"structure,parameters"``, where things stand and how they look as well.
+        parameters: the schedule of the latter.
     """
 
     features: str = "count"
@@ -87,13 +91,18 @@ class Preset:
     num_latents: int = 1
     index: bool = True
     prior_if_worse: bool = True
+    learn: str = "structure"
+    parameters: ParameterSchedule = field(default_factory=ParameterSchedule)
 
     @staticmethod
     def of(record: dict[str, Any]) -> "Preset":
         """From ``dataclasses.asdict``, as a run's JSON keeps it, under the names of today or of version 0.1."""
         record = {_RENAMED.get(key, key): value for key, value in record.items()}
         whole = {key: tuple(value) if isinstance(value, list) else value for key, value in record.items()}
-        return Preset(**{**whole, "count": CountSchedule(**record["count"])})
+        nested: dict[str, Any] = {"count": CountSchedule(**record["count"])}
+        if "parameters" in record:
+            nested["parameters"] = ParameterSchedule(**record["parameters"])
+        return Preset(**{**whole, **nested})
 
     def with_objective(self, objective: str) -> "Preset":
         """This preset with another objective.

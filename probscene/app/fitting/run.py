@@ -20,6 +20,7 @@ from ..files import make_folder, write_json, write_whole
 from ..labelling.few import FewLabels
 from ..loading import BUILT_IN, lasting_reference, load_model, same_assets, split_reference
 from ..modules import file_digest
+from .learnt.parameters import apart, with_parameters
 from .parts import (
     IN_MEMORY,
     CheckedDivergence,
@@ -49,7 +50,7 @@ class RunFolder(Storage):
         path: the folder.
         record: the contents of ``run.json``.
         built: the feature network, untrained, where the fit is to begin with one that was built before.
-        few: labels of some of the target's images, where the fit is to begin with such.
+        few: labels of some of the target's images.
     """
 
     def __init__(self, path: Path, record: dict[str, Any], model: SceneModel | None = None, parts: Parts | None = None):
@@ -81,8 +82,7 @@ class RunFolder(Storage):
             RunError: the folder holds a run or other files already.
             MachineError: it cannot be written.
         """
-        path = Path(path)
-        check_free(path)
+        check_free(path := Path(path))
         if isinstance(model, SceneModel):
             reference, file, digest, loaded = f"{IN_MEMORY}{model.name}", None, None, model
         else:
@@ -264,10 +264,10 @@ class RunFolder(Storage):
             return self.model.prior
         guide = self.new_guide()
         try:
-            guide.load_state_dict(tensors)
+            guide.load_state_dict(apart(tensors)[0])
         except RuntimeError as error:
             raise RunError(f"Expected a guide for model {self.model.name} in {self.path}, actual another.") from error
-        return guide.eval()
+        return with_parameters(self, guide.eval(), apart(tensors)[1])
 
     def check_finished(self) -> None:
         """See that there is a learnt guide.

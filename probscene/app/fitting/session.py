@@ -34,7 +34,7 @@ from .scene_features import UNLIKE, unlike
 from .storage import check_free
 
 TIMING = "timing.json"
-STAGES = ("reading", "features", "readings", "target", "pretraining", "structure", "outcome")
+STAGES = ("reading", "features", "readings", "target", "pretraining", "structure", "parameters", "outcome")
 
 Target = Path | str | Sequence[Path | str] | Any
 """A folder, a list of files, an array or a dataset of images, see ``open_images``."""

@@ -32,7 +32,7 @@ from ..modules import file_digest
 from .parts import IN_MEMORY, inner
 
 FORMAT = 3  # of the run folder; another number is not read
-READINGS, OUTCOME = "readings.json", "outcome.json"
+READINGS, OUTCOME, PARAMETERS = "readings.json", "outcome.json", "parameters.json"
 SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
 KEYS = {"model", "model_sha256", "assets"}  # that every run.json has
 
@@ -107,6 +107,16 @@ class Storage:
         """Keep what ``outcome`` gives."""
         write_json(self.path / OUTCOME, found)
 
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Which sites are learnt, how well each is read, and whether the learnt parameters are kept; empty where none
+        were to be learnt."""
+        return self._read_json(PARAMETERS)
+
+    def write_parameters(self, found: dict[str, Any]) -> None:
+        """Keep what ``parameters`` gives."""
+        write_json(self.path / PARAMETERS, found)
+
     def _read_json(self, name: str) -> dict[str, Any]:
         file = self.path / name
         try:
@@ -145,7 +155,7 @@ class Keeper:
         tensors = run.read_tensors(self.name)
         if tensors is not None:
             training.restore(tensors)
-        stage = {"features": "features", "guide": "structure"}[name]
+        stage = {"guide": "structure"}.get(name, name)
         self.lines = [line for line in self.lines if not self._is_past(json.loads(line), stage)]
 
     def __call__(self, line: dict[str, float | str] | None) -> None:

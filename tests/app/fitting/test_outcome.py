@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fitting.outcome import _said, moved
+from probscene.app.fitting.learnt.outcome import _said, moved
 
 N = 500
 

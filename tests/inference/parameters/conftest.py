@@ -1,0 +1,52 @@
+"""A model with every sort of site: trays with balls in them on a floor, none of which can be seen but these two."""
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+from probscene.drawing import Sprites
+from probscene.grammar import Grammar
+from probscene.model import scene_model
+from probscene.structure import StructurePrior, counts
+
+TRAYS = Grammar("""
+    Scene -> floor(Trays)
+    Trays -> tray(Stack) Trays | ε
+    Stack -> hidden(Balls)
+    Balls -> Ball Balls | ε
+    Ball  -> red | blue
+""")
+TRAYS_PRIOR = StructurePrior(TRAYS, Trays=counts(1, 2, 2), Balls=counts(1, 1, 1, 1))
+
+
+@pytest.fixture(scope="session")
+def trays():
+    """The model; a ball's place depends on its tray's, and its shade on its size."""
+
+    @scene_model(TRAYS, TRAYS_PRIOR, canvas=(64, 64), max_steps=40, classes=("tray", "red", "blue"))
+    def trays(scene):
+        bright = pyro.sample("scene.bright", dist.Uniform(0.4, 1.0))
+        with scene.nodes("tray"):
+            x = pyro.sample("tray.x", dist.Normal(32.0, 8.0))
+            y = pyro.sample("tray.y", dist.Uniform(10.0, 54.0))
+            wood = pyro.sample("tray.wood", dist.Categorical(torch.ones(3)))
+        with scene.nodes("red", "blue"):
+            away = pyro.sample("ball.away", dist.Uniform(-8.0, 8.0))
+            size = pyro.sample("ball.size", dist.Uniform(2.0, 4.0))
+            shade = pyro.sample("ball.shade", dist.Uniform(0.3, 0.5 + size / 8))
+            pyro.sample("ball.fixed", dist.Uniform(0.0, 1.0), infer={"learn": False})
+            pyro.sample("ball.odd", dist.Beta(2.0, 2.0))
+        with scene.nodes("floor"):
+            pyro.sample("floor.turn", dist.Uniform(0.0, 1.0))
+        with pyro.plate("decoration", 3, dim=-1):
+            pyro.sample("decoration.x", dist.Uniform(0.0, 64.0))
+        at = scene.of_parent(scene.of_parent(x)), scene.of_parent(scene.of_parent(y))
+        tone = (shade * bright)[..., None] * torch.tensor([1.0, 0.4, 0.3])
+        return scene.draw(
+            Sprites.disc("tray", x, y, radius=9.0, tint=(0.2, 0.5, 0.2)),
+            Sprites.disc(("red", "blue"), at[0] + away, at[1], radius=size, tint=tone),
+            background=(0.05 + wood.sum() * 0.0, 0.05, 0.05),
+        )
+
+    return trays
