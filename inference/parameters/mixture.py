@@ -61,4 +61,5 @@ class LogisticMixture(NamedTuple):
             u = ((low + high) / 2).sigmoid().clamp(NEAR, 1 - NEAR)
         if not torch.is_grad_enabled() or not self.location.requires_grad:
             return u
-        return u - (self.cdf(u.logit()) - v) / self.log_prob(u).exp().detach()
+        below = self.cdf(u.logit())
+        return u - (below - below.detach()) / self.log_prob(u).exp().detach().clamp(min=NEAR)

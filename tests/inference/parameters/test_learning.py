@@ -1,0 +1,68 @@
+"""Parameters learnt from values, and from images."""
+
+import pytest
+import torch
+
+from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, log_density, posterior_draws
+from probscene.inference.parameters.net import Graph, ParameterNet
+
+
+def rows(number=300, sd=0.01, noise=0.0, seed=0):
+    """Three siblings each, evenly spaced in the first site, all the same in the second."""
+    torch.manual_seed(seed)
+    kind, parent = torch.zeros(number, 3, dtype=torch.int64), torch.full((number, 3), -1)
+    even = torch.tensor([0.25, 0.5, 0.75]).expand(number, 3)
+    both = torch.stack([even, torch.full((number, 3), 0.4)], -1) + noise * torch.randn(number, 3, 2)
+    none = torch.zeros(number, 0)
+    return Values(kind, parent, both, torch.full_like(both, sd), none, none, torch.zeros(2, dtype=torch.bool))
+
+
+def test_what_was_read_is_learnt():
+    torch.manual_seed(0)
+    net = ParameterNet(1, 2, 0, hidden=24)
+    values = rows()
+
+    def density():
+        with torch.no_grad():
+            return float(log_density(net, values).sum(1).mean())
+
+    before = density()
+    MaximumLikelihood(net, values, steps=200, images=64, learning_rate=1e-2).run()
+    assert abs(before) < 3 < 10 < density()
+    graph, found = Graph.of(values.kind, values.parent), torch.full((300, 3, 2), torch.nan)
+    with torch.no_grad():
+        for s in range(2):
+            found[..., s] = net.sample(graph, values.scene, found, s, torch.rand(300, 3), values.kind >= 0)
+    assert float((found - values.nodes).abs().mean()) < 0.04
+
+
+def test_the_error_of_readings_is_taken_out():
+    """Values that are all the same, read with an error: a guide of the readings themselves would keep that error."""
+    torch.manual_seed(0)
+    net, values = ParameterNet(1, 2, 0, hidden=24), rows(600, sd=0.1, noise=0.1)
+    MaximumLikelihood(net, values, steps=300, images=100, learning_rate=1e-2).run()
+    spread = posterior_draws(net, values, 16).nodes.std(0).mean()
+    assert float(values.drawn().nodes.std(0).mean()) > 0.13 and float(spread) < 0.085
+
+
+def test_learning_goes_on_to_the_same_bits():
+    def learnt():
+        torch.manual_seed(0)
+        net = ParameterNet(1, 2, 0, hidden=8)
+        return MaximumLikelihood(net, rows(40), steps=30, images=20, seed=3)
+
+    class Interrupted(Exception):
+        pass
+
+    def interrupt(training, _):
+        if training.done == 20:
+            raise Interrupted
+
+    whole, first, second = learnt(), learnt(), learnt()
+    whole.run()
+    with pytest.raises(Interrupted):
+        first.run(interrupt)
+    second.restore({key: value.clone() for key, value in first.state().items()})
+    second.run()
+    for one, other in zip(whole.net.parameters(), second.net.parameters(), strict=True):
+        assert torch.equal(one, other)

@@ -1,0 +1,115 @@
+"""What a reader says, and what is made of it."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import truncnorm
+
+from probscene.inference.features.counting.batches import STRIDE as CELL
+from probscene.inference.features.counting.batches import cells
+from probscene.inference.parameters.net import Graph, Seen
+from probscene.inference.parameters.reading.assembly import along_the_widest, assembly
+from probscene.inference.parameters.reading.reader import Found, blocks, circles, cut_draw, cut_mean
+from probscene.inference.parameters.reading.skill import CIRCLE, LINE, TWICE, Skill
+from probscene.sampling import sample, seed_everything
+
+seeds = st.integers(0, 2**31)
+
+
+@given(st.floats(-0.5, 1.5), st.floats(0.02, 1.5), st.floats(0.001, 0.999))
+def test_cut_normal_distributions_are_scipys(mean, sd, v):
+    low, high = -mean / sd, (1 - mean) / sd
+    if not -4 < low < 4 and not -4 < high < 4:
+        return  # nearly nothing of it lies between 0 and 1
+    reference = truncnorm(low, high, mean, sd)
+    one, other = torch.tensor(mean).double(), torch.tensor(sd).double()
+    assert float(cut_mean(one, other)) == pytest.approx(reference.mean(), abs=1e-3)
+    assert float(cut_draw(one, other, torch.tensor(v).double())) == pytest.approx(reference.ppf(v), abs=5e-3)
+
+
+@given(seeds, st.integers(0, 12))
+def test_objects_apart_are_all_found(seed, number):
+    rng = np.random.default_rng(seed)
+    centre = []
+    for _ in range(200):
+        at = rng.uniform(1.5, 18.5, 2)
+        if len(centre) < number and all(np.abs(at - other).max() >= 3 for other in centre):
+            centre.append(at)
+    places = torch.tensor(np.array(centre).reshape(1, -1, 2), dtype=torch.float32)
+    label = torch.zeros(places.shape[:2], dtype=torch.int64)
+    mass = cells(places * CELL, label, 1, 20, 20)[:, 1]
+    n, y, x = blocks(mass)
+    assert len(n) == len(centre)
+    found = {(int(i), int(j)) for i, j in zip(x, y, strict=True)}
+    wanted = {tuple(np.floor(at - 0.5).astype(int).tolist()) for at in centre}
+    assert all(any(abs(i - a) <= 1 and abs(j - b) <= 1 for i, j in found) for a, b in wanted)
+
+
+def test_objects_come_image_by_image():
+    mass = torch.zeros(3, 6, 6)
+    mass[0, 1, 1] = mass[2, 4, 4] = mass[2, 1, 1] = 1.0
+    assert blocks(mass)[0].tolist() == [0, 2, 2] and len(blocks(torch.zeros(2, 6, 6))[0]) == 0
+
+
+def said(u, error=0.02, way=LINE):
+    """What a reader would say that reads a site in one way alone."""
+    rng = torch.Generator().manual_seed(0)
+    noisy = u + error * torch.randn(len(u), generator=rng)
+    raw = torch.zeros(len(u), 1, 6)
+    raw[:, 0, 0], raw[:, 0, 1] = 0.5, -1.2
+    if way == LINE:
+        raw[:, 0, 0], raw[:, 0, 1] = noisy, np.log(error)
+    if way == CIRCLE:
+        raw[:, 0, 2:] = circles(noisy) * 0.98
+    if way == TWICE:
+        raw[:, 0, 4:] = circles(noisy)[:, 2:] * 0.98
+    return raw
+
+
+@pytest.mark.parametrize("way", [LINE, CIRCLE, TWICE])
+def test_the_way_is_found_and_read(way):
+    u = torch.rand(600, generator=torch.Generator().manual_seed(1))
+    raw = said(u, way=way)
+    skill = Skill.of(raw, u[:, None])
+    assert skill.way.tolist() == [way] and float(skill.share) > 0.9 and bool(skill.readable)
+    mean, sd = skill.read(raw)
+    apart = (mean[:, 0] - u).abs()
+    apart = torch.minimum(apart, 1 - apart) if way != LINE else apart
+    apart = torch.minimum(apart, 0.5 - apart).abs() if way == TWICE else apart
+    assert float(apart.mean()) < 0.03 and float(sd.mean()) < 0.1
+
+
+def test_what_says_nothing_is_not_readable():
+    u = torch.rand(600, generator=torch.Generator().manual_seed(1))
+    raw = said(u, way=LINE)[torch.randperm(600, generator=torch.Generator().manual_seed(2))]
+    assert not Skill.of(raw, u[:, None]).readable.any()
+    assert not Skill.of(raw, torch.full((600, 1), torch.nan)).readable.any()
+
+
+def test_graphs_are_those_that_were_drawn(trays):
+    """From the true places of the nodes, and with them as what a reader finds, come the scenes' own graphs."""
+    seed_everything(0)
+    scenes = sample(trays, trays.prior, 60)
+    derivation = scenes.derivation.trimmed()
+    seen = Seen.of(trays.grammar, trays.classes, derivation)
+    place = torch.rand(*seen.kind.shape, 2) * 60
+    place[..., 0] = place[..., 0].sort(1).values  # siblings go from the left to the right
+    made = assembly(trays.grammar, trays.classes, Graph.of(seen.kind, seen.parent), place)
+    n, m = (seen.kind >= 0).nonzero(as_tuple=True)
+    label = torch.tensor([trays.classes.index(trays.grammar.kinds[k]) for k in seen.kind[n, m].tolist()])
+    parent = seen.parent[n, m]
+    shuffled = torch.randperm(len(n))
+    found = Found(
+        n[shuffled],
+        label[shuffled],
+        place[n, m][shuffled],
+        place[n, parent.clamp(min=0)][shuffled],
+        torch.zeros(len(n), 0, 6),
+        torch.zeros(60, 0, 6),
+    )
+    u = torch.rand(len(n), 2)
+    kind, found_parent, mean, _ = along_the_widest(made, found).values(found, 60, u[shuffled], u[shuffled])
+    assert torch.equal(kind, seen.kind[:, : kind.shape[1]]) and torch.equal(found_parent, seen.parent)
+    assert torch.equal(mean[n, m], u)
