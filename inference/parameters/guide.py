@@ -116,7 +116,7 @@ class _OfSites(TorchDistribution):
         has: which nodes have it.
     """
 
-    arg_constraints: Any = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    arg_constraints: Any = {}  # pyright: ignore[reportAssignmentType]
     has_rsample = True
 
     def __init__(self, base: Any, learnt: Learnt, index: int, has: Tensor):

@@ -68,15 +68,16 @@ def test_density_and_sampling_are_one_distribution(trays):
     """The quantile of each value, by the mixtures that its density is of, is the number that it was drawn from."""
     guide = guide_of(trays)
     scenes = drawn(guide.suited(trays), 120)
+    guide.net.double()
     u = quantiles_of(trays, scenes)
     derivation = scenes.derivation.trimmed()
     seen = Seen.of(trays.grammar, trays.classes, derivation)
     graph = Graph.of(seen.kind, seen.parent)
-    values = torch.stack([seen.taken(u[site.name]) for site in guide.node_sites], -1)
+    values = torch.stack([seen.taken(u[site.name]) for site in guide.node_sites], -1).double()
     values = values.where((seen.kind >= 0).unsqueeze(-1), torch.nan)
-    scene = u["scene.bright"]
+    scene = u["scene.bright"].double()
     for s in range(len(guide.node_sites)):
-        v = torch.rand(seen.kind.shape)
+        v = torch.rand(seen.kind.shape).double()
         known = values.clone()
         known[..., s:] = torch.nan
         has = ~values[..., s].isnan()
@@ -85,8 +86,8 @@ def test_density_and_sampling_are_one_distribution(trays):
             again = known.clone()
             again[..., s] = found.where(has, torch.nan)
             back = guide.net.node_mixture(graph, scene, again, s).cdf(found.logit())
-        inside = has & (found > 1e-3) & (found < 1 - 1e-3)
-        assert inside.sum() > 30 and torch.allclose(back[inside], v[inside], atol=2e-3)
+        inside = has & (found > 1e-5) & (found < 1 - 1e-5)
+        assert inside.sum() > 30 and torch.allclose(back[inside], v[inside], atol=1e-6)
 
 
 def test_nodes_without_a_class_are_passed_over(trays):
