@@ -167,7 +167,7 @@ class ParameterNet(nn.Module):
         N, M = v.shape
         earlier = torch.arange(self.node_sites) < s
         rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
-        place, memory, found = self._place(graph, scene, s), torch.zeros(N, self.cell.hidden_size), []
+        place, memory, found = self._place(graph, scene, s), v.new_zeros(N, self.cell.hidden_size), []
         w: Any = self.cell  # torch names its weights as it makes them
         for m in range(M):
             around = [columns[m]]
@@ -206,20 +206,20 @@ class ParameterNet(nn.Module):
             + self.of_site.weight[s]
             + self.of_rank(rank)
             + self.of_number(number)
-            + self.of_place(torch.stack(part, -1))
+            + self.of_place(torch.stack(part, -1).to(scene.dtype))
             + self._scene(graph, scene).unsqueeze(1)
         )
 
     def _scene(self, graph: Graph, scene: Tensor) -> Tensor:
         counts = F.one_hot(graph.kind.remainder(self.kinds + 1), self.kinds + 1).sum(1)[:, : self.kinds]
-        return self.of_scene(torch.cat([counts.float().log1p(), _code(scene)], -1))
+        return self.of_scene(torch.cat([counts.to(scene.dtype).log1p(), _code(scene)], -1))
 
 
 def _code(u: Tensor) -> Tensor:
     """``(..., 3 S)`` of u ``(..., S)``: whether it is known, and it, on both scales."""
     there = ~u.isnan()
     u = u.nan_to_num(0.5)
-    return torch.cat([there.float(), 2 * u - 1, u.clamp(1e-4, 1 - 1e-4).logit() / LOGITS], -1)
+    return torch.cat([there.to(u.dtype), 2 * u - 1, u.clamp(1e-4, 1 - 1e-4).logit() / LOGITS], -1)
 
 
 def _gathered(values: Tensor, index: Tensor) -> Tensor:
