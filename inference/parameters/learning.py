@@ -132,7 +132,7 @@ class ParameterLearning:
             tensors |= {f"guide.{key}": value for key, value in self.guide.net.state_dict().items()}
         if self.inner is not None:
             tensors |= {f"inner.{key}": value for key, value in self.inner.state().items()}
-        return tensors
+        return {key: value.clone() for key, value in tensors.items()}  # the reader is also its training's
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""

@@ -69,9 +69,8 @@ class Reader(nn.Module):
         self.what = nn.Conv2d(WIDTH, 1 + classes, 1)
         self.hidden = nn.Conv2d(WIDTH + 2, HIDDEN, 1)
         self.values = nn.Conv2d(HIDDEN, 2 + sites * (2 + HARMONICS), 1)
-        self.overall = nn.Sequential(
-            nn.Linear(2 * WIDTH, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, scene_sites * (2 + HARMONICS))
-        )
+        last = nn.Linear(HIDDEN, max(1, scene_sites) * (2 + HARMONICS))
+        self.overall = nn.Sequential(nn.Linear(2 * WIDTH, HIDDEN), nn.ReLU(), last)
         with torch.no_grad():  # nearly every cell holds nothing
             self.what.weight.mul_(0.3)
             bias = cast(Tensor, self.what.bias)
@@ -95,8 +94,8 @@ class Reader(nn.Module):
         hidden = F.relu(self.hidden(torch.cat([seen, place], 1)))
         parent, values = self.values(hidden).tensor_split([2], 1)
         overall = self.overall(torch.cat([seen.mean((2, 3)), seen.amax((2, 3))], 1))
-        shapes = (self.sites, 2 + HARMONICS), (self.scene_sites, 2 + HARMONICS)
-        return self.what(seen), parent, values.unflatten(1, shapes[0]), overall.unflatten(1, shapes[1])
+        overall = overall.unflatten(1, (-1, 2 + HARMONICS))[:, : self.scene_sites]
+        return self.what(seen), parent, values.unflatten(1, (self.sites, 2 + HARMONICS)), overall
 
     @torch.no_grad()
     def find(self, images: Tensor) -> Found:
