@@ -95,7 +95,7 @@ class Reader(nn.Module):
         parent, values = self.values(hidden).tensor_split([2], 1)
         overall = self.overall(torch.cat([seen.mean((2, 3)), seen.amax((2, 3))], 1))
         overall = overall.unflatten(1, (-1, 2 + HARMONICS))[:, : self.scene_sites]
-        return self.what(seen), parent, values.unflatten(1, (self.sites, 2 + HARMONICS)), overall
+        return self.what(seen), parent, values.reshape(len(seen), self.sites, 2 + HARMONICS, h, w), overall
 
     @torch.no_grad()
     def find(self, images: Tensor) -> Found:
