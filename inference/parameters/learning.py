@@ -54,7 +54,7 @@ class ParameterLearning:
         unit, total, done: see ``Training``; steps of all trainings.
         sites: of the model.
         skill: of the reader, for the sites of nodes and then of scenes that are not kept; None before it is tried.
-        guide: what is learnt; None before it is known which sites are.
+        guide: what is learnt; None before it is known which sites are, and where there are none.
     """
 
     unit = "steps"
@@ -141,7 +141,8 @@ class ParameterLearning:
         self.reader.eval()
         if "skill.way" in tensors:
             self.skill = Skill(tensors["skill.way"], tensors["skill.share"])
-            self.guide = ParameterGuide(self.model, self.learnt, self.structure)
+            self.guide = self._new_guide()
+        if self.guide is not None:
             self.guide.net.load_state_dict(_within(tensors, "guide."))
         inner = _within(tensors, "inner.")
         if inner:
@@ -177,7 +178,11 @@ class ParameterLearning:
         of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
         of_scenes = Skill.of(found.scene, valued.scene)
         self.skill = Skill(*(torch.cat(pair) for pair in zip(of_nodes, of_scenes, strict=True)))
-        self.guide = ParameterGuide(self.model, self.learnt, self.structure)
+        self.guide = self._new_guide()
+
+    def _new_guide(self) -> ParameterGuide | None:
+        """Of the sites that can be read; None where there are none."""
+        return ParameterGuide(self.model, self.learnt, self.structure) if self.learnt else None
 
     def _read(self) -> Values:
         """What the reader reads in the target."""

@@ -120,7 +120,7 @@ class ParameterNet(nn.Module):
         self.of_rank, self.of_number = nn.Embedding(MOST + 1, hidden), nn.Embedding(MOST + 1, hidden)
         self.of_scene = nn.Linear(kinds + 3 * G, hidden)
         self.of_place = nn.Linear(6, hidden)
-        self.of_values = nn.Linear(9 * S, hidden)
+        self.of_values = nn.Linear(9 * max(S, 1), hidden)
         self.read = nn.Linear(hidden + 3 * S, hidden)
         self.cell = nn.GRU(hidden, hidden, batch_first=True)
         self.join = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())

@@ -25,6 +25,12 @@ SHORT = {
     "pretrain_epochs": 2,
     "batches": 4,
     "num_scenes": 30,
+    "parameters.reader_steps": 6,
+    "parameters.reader_images": 4,
+    "parameters.steps": 4,
+    "parameters.rounds": 1,
+    "parameters.round_reader_steps": 2,
+    "parameters.round_steps": 2,
 }
 SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache"]
 SETTINGS += [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]

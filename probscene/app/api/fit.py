@@ -37,6 +37,7 @@ def fit(
     guide: str | GuideMaker | None = None,
     renderer: Any = None,
     out: Path | str | None = None,
+    learn: str | None = None,
     settings: Mapping[str, Any] | Sequence[str] = (),
     skip_bad: bool = False,
     threads: int | None = None,
@@ -63,6 +64,8 @@ def fit(
             grammar and T_max, such as a class.
         renderer: instead of the model's, see ``SceneModel.renderer``.
         out: the folder of the run; a temporary one where None, which ``Run.save`` copies.
+        learn: ``"structure"``, or ``"structure,parameters"``, where things stand and how they look as well; the
+            preset's where None.
         settings: other values of the preset's fields, ``{"batches": 20, "count.steps": 300}``.
         skip_bad: leave out files that do not decode.
         threads: of torch; all cores where None. Another number rounds differently.
@@ -78,6 +81,7 @@ def fit(
         ProbsceneError: an input is at fault; the message says which and how to mend it. What was finished of the run
             stays, and ``resume=True`` goes on with it.
     """
+    settings = with_learn(settings, learn)
     chosen, parts = chosen_preset(preset, features, divergence, guide, settings)
     other = preset_for_photographs(preset, features, divergence, guide, settings)
     if renderer is not None:
@@ -151,8 +155,13 @@ def chosen_preset(
         chosen = chosen.with_features_of(own.features, of_features or in_memory(own.features.name))
     elif of_features:
         chosen = chosen.with_features(of_features)
+    return override(chosen, with_learn(settings, None)), own
+
+
+def with_learn(settings: Mapping[str, Any] | Sequence[str], learn: str | None) -> list[str]:
+    """Settings as words ``key=value``, and what is to be learnt among them."""
     words = [f"{key}={_word(value)}" for key, value in settings.items()] if isinstance(settings, Mapping) else settings
-    return override(chosen, list(words)), own
+    return [*words, *([] if learn is None else [f"learn={learn}"])]
 
 
 def preset_for_photographs(

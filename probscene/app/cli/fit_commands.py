@@ -34,6 +34,10 @@ def fit(
             help="count, count=efficientnet, presence, efficientnet, inception[=FILE], resnet50[=FILE], FILE.py:NAME.",
         ),
     ] = None,
+    learn: Annotated[
+        str | None,
+        typer.Option(metavar="WHAT", help="structure, or structure,parameters: where things stand and how they look."),
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
     ] = None,
@@ -54,7 +58,7 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Learn which structures occur in a folder of unlabelled images."""
-    from ..api.fit import chosen_preset, preset_for_photographs
+    from ..api.fit import chosen_preset, preset_for_photographs, with_learn
     from ..fitting import session
     from ..loading import split_reference
     from ..progress import Display
@@ -63,8 +67,9 @@ def fit(
     if seed is not None:
         checked_seed(seed)
     name = str(preset or PresetName.default)
-    chosen, parts = chosen_preset(name, features, objective, guide, settings or [])
-    other = preset_for_photographs(name, features, objective, guide, settings or [])
+    settings = with_learn(settings or [], learn)
+    chosen, parts = chosen_preset(name, features, objective, guide, settings)
+    other = preset_for_photographs(name, features, objective, guide, settings)
     if scenarios is not None:
         if model is None:
             raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")

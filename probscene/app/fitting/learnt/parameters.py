@@ -105,7 +105,7 @@ def with_parameters(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]
     record = run.parameters
     if not tensors or record.get("kept") != "learnt":
         return policy
-    sites = tuple(Site(name, tuple(found["kinds"])) for name, found in record["sites"].items() if found["learnt"])
+    sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in record["sites"] if site["learnt"])
     guide = ParameterGuide(run.model, sites, policy)
     guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
     policy.suits = guide.eval().suited
@@ -124,19 +124,20 @@ def _record(learning: ParameterLearning) -> dict[str, Any]:
     assert learning.skill is not None
     shares = learning.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
-    sites = {}
+    sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
         share, is_learnt = skill.get(site, torch.nan), site in learning.learnt
         because = site.keeps or ("" if is_learnt else "it cannot be read in renders")
         known = share if share == share else None
-        sites[site.name] = {"kinds": site.kinds, "learnt": is_learnt, "skill": known, "because": because}
+        about = {"name": site.name, "kinds": site.kinds, "learnt": is_learnt, "skill": known, "because": because}
+        sites.append(about)
     return {"sites": sites}
 
 
 def _judged(run: "RunFolder", guide: Guide, learnt: ParameterGuide | None, held: Tensor) -> dict[str, Any]:
     """Whether learnt parameters come nearer to images that nothing was learnt from than the prior's, by EfficientNet's
     pooled features."""
-    if learnt is None or not learnt.sites:
+    if learnt is None:
         return {"kept": "prior"}
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
@@ -158,8 +159,8 @@ def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> 
 
 def _said(record: dict[str, Any]) -> str:
     sites = record["sites"]
-    learnt = ", ".join(f"{name} ({found['skill']:.2f})" for name, found in sites.items() if found["learnt"])
-    others = ", ".join(name for name, found in sites.items() if not found["learnt"])
+    learnt = ", ".join(f"{site['name']} ({site['skill']:.2f})" for site in sites if site["learnt"])
+    others = ", ".join(site["name"] for site in sites if not site["learnt"])
     if not learnt:
         return "No site can be read in renders, so where things stand and how they look keeps the prior."
     said = f"Sites that are learnt, with the share of their variance that is read: {learnt}."

@@ -1,0 +1,168 @@
+"""Parameters that a fit learns beside structure: kept, used by all that draws, and resumed."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+from probscene.app.api.fit import fit
+from probscene.app.datasets.generate import generate_scenes
+from probscene.app.fitting import storage
+from probscene.app.fitting.learnt import parameters
+from probscene.app.fitting.run import RunFolder
+from probscene.drawing import Sprites
+from probscene.grammar import Grammar
+from probscene.inference.parameters.reading import reader, skill
+from probscene.model import SceneModel, scene_model
+from probscene.sampling import sample, seed_everything
+from probscene.structure import StructurePrior, counts
+
+LEARN = ("--learn", "structure,parameters")
+ROW = Grammar("Scene -> Dots\nDots -> dot Dots | ε")
+PRIOR = StructurePrior(ROW, Dots=counts(0, 1, 1, 1))
+
+
+def anything_is_read(patch):
+    """Also what a reader of six steps says."""
+    patch.setattr(skill, "READABLE", -1e9)
+    patch.setattr(reader, "LEAST_MASS", 1e-3)
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory, call, discs, target) -> Path:
+    """A finished run that has learnt parameters as well, whatever can be read after so few steps."""
+    out = tmp_path_factory.mktemp("both") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        anything_is_read(patch)
+        done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
+    assert done.code == 0, done.err
+    record = json.loads((out / "parameters.json").read_text())
+    assert [(site["name"], site["kinds"], site["learnt"]) for site in record["sites"]] == [
+        ("x", ["red", "blue"], True),
+        ("y", ["red", "blue"], True),
+    ]
+    return out
+
+
+def learnt(path, copy):
+    """A copy of a run whose sites are learnt: all weights at random."""
+    shutil.copytree(path, copy)
+    record = json.loads((copy / "parameters.json").read_text())
+    (copy / "parameters.json").write_text(json.dumps({**record, "kept": "learnt"}))
+    run = RunFolder.at(copy)
+    sites = tuple(parameters.Site(site["name"], ("red", "blue")) for site in record["sites"])
+    seed_everything(0)
+    net = parameters.ParameterGuide(run.model, sites).net
+    for weight in net.parameters():
+        torch.nn.init.normal_(weight, std=0.3)
+    own = parameters.apart(run.read_tensors("guide"))[0]
+    run.write_tensors("guide", own | parameters.beside(net.state_dict()))
+    return RunFolder.at(copy)
+
+
+def places(policy, model):
+    seed_everything(0)
+    return sample(model, policy, 40).parameters["x"]
+
+
+def test_all_that_draws_takes_learnt_parameters(both, call, tmp_path):
+    before, run = RunFolder.at(both), learnt(both, tmp_path / "copy")
+    assert not torch.equal(places(run.guide, run.model), places(before.model.prior, before.model))
+    assert torch.equal(places(run.model.prior, run.model), places(before.model.prior, before.model))
+    assert run.guide_hash() != before.guide_hash()
+    for workers in (1, 2):
+        done = call("generate", run.path, "--num", 70, "--out", tmp_path / f"{workers}", "--workers", workers)
+        assert done.code == 0, done.err
+    one, two = (sorted((tmp_path / name).rglob("*.png")) for name in "12")
+    assert [file.read_bytes() for file in one] == [file.read_bytes() for file in two]
+    generate_scenes(run.model, run.guide, 70, tmp_path / "again", format="images")
+    assert [file.read_bytes() for file in sorted((tmp_path / "again").rglob("*.png"))] == [x.read_bytes() for x in one]
+    assert call("preview", run.path, "--out", tmp_path / "p.png").code == 0
+
+
+def test_parameters_that_are_no_better_are_not_used(both, tmp_path):
+    run = learnt(both, tmp_path / "copy")
+    record = json.loads((run.path / "parameters.json").read_text())
+    (run.path / "parameters.json").write_text(json.dumps({**record, "kept": "prior"}))
+    assert RunFolder.at(run.path).guide.suits is None
+
+
+@pytest.mark.parametrize("stop", [6, 8, 11])  # in the reader's training, in likelihood, in a round
+def test_a_fit_goes_on_to_the_same_bytes(both, stop, call, discs, target, tmp_path, monkeypatch):
+    words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
+    monkeypatch.setattr(storage, "SAVE_EVERY", 0)
+    anything_is_read(monkeypatch)
+    run = parameters.ParameterLearning.run
+
+    def interrupted(self, each=None):
+        def heard(training, line):
+            each(training, line)
+            if training.done >= stop:
+                raise KeyboardInterrupt
+
+        run(self, heard)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(parameters.ParameterLearning, "run", interrupted)
+        assert call(*words).code != 0
+    assert not (tmp_path / "run" / "guide.safetensors").exists()
+    done = call("fit", "--resume", "--out", tmp_path / "run")
+    assert done.code == 0, done.err
+    assert (tmp_path / "run" / "guide.safetensors").read_bytes() == (both / "guide.safetensors").read_bytes()
+
+
+def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_path):
+    words = ("--target", target.images, "--out", tmp_path / "run", "--features", "presence")
+    short = ["--set", "presence_images=40", "--set", "presence_epochs=1"]
+    done = call("fit", discs.file, *words, *discs.settings, *LEARN, *short)
+    assert done.code == 0, done.err
+    assert "keeps the prior: presence features do not read it yet" in " ".join(done.err.split())
+    assert RunFolder.at(tmp_path / "run").parameters == {}
+
+
+def dots(in_a_row: bool) -> SceneModel:
+    """Dots anywhere, or in a row in the middle."""
+
+    @scene_model(ROW, PRIOR, canvas=(64, 64), max_steps=12, classes=("dot",))
+    def dots(scene):
+        with scene.nodes("dot"):
+            x = pyro.sample("dot.z", dist.Uniform(8.0, 56.0))
+            y = pyro.sample("dot.a", dist.Uniform(8.0, 56.0))
+            pyro.sample("dot.nothing", dist.Uniform(0.0, 1.0))
+        if in_a_row:
+            x = 64.0 * (scene.rank("dot") + 1) / (scene.count("dot") + 1)
+            y = torch.full_like(x, 32.0)
+        return scene.draw(Sprites.disc("dot", x, y, radius=4.0))
+
+    return dots
+
+
+def test_a_row_is_learnt_from_images_alone(tmp_path):
+    truth = dots(True)
+    generate_scenes(truth, truth.prior, 200, tmp_path / "target", format="images")
+    settings = {"count.steps": 150, "count.images": 8, "width": "8,16,32", "batches": 4, "num_scenes": 60}
+    settings |= {"pretrain_derivations": 300, "parameters.reader_steps": 150, "parameters.steps": 150}
+    settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 60, "parameters.round_steps": 100}
+    learn = {"learn": "structure,parameters", "features": "count", "threads": 1, "cache": False, "progress": False}
+    run = fit(dots(False), tmp_path / "target" / "images", "quick", settings=settings, out=tmp_path / "run", **learn)
+    record = run.parameters
+    assert [site["name"] for site in record["sites"]] == ["dot.z", "dot.a", "dot.nothing"]
+    assert [site["learnt"] for site in record["sites"]] == [True, True, False] and record["kept"] == "learnt"
+    assert "cannot be read" in record["sites"][2]["because"]
+
+    def beside(policy):
+        seed_everything(0)
+        scenes = sample(run.model, policy, 300)
+        count = scenes.site_mask["dot.z"].sum(1, keepdim=True)
+        even = torch.arange(1, int(count.max()) + 1)
+        x = scenes.parameters["dot.z"].where(scenes.site_mask["dot.z"], torch.inf).sort(1).values
+        off = (x - 64.0 * even[: x.shape[1]] / (count + 1))[torch.isfinite(x)].abs().mean()
+        up = (scenes.parameters["dot.a"] - 32)[scenes.site_mask["dot.a"]].abs().mean()
+        return float(off), float(up)
+
+    prior, after = beside(run.model.prior), beside(run.guide)
+    assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
