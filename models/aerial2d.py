@@ -38,6 +38,7 @@ GRAMMAR = Grammar("""
 CANVAS, MAX_STEPS, CLASSES = 256, 64, ("road", "car")
 LANE = ROAD / 4  # pixels from the middle of a road to the middle of a lane
 APART = 20.5  # pixels between cars of a lane: more than the diagonal of a car
+FULL = 11  # cars that a lane has room for
 EDGE = CAR / 2 + 1  # pixels from the border of the canvas to the middle of the first car
 TREES, HOUSES, GAP = 28, 12, 5  # at most so many, and pixels between them and a road
 COLOURS = torch.tensor(
@@ -126,25 +127,34 @@ def _road_places(road: Tensor, distance: Tensor, below: Tensor) -> Tensor:
 def _car_places(scene: SceneGraph, car: Tensor, place, side, turn, spaced: bool) -> tuple[Tensor, Tensor, Tensor]:
     """x, lane (0 or 1) and heading of the cars, each ``(N, M)``.
 
-    A road's cars are shared out over its lanes by the order of ``side``. In a lane they are spaced evenly, or at
-    places that are uniform among all at which they do not overlap: sorted uniform numbers, each pushed on by the cars
-    before it.
+    Each car takes the lane that ``side`` says, unless one lane has no room for all that do; then, and in the target, a
+    road's cars are shared out over its lanes by the order of ``side``. In a lane they are spaced evenly, or at places
+    that are uniform among all at which they do not overlap: sorted uniform numbers, each pushed on by the cars before
+    it. A car is turned relative to its lane's direction.
     """
     siblings = (scene.parent[:, :, None] == scene.parent[:, None, :]) & car[:, None, :] & car[:, :, None]
 
     def rank(key):
         return (siblings & (key[:, None, :] < key[:, :, None])).sum(-1)
 
-    lane = rank(side) % 2
+    shared, chosen = rank(side) % 2, (side > 0.5).long()
+    in_lane = (siblings & (chosen[:, None, :] == chosen[:, :, None])).sum(-1)
+    crowded = (siblings & (in_lane > FULL)[:, None, :]).any(-1)
+    lane = torch.where(crowded, shared, shared if spaced else chosen)
+    along = torch.where(lane == 1, 0.0, math.pi)
     siblings = siblings & (lane[:, None, :] == lane[:, :, None])
     number, first = siblings.sum(-1), rank(place)
     length = CANVAS - 2 * EDGE
     if spaced:
         pitch = CANVAS / number.clamp(min=1)
         x = pitch * (first + 0.5) + (place - 0.5) * (pitch - APART).clamp(0, 8)
-        return x, lane, torch.where(lane == 1, 0.0, math.pi) + (turn - 0.5) * math.radians(6)
+        return x, lane, along + (turn - 0.5) * math.radians(6)
     apart = torch.clamp(length / (number - 1).clamp(min=1), max=APART)
-    return EDGE + place * (length - (number - 1).clamp(min=0) * apart) + first * apart, lane, 2 * math.pi * turn
+    return (
+        EDGE + place * (length - (number - 1).clamp(min=0) * apart) + first * apart,
+        lane,
+        along + 2 * math.pi * (turn - 0.5),
+    )
 
 
 def _clear(y: Tensor, reach: Tensor, road_y: Tensor, road: Tensor) -> Tensor:

@@ -96,12 +96,24 @@ def test_places_are_uniform_among_those_without_overlap():
     scenes = sample(MODEL, policy, 3000)
     layer = scenes.drawing.layers[LAYERS["car"]]
     x, y = (value[layer.present].view(3000, 3) for value in (layer.x, layer.y))
-    alone = (y == y.median(1, keepdim=True).values).sum(1, keepdim=True) == 2
-    lonely = (y != y.median(1, keepdim=True).values) & alone
+    alone = (y == y.median(1, keepdim=True).values).sum(1) == 2
+    assert abs(float(alone.float().mean()) - 0.75) < 0.04  # each car takes a lane of its own choice
+    x, y = x[alone], y[alone]
+    lonely = y != y.median(1, keepdim=True).values
     assert kstest((x[lonely] - 10).numpy() / length, "uniform").pvalue > 1e-3
-    pair = x[~lonely].view(3000, 2)
+    pair = x[~lonely].view(-1, 2)
     gap = ((pair[:, 0] - pair[:, 1]).abs() - APART) / (length - APART)
     assert kstest(gap.numpy(), lambda g: 1 - (1 - g) ** 2).pvalue > 1e-3
+
+
+def test_a_lane_that_has_no_room_shares_its_cars_with_the_other():
+    policy = StructurePrior(GRAMMAR, Roads=counts(0, 1), Cars=counts(*[0] * 20, 1))
+    seed_everything(1)
+    scenes = sample(MODEL, policy, 300)
+    layer = scenes.drawing.layers[LAYERS["car"]]
+    y = layer.y[layer.present].view(300, 20)
+    upper = (y == y.amin(1, keepdim=True)).sum(1)
+    assert (torch.maximum(upper, 20 - upper) <= 11).all() and upper.unique().tolist() == [9, 10, 11]
 
 
 @pytest.mark.parametrize("model", [MODEL, MODEL.target(0)], ids=["prior", "target"])
