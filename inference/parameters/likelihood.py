@@ -27,6 +27,7 @@ from .reading.reader import cut_draw
 from .sites import NEAR
 
 ALONE = 0.4  # of the steps, the first ones, take what was read as it is
+VALUES, FEWEST = 24_000, 16  # nodes times sites that a step looks at, at most; images, at least
 CANDIDATES = 8  # draws of which one is taken
 
 
@@ -126,7 +127,7 @@ class MaximumLikelihood:
         net: trained in place.
         values: what was read.
         steps: of Adam, along a cosine.
-        images: a step.
+        images: a step, at most.
         learning_rate: the largest.
         seed: of everything random.
 
@@ -161,7 +162,7 @@ class MaximumLikelihood:
             rate = self.learning_rate * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
             for group in self.optimiser.param_groups:
                 group["lr"] = rate
-            rows = torch.randperm(len(self.values.kind))[: self.images]
+            rows = torch.randperm(len(self.values.kind))[: self._number()]
             some = self.values.of(rows)
             drawn = some.drawn() if self.done < ALONE * self.total else posterior_draws(self.net, some)
             loss = -log_density(self.net, drawn).sum(1).mean()
@@ -177,6 +178,11 @@ class MaximumLikelihood:
                 check_finite(mean, self.net.parameters(), "the parameters", where, "begin again with a lower rate")
                 if each is not None:
                     each(self, {"loss": mean})
+
+    def _number(self) -> int:
+        """Images a step: fewer where each has many values."""
+        each = max(1, self.net.node_sites) * self.values.kind.shape[1]
+        return max(FEWEST, min(self.images, VALUES // each))
 
     def summary(self) -> dict[str, Any]:
         """Nothing more for the log."""

@@ -105,7 +105,7 @@ def find_sites(model: SceneModel) -> tuple[Site, ...]:
             found.append(Site(name, (), quantiles.kept[name]))
         elif value.shape[1] == 1 and not _masked_as_nodes(mask, kind):
             found.append(Site(name, ()))
-        elif mask.shape == kind.shape:
+        elif mask.shape == kind.shape and not (mask & (kind < 0)).any():  # a plate of another sort may be as wide
             with_it = [model.grammar.kinds[k] for k in kind[mask & (kind >= 0)].unique().tolist()]
             seen = any(name in model.classes for name in with_it)
             found.append(Site(name, tuple(with_it), "" if seen else "it belongs to no node that has a class"))

@@ -10,14 +10,14 @@ from probscene.inference.guides.lstm import GUIDES
 from probscene.inference.objective import BASELINES
 
 from .parts import is_file_part, lasting_word
-from .presets import LEARNT, OBJECTIVES, TRAINED, Preset
+from .presets import BOTH, OBJECTIVES, STRUCTURE, TRAINED, Preset
 
 CHOICES = {
     "features": TRAINED,
     "objective": OBJECTIVES,
     "baseline": BASELINES,
     "guide": GUIDES,
-    "learn": LEARNT,
+    "learn": (STRUCTURE, BOTH),
 }
 LEAST = {"num_scenes": 2}
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate")

@@ -20,7 +20,7 @@ from .parts import CheckedDivergence, as_divergence, as_features, is_file_part, 
 FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
 TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, "presence")  # on the prior's renders
 _RENAMED = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
-LEARNT = ("structure", "structure,parameters")
+STRUCTURE, BOTH = "structure", "structure,parameters"
 OBJECTIVES = ("kde", "js", "witness", "mmd")
 
 
@@ -91,7 +91,7 @@ class Preset:
     num_latents: int = 1
     index: bool = True
     prior_if_worse: bool = True
-    learn: str = "structure"
+    learn: str = STRUCTURE
     parameters: ParameterSchedule = field(default_factory=ParameterSchedule)
 
     @staticmethod
@@ -213,12 +213,13 @@ class Preset:
         return ratio(self.variance, self.marginal_variance, self.leave_one_out)
 
 
-QUICK = Preset()
+QUICK = Preset(learn=BOTH)
 DEFAULT = replace(QUICK, count=CountSchedule(steps=12000), batches=120)
 # Streets have ten counts, some of which spread over tens: kernels of variance 1 would leave most of 500 scenes alone.
 # Objects behind others are counted as far as they can be seen at all; the prior holds what cannot.
 STREET = replace(
     QUICK,
+    learn=STRUCTURE,
     objective="js",
     variance=5.0,
     prior_kl_weight=0.03,

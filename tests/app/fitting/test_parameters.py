@@ -120,7 +120,7 @@ def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_pa
     short = ["--set", "presence_images=40", "--set", "presence_epochs=1"]
     done = call("fit", discs.file, *words, *discs.settings, *LEARN, *short)
     assert done.code == 0, done.err
-    assert "keeps the prior: presence features do not read it yet" in " ".join(done.err.split())
+    assert "keeps the prior: presence features are not read for it yet" in " ".join(done.err.split())
     assert RunFolder.at(tmp_path / "run").parameters == {}
 
 

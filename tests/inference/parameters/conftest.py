@@ -39,7 +39,7 @@ def trays():
             pyro.sample("ball.odd", dist.Beta(2.0, 2.0))
         with scene.nodes("floor"):
             pyro.sample("floor.turn", dist.Uniform(0.0, 1.0))
-        with pyro.plate("decoration", 3, dim=-1):
+        with pyro.plate("decoration", scene.kind.shape[1], dim=-1):  # as wide as the nodes, by chance
             pyro.sample("decoration.x", dist.Uniform(0.0, 64.0))
         at = scene.of_parent(scene.of_parent(x)), scene.of_parent(scene.of_parent(y))
         tone = (shade * bright)[..., None] * torch.tensor([1.0, 0.4, 0.3])

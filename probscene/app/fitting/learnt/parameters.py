@@ -22,6 +22,7 @@ from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
+from probscene.scenarios import JointGrammar
 
 from ...progress import Progress
 from ..observer import RENDERED_AT_ONCE, Observer
@@ -57,8 +58,9 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     counts = inner(net)
-    if not isinstance(counts, CountNet):
-        say(f"Where things stand and how they look keeps the prior: {run.features.name} features do not read it yet.")
+    if not isinstance(counts, CountNet) or isinstance(run.model.grammar, JointGrammar):
+        who = "models of several scenarios are" if isinstance(counts, CountNet) else f"{run.features.name} features are"
+        say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
         return
     kept = run.read_tensors(NAME)
     if kept is None:
