@@ -72,8 +72,8 @@ def aerial(num_scenes: int, structure: Policy, spaced: bool, scenery) -> Drawing
             distance = pyro.sample("road.distance", uniform)  # (N, M) to the road before, in shares of what is free
             asphalt = pyro.sample("road.asphalt", uniform)
         with scene.nodes("car"):
-            place, side, turn, shape, paint = (
-                pyro.sample(f"car.{name}", uniform) for name in ("place", "lane", "turn", "shape", "paint")
+            side, place, turn, shape, paint = (
+                pyro.sample(f"car.{name}", uniform) for name in ("lane", "place", "turn", "shape", "paint")
             )
         with pyro.plate("decoration", TREES + HOUSES, dim=-1):
             where_x, where_y, chance, look, tone = (

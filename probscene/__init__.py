@@ -49,6 +49,8 @@ _MODULES = {
     "probscene.inference.guides.lstm": ("LSTMGuide",),
     "probscene.inference.guides.pcfg": ("PCFG",),
     "probscene.inference.objective": ("ScoreFunction",),
+    "probscene.inference.parameters.guide": ("ParameterGuide",),
+    "probscene.inference.parameters.sites": ("find_sites",),
     "probscene.inference.pretrain": ("pretrain",),
     "probscene.mesh": ("Mesh",),
     "probscene.model": ("Groups", "SceneModel", "scene_model"),
@@ -75,6 +77,8 @@ if TYPE_CHECKING:
     from probscene.inference.guides.lstm import LSTMGuide
     from probscene.inference.guides.pcfg import PCFG
     from probscene.inference.objective import ScoreFunction
+    from probscene.inference.parameters.guide import ParameterGuide
+    from probscene.inference.parameters.sites import find_sites
     from probscene.inference.pretrain import pretrain
 
     from .batch import RenderBatch, Renderer
@@ -96,11 +100,11 @@ if TYPE_CHECKING:
 __all__ = [
     "FeatureNet", "Features", "Camera", "DataError", "Derivation", "Divergence", "Drawing", "Grammar", "GrammarError",
     "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide",
-    "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "Photo", "Policy", "Preset",
-    "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph",
-    "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive",
-    "evaluate", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report", "sample",
-    "scene_model", "seed_everything", "trial", "weights",
+    "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "ParameterGuide", "Photo", "Policy",
+    "Preset", "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError", "SceneDataset",
+    "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive",
+    "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",
+    "sample", "scene_model", "seed_everything", "trial", "weights",
 ]  # fmt: skip
 
 

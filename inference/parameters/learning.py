@@ -176,7 +176,7 @@ class ParameterLearning:
         found = self.reader.find(valued.drawn.image)
         which = matched(found, valued)
         of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
-        of_scenes = Skill.of(found.scene, valued.scene)
+        of_scenes = Skill.of(found.overall, valued.overall)
         self.skill = Skill(*(torch.cat(pair) for pair in zip(of_nodes, of_scenes, strict=True)))
         self.guide = self._new_guide()
 
@@ -193,7 +193,7 @@ class ParameterLearning:
         skills = Skill(*(part[:S] for part in self.skill)), Skill(*(part[S:] for part in self.skill))
         node, scene = (skill.readable.nonzero().flatten() for skill in skills)
         mean, sd = (part[:, node] for part in skills[0].read(found.raw))
-        scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.scene))
+        scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
         kind, parent, *nodes = along_the_widest(self._assembly(), found).values(found, len(images), mean, sd)
         turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
         return Values(kind, parent, nodes[0], nodes[1], scene_mean, scene_sd, turns)

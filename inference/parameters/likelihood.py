@@ -9,8 +9,7 @@ marginal likelihood of what was read [1].
 Axis letters: L images, M nodes, S sites of nodes, G sites of scenes.
 
 References:
-    [1] Celeux and Diebolt, *The SEM algorithm: a probabilistic teacher algorithm derived from the EM algorithm for the
-        mixture problem*, 1985.
+    [1] Celeux and Diebolt, *The SEM algorithm*, Computational Statistics Quarterly 1985.
 """
 
 import math

@@ -2,8 +2,8 @@
 
 Sites come in the order of the program. Within a site, nodes come in the order of their derivation, parents before
 children. A node's mixture depends on the scene's sites and the number of nodes of each kind, its kind, its place among
-its siblings, its own earlier sites, its parent and its sibling before with all that is known of them, and, through a
-GRU, on all nodes before it. Axis letters: N scenes, M nodes, S sites of nodes, G sites of scenes, H units.
+its siblings, its own earlier sites and the mean of its siblings', its parent and its sibling before with all that is
+known of them, and, through a GRU, on all nodes before it. Axis letters: N scenes, M nodes, S sites of nodes, G sites of scenes, H units.
 """
 
 from collections.abc import Sequence
@@ -121,6 +121,7 @@ class ParameterNet(nn.Module):
         self.of_scene = nn.Linear(kinds + 3 * G, hidden)
         self.of_place = nn.Linear(6, hidden)
         self.of_values = nn.Linear(9 * max(S, 1), hidden)
+        self.of_siblings = nn.Linear(3 * max(S, 1), hidden)
         self.read = nn.Linear(hidden + 3 * S, hidden)
         self.cell = nn.GRU(hidden, hidden, batch_first=True)
         self.join = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
@@ -155,7 +156,8 @@ class ParameterNet(nn.Module):
         memory = F.pad(states, (0, 0, 1, 0))[:, :-1]
         own = known.where(torch.arange(self.node_sites) < s, torch.nan)
         around = [own, _gathered(known, graph.parent), _gathered(known, graph.before)]
-        return self._mixture(self._place(graph, scene, s), torch.cat([_code(x) for x in around], -1), memory, s)
+        place = self._place(graph, scene, s) + self._siblings(graph, own)
+        return self._mixture(place, torch.cat([_code(x) for x in around], -1), memory, s)
 
     def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
         """u of the nodes' site number ``s``, ``(N, M)``, at the quantiles ``v (N, M)``, one node after the other.
@@ -167,7 +169,8 @@ class ParameterNet(nn.Module):
         N, M = v.shape
         earlier = torch.arange(self.node_sites) < s
         rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
-        place, memory, found = self._place(graph, scene, s), v.new_zeros(N, self.cell.hidden_size), []
+        place = self._place(graph, scene, s) + self._siblings(graph, torch.stack(columns, 1))
+        memory, found = v.new_zeros(N, self.cell.hidden_size), []
         w: Any = self.cell  # torch names its weights as it makes them
         for m in range(M):
             around = [columns[m]]
@@ -209,6 +212,15 @@ class ParameterNet(nn.Module):
             + self.of_place(torch.stack(part, -1).to(scene.dtype))
             + self._scene(graph, scene).unsqueeze(1)
         )
+
+    def _siblings(self, graph: Graph, own: Tensor) -> Tensor:
+        """``(N, M, H)``, the mean of what is known of a node's siblings and itself, of all sites before."""
+        there = graph.kind >= 0
+        together = (
+            (graph.parent.unsqueeze(-1) == graph.parent.unsqueeze(-2)) & there.unsqueeze(-1) & there.unsqueeze(-2)
+        )
+        share = together.to(own.dtype) / graph.number.clamp(min=1).unsqueeze(-1)
+        return self.of_siblings(share @ _code(own))
 
     def _scene(self, graph: Graph, scene: Tensor) -> Tensor:
         counts = F.one_hot(graph.kind.remainder(self.kinds + 1), self.kinds + 1).sum(1)[:, : self.kinds]

@@ -7,8 +7,7 @@ they are, so that a place is read like any other site. Sites of the whole scene 
 letters: N images, C classes, S sites of nodes, G sites of scenes, h w cells.
 
 References:
-    [1] Seitzer et al., *On the pitfalls of heteroscedastic uncertainty estimation with probabilistic neural networks*,
-        ICLR 2022.
+    [1] Seitzer et al., *On the pitfalls of heteroscedastic uncertainty estimation*, ICLR 2022.
 """
 
 import copy
@@ -39,7 +38,7 @@ class Found(NamedTuple):
         label: ``(K,)`` int64 class.
         centre, parent: ``(K, 2)`` x and y of its middle, and of its parent's, pixels.
         raw: ``(K, S, 2 + HARMONICS)`` what the network says of u.
-        scene: ``(N, G, 2 + HARMONICS)`` of the scenes' sites.
+        overall: ``(N, G, 2 + HARMONICS)`` of the scenes' sites.
     """
 
     image: Tensor
@@ -47,7 +46,7 @@ class Found(NamedTuple):
     centre: Tensor
     parent: Tensor
     raw: Tensor
-    scene: Tensor
+    overall: Tensor
 
 
 class Reader(nn.Module):

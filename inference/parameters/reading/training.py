@@ -30,13 +30,13 @@ class Valued(NamedTuple):
         drawn: the labels.
         parent: ``(N, M)`` int64 node index of the nearest parent that has a class, -1 for none.
         u: ``(N, M, S)``, NaN where a node has none.
-        scene: ``(N, G)``.
+        overall: ``(N, G)`` of the scenes' sites.
     """
 
     drawn: Examples
     parent: Tensor
     u: Tensor
-    scene: Tensor
+    overall: Tensor
 
 
 class ReaderTraining:
@@ -130,7 +130,7 @@ def reader_loss(reader: Reader, valued: Valued) -> Tensor:
     n, m, i, j, share = (torch.cat(part) for part in parts)
     u = valued.u[n, m]
     of_values = value_loss(said[n, :, :, i, j], u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
-    of_scene = value_loss(overall, valued.scene.nan_to_num(0.5)).where(~valued.scene.isnan(), 0.0)
+    of_scene = value_loss(overall, valued.overall.nan_to_num(0.5)).where(~valued.overall.isnan(), 0.0)
     has = (valued.parent[n, m] >= 0).float()
     at = drawn.centre[n, valued.parent[n, m].clamp(min=0)] / scale
     away = (torch.stack([j, i], -1) + 0.5 + parent[n, :, i, j] - at).abs().clamp(max=20.0).sum(-1)

@@ -1,0 +1,125 @@
+"""How close layout comes to the target's on Multi-MNIST, learnt with structure from images of another program.
+
+    python benchmarks/learn_parameters.py --mnist FOLDER --out FOLDER [--targets 0 1 2] [--preset quick] [--seed 0]
+
+Targets are those of ``learn_multi_mnist.py``: upright digits of t10k in an evenly spaced row. Printed for the prior,
+the learnt structure alone, and structure and parameters: how far digits are from their places in the row and from its
+line, pixels; how far they are turned, degrees; how many are more than five pixels off; and KID from 500 target images
+in EfficientNet-Lite0's features, with an interval, and its floor, another 500 target images. Total variation of the
+number of digits and of their classes is that of the structures. FOLDER holds the runs, ``results.json`` and a picture
+of each target, ``scenes-K.png``: prior, structure alone, both, target.
+"""
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from learn_multi_mnist import distances, draw_target
+from torch import Tensor
+
+from probscene.app.api.fit import fit
+from probscene.app.chunks import CHUNK, draw_chunk
+from probscene.app.files import write_json
+from probscene.app.fitting.run import RunFolder
+from probscene.app.fitting.session import timing
+from probscene.app.loading import renderer_for
+from probscene.dataset import ImageFolder
+from probscene.inference.features.pretrained import EfficientNetLite
+from probscene.inference.judging.image_metrics import Figure, kid
+from probscene.policy import Policy
+from probscene.sampling import Scenes
+
+IMAGES, OFF, SIDE = 500, 5.0, 4  # of each side for KID; pixels; pictures along a side of a panel
+SOURCES = ("prior", "structure", "both")
+
+
+def row_errors(scenes: list[Scenes]) -> dict[str, float]:
+    """Of the digits of all scenes, how far they are from an upright, evenly spaced row."""
+    parts = []
+    for some in scenes:
+        has = some.site_mask["digit.x"]
+        x = some.parameters["digit.x"].where(has, torch.inf).sort(1).values
+        number = has.sum(1, keepdim=True)
+        place = 256 * torch.arange(1, x.shape[1] + 1) / (number + 1)
+        across = (x - place).where(torch.isfinite(x), torch.nan).abs()
+        order = some.parameters["digit.x"].where(has, torch.inf).argsort(1)
+        up = (some.parameters["digit.y"] - 128).abs().gather(1, order)
+        turned = some.parameters["digit.angle"].abs().gather(1, order) * 180 / math.pi
+        parts.append(torch.stack([across, up, turned], -1)[torch.isfinite(x)])
+    errors = torch.cat(parts)
+    off = (errors[:, :2] > OFF).any(1).double().mean()
+    return dict(zip(("place", "line", "angle", "off"), [*errors.mean(0).tolist(), float(off)], strict=True))
+
+
+def drawn(run: RunFolder, policy: Policy, seed: int) -> tuple[list[Scenes], Tensor]:
+    """Scenes, and their first ``IMAGES`` images ``(IMAGES, 3, H, W)``."""
+    render = renderer_for(run.model)
+    scenes = [draw_chunk(run.model, policy, seed, chunk) for chunk in range(-(-IMAGES // CHUNK))]
+    return scenes, torch.cat([render(some.drawing).image for some in scenes])[:IMAGES]
+
+
+def said(figure: Figure) -> dict[str, float]:
+    """For JSON."""
+    return {"value": figure.value, "low": figure.low, "high": figure.high}
+
+
+def picture(panels: list[Tensor], path: Path) -> None:
+    """Panels of pictures beside one another."""
+    blocks = []
+    for images in panels:
+        grid = images[: SIDE**2].expand(-1, 3, -1, -1)[:, 0].view(SIDE, SIDE, *images.shape[2:])
+        block = grid.permute(0, 2, 1, 3).reshape(SIDE * images.shape[2], -1).numpy()
+        blocks.append(np.pad(block, ((0, 0), (0, 24)), constant_values=255))
+    whole = np.concatenate(blocks, 1)[:, :-24]
+    cv2.imwrite(str(path), cv2.resize(whole, None, fx=0.375, fy=0.375, interpolation=cv2.INTER_AREA))
+
+
+def measured(target: int, args: argparse.Namespace) -> dict:
+    """One target's row."""
+    images = args.out / f"target-{target}"
+    draw_target(args.mnist, target, images, args.images)
+    learn = {"learn": "structure,parameters", "threads": 1, "cache": args.out / "cache", "resume": True}
+    run = fit("multi_mnist", images, args.preset, args.seed, out=args.out / f"both-{target}", **learn)
+    look, real = EfficientNetLite(), ImageFolder(images, run.model.canvas, run.model.channels)
+    of_real = look.embed(torch.stack([real.load(i) for i in range(2 * IMAGES)]))
+    row: dict = {
+        "target": target,
+        "seed": args.seed,
+        "seconds": timing(run),
+        "total_variation": distances(run.guide, target),
+    }
+    row["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
+    panels, learnt = [], run.guide.suits
+    for source in SOURCES:
+        policy = run.model.prior if source == "prior" else run.guide
+        if source != "prior":
+            policy.suits = learnt if source == "both" else None
+        scenes, pictures = drawn(run, policy, 1)
+        row[source] = row_errors(scenes) | {"kid": said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
+        panels.append(pictures)
+    picture([*panels, torch.stack([real.load(i) for i in range(SIDE**2)])], args.out / f"scenes-{target}.png")
+    return row
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--mnist", type=Path, required=True, help="folder of the original IDX files")
+    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
+    parser.add_argument("--targets", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--images", type=int, default=2000)
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    rows = []
+    for target in args.targets:
+        rows.append(measured(target, args))
+        print(json.dumps(rows[-1]), flush=True)
+        write_json(args.out / "results.json", rows)
+
+
+if __name__ == "__main__":
+    main()
