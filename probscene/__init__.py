@@ -102,8 +102,8 @@ __all__ = [
     "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide",
     "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "ParameterGuide", "Photo", "Policy",
     "Preset", "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError", "SceneDataset",
-    "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive",
-    "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",
+    "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts",
+    "derive", "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",
     "sample", "scene_model", "seed_everything", "trial", "weights",
 ]  # fmt: skip
 

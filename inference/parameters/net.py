@@ -3,7 +3,8 @@
 Sites come in the order of the program. Within a site, nodes come in the order of their derivation, parents before
 children. A node's mixture depends on the scene's sites and the number of nodes of each kind, its kind, its place among
 its siblings, its own earlier sites and the mean of its siblings', its parent and its sibling before with all that is
-known of them, and, through a GRU, on all nodes before it. Axis letters: N scenes, M nodes, S sites of nodes, G sites of scenes, H units.
+known of them, and, through a GRU, on all nodes before it. Axis letters: N scenes, M nodes, S sites of nodes, G sites of
+scenes, H units.
 """
 
 from collections.abc import Sequence
@@ -215,10 +216,8 @@ class ParameterNet(nn.Module):
 
     def _siblings(self, graph: Graph, own: Tensor) -> Tensor:
         """``(N, M, H)``, the mean of what is known of a node's siblings and itself, of all sites before."""
-        there = graph.kind >= 0
-        together = (
-            (graph.parent.unsqueeze(-1) == graph.parent.unsqueeze(-2)) & there.unsqueeze(-1) & there.unsqueeze(-2)
-        )
+        parent = graph.parent.where(graph.kind >= 0, -2)
+        together = (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & (parent > -2).unsqueeze(-1)
         share = together.to(own.dtype) / graph.number.clamp(min=1).unsqueeze(-1)
         return self.of_siblings(share @ _code(own))
 
