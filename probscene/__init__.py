@@ -99,12 +99,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FeatureNet", "Features", "Camera", "DataError", "Derivation", "Divergence", "Drawing", "Grammar", "GrammarError",
-    "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide",
-    "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "ParameterGuide", "Photo", "Policy",
-    "Preset", "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError", "SceneDataset",
-    "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts",
-    "derive", "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",
-    "sample", "scene_model", "seed_everything", "trial", "weights",
+    "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio",
+    "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "ParameterGuide", "Photo",
+    "Policy", "Preset", "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError",
+    "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World",
+    "compare", "counts", "derive", "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain",
+    "ranked", "render", "report", "sample", "scene_model", "seed_everything", "trial", "weights",
 ]  # fmt: skip
 
 
