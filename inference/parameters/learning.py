@@ -28,12 +28,12 @@ from .reading.assembly import along_the_widest, assembly
 from .reading.reader import Found, Reader
 from .reading.skill import Skill
 from .reading.training import MIN_VISIBLE, ReaderTraining, Valued
-from .reading.valued import Label, ValuedRenders
+from .reading.valued import Label, ValuedRenders, joined
 from .schedule import ParameterSchedule
 from .sites import Site, find_sites
 
 TRIED = 200  # renders that a reader is tried on
-OWN = 0.65  # of a round's steps look at the guide's own renders
+OWN = 0.65  # of a round's renders are the guide's own
 ARRANGED = 0.5  # of the other renders are arranged
 NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
 
@@ -165,9 +165,11 @@ class ParameterLearning:
 
     def _drawn(self, num: int) -> Valued:
         """Renders for a step of the reader."""
-        if self.guide is not None and float(torch.rand(())) < OWN:
-            return self.renders.draw(num, self.structure, self.guide.suited(self.model))
-        return self.renders.draw(num, self.model.pretraining_policy, arranged=ARRANGED)
+        own = 0 if self.guide is None else round(OWN * num)
+        parts = [self.renders.draw(num - own, self.model.pretraining_policy, arranged=ARRANGED)]
+        if self.guide is not None and own:
+            parts.append(self.renders.draw(own, self.structure, self.guide.suited(self.model)))
+        return joined(parts)  # both in each step, as batch norm is of what a step looks at
 
     def _try(self) -> None:
         """See what the reader can read in the prior's renders."""

@@ -68,3 +68,24 @@ class ValuedRenders:
             nodes(u, torch.nan),
             torch.cat(scene, 1) if scene else torch.zeros(N, 0),
         )
+
+
+def joined(parts: list[Valued]) -> Valued:
+    """Several batches as one."""
+    nodes = max(part.parent.shape[1] for part in parts)
+
+    def all_of(name: str, empty: float = -1) -> Tensor:
+        found = [getattr(part if name in Valued._fields else part.drawn, name) for part in parts]
+        return torch.cat([_padded(one, nodes, empty) for one in found])
+
+    drawn = parts[0].drawn._replace(
+        image=torch.cat([part.drawn.image for part in parts]),
+        **{name: all_of(name) for name in ("label", "centre", "size", "visible")},
+    )
+    return Valued(drawn, all_of("parent"), all_of("u", torch.nan), torch.cat([part.overall for part in parts]))
+
+
+def _padded(part: Tensor, nodes: int, empty: float) -> Tensor:
+    """``(N, nodes, ...)`` of ``(N, M, ...)``."""
+    tail = (0, 0) * (part.ndim - 2)
+    return torch.nn.functional.pad(part, (*tail, 0, nodes - part.shape[1]), value=empty)

@@ -1,5 +1,7 @@
 """What a reader says, and what is made of it."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -7,12 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import truncnorm
 
+from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import STRIDE as CELL
 from probscene.inference.features.counting.batches import cells
 from probscene.inference.parameters.net import Graph, Seen
 from probscene.inference.parameters.reading.assembly import along_the_widest, assembly
 from probscene.inference.parameters.reading.reader import Found, blocks, circles, cut_draw, cut_mean
 from probscene.inference.parameters.reading.skill import CIRCLE, LINE, TWICE, Skill
+from probscene.inference.parameters.reading.valued import ValuedRenders, joined
+from probscene.inference.parameters.sites import find_sites
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 seeds = st.integers(0, 2**31)
@@ -113,3 +119,26 @@ def test_graphs_are_those_that_were_drawn(trays):
     kind, found_parent, mean, _ = along_the_widest(made, found).values(found, 60, u[shuffled], u[shuffled])
     assert torch.equal(kind, seen.kind[:, : kind.shape[1]]) and torch.equal(found_parent, seen.parent)
     assert torch.equal(mean[n, m], u)
+
+
+def test_batches_are_joined_as_they_are(trays):
+    """Each part's rows come back, padded to the most nodes."""
+    classes = class_table(trays.grammar.kinds, trays.classes)
+    render = SpriteRenderer(trays.canvas)
+    sites = {site.name: site for site in find_sites(trays)}
+    label = partial(_labels, render, classes)
+    renders = ValuedRenders(trays, label, (sites["tray.x"], sites["ball.away"]), (sites["scene.bright"],))
+    seed_everything(0)
+    parts = [renders.draw(3, trays.prior), renders.draw(5, trays.prior)]
+    whole = joined(parts)
+    for part, rows in zip(parts, (slice(0, 3), slice(3, 8)), strict=True):
+        M = part.parent.shape[1]
+        assert torch.equal(whole.drawn.image[rows], part.drawn.image)
+        assert torch.equal(whole.overall[rows], part.overall)
+        for one, other in ((whole.parent, part.parent), (whole.drawn.label, part.drawn.label)):
+            assert torch.equal(one[rows, :M], other) and (one[rows, M:] == -1).all()
+        assert torch.equal(whole.u[rows, :M].nan_to_num(-1), part.u.nan_to_num(-1)) and whole.u[rows, M:].isnan().all()
+
+
+def _labels(render, classes, scenes):
+    return examples(render(scenes.drawing), classes)
