@@ -71,10 +71,11 @@ def picture(panels: list[Tensor], path: Path) -> None:
     """Panels of pictures beside one another."""
     blocks = []
     for images in panels:
-        grid = images[: SIDE**2].expand(-1, 3, -1, -1)[:, 0].view(SIDE, SIDE, *images.shape[2:])
-        block = grid.permute(0, 2, 1, 3).reshape(SIDE * images.shape[2], -1).numpy()
-        blocks.append(np.pad(block, ((0, 0), (0, 24)), constant_values=255))
-    whole = np.concatenate(blocks, 1)[:, :-24]
+        framed = torch.nn.functional.pad(images[: SIDE**2, 0], (2, 2, 2, 2), value=90)
+        grid = framed.view(SIDE, SIDE, *framed.shape[1:])
+        block = grid.permute(0, 2, 1, 3).reshape(SIDE * framed.shape[1], -1).numpy()
+        blocks.append(np.pad(block, ((0, 0), (0, 40)), constant_values=255))
+    whole = np.concatenate(blocks, 1)[:, :-40]
     cv2.imwrite(str(path), cv2.resize(whole, None, fx=0.375, fy=0.375, interpolation=cv2.INTER_AREA))
 
 
