@@ -13,7 +13,8 @@ from probscene.models.multi_mnist import MODEL
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-TINY = {"count.steps": 8, "batches": 1, "num_scenes": 20, "pretrain_derivations": 100, "pretrain_epochs": 1}
+TINY = {"learn": "structure", "count.steps": 8, "batches": 1, "num_scenes": 20, "pretrain_derivations": 100}
+TINY |= {"pretrain_epochs": 1}
 
 
 def test_python_runs(tmp_path, monkeypatch, capsys):

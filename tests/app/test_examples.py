@@ -42,7 +42,14 @@ def test_tabletop_is_fitted_and_generated(call, discs, photos, tmp_path):
     ids=["paper", "mmd", "latents", "pcfg", "grammar-vae"],
 )
 def test_other_presets_and_objectives_run(words, call, photos, tmp_path):
-    few = ("pretrain_derivations=100", "batches=2", "num_scenes=20", "learning_rate=1e-3", "prior_if_worse=false")
+    few = (
+        "pretrain_derivations=100",
+        "batches=2",
+        "num_scenes=20",
+        "learning_rate=1e-3",
+        "prior_if_worse=false",
+        "learn=structure",
+    )
     few = [word for setting in few for word in ("--set", setting)]
     done = call("fit", TABLETOP, "--target", photos, "--out", tmp_path / "run", "--threads", 1, *words, *few)
     assert done.code == 0, done.err

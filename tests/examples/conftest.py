@@ -19,6 +19,7 @@ SHORT = {
     "pretrain_derivations": 100,
     "pretrain_epochs": 1,
     "prior_if_worse": "false",
+    "learn": "structure",
     "batches": 2,
     "num_scenes": 20,
 }
