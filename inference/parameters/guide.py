@@ -26,7 +26,7 @@ from probscene.policy import Policy
 from probscene.world import World
 
 from .net import Graph, ParameterNet, Seen
-from .sites import NEAR, Site
+from .sites import NEAR, Site, site_name
 
 
 class ParameterGuide(nn.Module):
@@ -71,7 +71,7 @@ class Learnt(Messenger):
         guide: the guide.
 
     Attributes:
-        seen, graph: of what the program has derived.
+        seen, graph: of what the program has derived; of all scenarios where it is of several.
         scene, values: u of the scene's and of the seen nodes' learnt sites so far, ``(N, G)`` and ``(N, M', S)``; NaN
             where there are none.
     """
@@ -85,6 +85,8 @@ class Learnt(Messenger):
 
     def _pyro_post_derive(self, msg: Any) -> None:
         model = self.guide.model
+        if msg["args"][0].rules != model.grammar.rules:
+            return  # a scenario's own part of what was derived
         self.seen = Seen.of(model.grammar, model.classes, msg["value"])
         self.graph = Graph.of(self.seen.kind, self.seen.parent)
         N, M = self.seen.kind.shape
@@ -94,12 +96,13 @@ class Learnt(Messenger):
     def _pyro_sample(self, msg: Any) -> None:
         if self.seen is None:
             return
+        own = site_name(self.guide.model.grammar, msg["name"])
         for sites, made in ((self.guide.scene_sites, OfScenes), (self.guide.node_sites, OfNodes)):
             names = [site.name for site in sites]
-            if msg["name"] in names:
+            if own in names:
                 mask = True if msg["mask"] is None else msg["mask"]
                 has = torch.as_tensor(mask).expand(msg["fn"].batch_shape)
-                msg["fn"] = made(msg["fn"], self, names.index(msg["name"]), has)
+                msg["fn"] = made(msg["fn"], self, names.index(own), has)
 
     def _pyro_post_sample(self, msg: Any) -> None:
         if isinstance(msg["fn"], _OfSites):
@@ -156,7 +159,7 @@ class _OfSites(TorchDistribution):
         raise NotImplementedError
 
     def _u(self, value: Tensor) -> Tensor:
-        return self.base.cdf(value).clamp(NEAR, 1 - NEAR).where(self.has, torch.nan)
+        return self.base.cdf(value).clamp(NEAR, 1 - NEAR)
 
 
 class OfNodes(_OfSites):
@@ -167,28 +170,37 @@ class OfNodes(_OfSites):
         return self.seen.put(self.net.sample(self.graph, self.scene, self.values, self.index, taken, has), v)
 
     def density(self, u: Tensor) -> Tensor:
-        taken = self.seen.taken(u)
-        values = _put(self.values, self.index, taken.where(self.seen.taken(self.has), torch.nan))
-        found = self.net.node_mixture(self.graph, self.scene, values, self.index).log_prob(taken)
+        values = self._with(self.values, u)
+        found = self.net.node_mixture(self.graph, self.scene, values, self.index).log_prob(self.seen.taken(u))
         return self.seen.put(found, torch.zeros_like(u))
 
     def keep(self, value: Tensor) -> None:
-        self.learnt.values = _put(self.values, self.index, self.seen.taken(self._u(value)))
+        self.learnt.values = self._with(self.learnt.values, self._u(value))
+
+    def _with(self, values: Tensor, u: Tensor) -> Tensor:
+        """The values, with u at the nodes that have it: a scenario's program leaves other scenes as they are."""
+        return _put(values, self.index, self.seen.taken(u), self.seen.taken(self.has))
 
 
 class OfScenes(_OfSites):
-    """Of a site of the scene."""
+    """Of a site of the scene: of each, or of the one node that has it."""
 
     def quantile(self, v: Tensor) -> Tensor:
-        return self.net.scene_mixture(self.graph, self.scene, self.index).icdf(v)
+        return self.net.scene_mixture(self.graph, self.scene, self.index).icdf(self._one(v)).expand_as(v)
 
     def density(self, u: Tensor) -> Tensor:
-        return self.net.scene_mixture(self.graph, self.scene, self.index).log_prob(u)
+        return self.net.scene_mixture(self.graph, self.scene, self.index).log_prob(self._one(u)).expand_as(u)
 
     def keep(self, value: Tensor) -> None:
-        self.learnt.scene = _put(self.scene.unsqueeze(1), self.index, self._u(value)).squeeze(1)
+        u, has = self._one(self._u(value)), self.has.any(1, keepdim=True)
+        self.learnt.scene = _put(self.learnt.scene.unsqueeze(1), self.index, u, has).squeeze(1)
+
+    def _one(self, values: Tensor) -> Tensor:
+        """``(N, 1)``."""
+        return values.where(self.has, 0.0).sum(1, keepdim=True)
 
 
-def _put(values: Tensor, index: int, column: Tensor) -> Tensor:
-    """``values (..., S)`` with another column."""
-    return torch.where(torch.arange(values.shape[-1]) == index, column.unsqueeze(-1), values)
+def _put(values: Tensor, index: int, column: Tensor, has: Tensor) -> Tensor:
+    """``values (..., S)`` with another column where ``has (...)``."""
+    here = has.unsqueeze(-1) & (torch.arange(values.shape[-1]) == index)
+    return torch.where(here, column.unsqueeze(-1), values)

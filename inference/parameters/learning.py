@@ -30,7 +30,7 @@ from .reading.skill import Skill
 from .reading.training import MIN_VISIBLE, ReaderTraining, Valued
 from .reading.valued import Label, ValuedRenders, joined
 from .schedule import ParameterSchedule
-from .sites import Site, find_sites
+from .sites import Site, find_sites, having
 
 TRIED = 200  # renders that a reader is tried on
 OWN = 0.65  # of a round's renders are the guide's own
@@ -197,8 +197,9 @@ class ParameterLearning:
         mean, sd = (part[:, node] for part in skills[0].read(found.raw))
         scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
         kind, parent, *nodes = along_the_widest(self._assembly(), found).values(found, len(images), mean, sd)
+        has = having(self.model.grammar, tuple(self.node_sites[i] for i in node.tolist()), kind)
         turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
-        return Values(kind, parent, nodes[0], nodes[1], scene_mean, scene_sd, turns)
+        return Values(kind, parent, *(x.where(has, torch.nan) for x in nodes), scene_mean, scene_sd, turns)
 
     def _assembly(self) -> Any:
         """What the prior's scenes have in common."""

@@ -90,15 +90,18 @@ class Seen(NamedTuple):
         return Seen(kind.gather(1, slot).where(seen, -1), mapped.gather(1, slot).where(seen, -1), slot, place)
 
     def taken(self, values: Tensor) -> Tensor:
-        """``(N, M', ...)`` of values of the derivation's nodes ``(N, M, ...)``."""
-        index = self.slot.view(*self.slot.shape, *(1,) * (values.ndim - 2)).expand(-1, -1, *values.shape[2:])
-        return values.gather(1, index)
+        """``(N, M', ...)`` of values of the derivation's nodes ``(N, M, ...)``. There may be fewer, or more, where a
+        scenario's own program has drawn them; what is taken is of no use in scenes of another."""
+        slot = self.slot.clamp(max=values.shape[1] - 1)
+        return values.gather(1, slot.view(*slot.shape, *(1,) * (values.ndim - 2)).expand(-1, -1, *values.shape[2:]))
 
     def put(self, values: Tensor, others: Tensor) -> Tensor:
-        """``(N, M)`` of values ``(N, M')``; ``others (N, M)`` where a node has no class."""
-        at = self.place.clamp(max=values.shape[1] - 1)
+        """``(N, M)`` of values ``(N, M')``; ``others (N, M)``, as wide as in ``taken``, where a node has no class."""
+        M = others.shape[1]
+        place = F.pad(self.place[:, :M], (0, max(0, M - self.place.shape[1])), value=values.shape[1])
+        at = place.clamp(max=values.shape[1] - 1)
         back = values.gather(1, at)
-        there = (self.place < values.shape[1]) & (self.kind.gather(1, at) >= 0)
+        there = (place < values.shape[1]) & (self.kind.gather(1, at) >= 0)
         return back.where(there, others)
 
 

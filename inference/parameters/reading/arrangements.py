@@ -11,8 +11,10 @@ import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
+from probscene.grammar import Grammar
+
 from ..net import Graph
-from ..sites import NEAR
+from ..sites import NEAR, site_name
 
 SAME, SPACED = 0.3, 0.3  # shares of the arranged scenes' sites; the rest is independent
 JITTER = 0.08  # largest spread of u around a pattern
@@ -22,13 +24,14 @@ class Arranged(Messenger):
     """Inside it some of a program's scenes are arranged.
 
     Args:
+        grammar: the model's.
         names: of the sites of nodes that are.
         share: of the scenes.
     """
 
-    def __init__(self, names: frozenset[str], share: float = 0.5):
+    def __init__(self, grammar: Grammar, names: frozenset[str], share: float = 0.5):
         super().__init__()
-        self.names, self.share = names, share
+        self.grammar, self.names, self.share = grammar, names, share
         self.graph: Graph | None = None
         self.chosen = torch.zeros(0, dtype=torch.bool)
 
@@ -37,7 +40,7 @@ class Arranged(Messenger):
         self.chosen = torch.rand(len(self.graph.kind)) < self.share
 
     def _pyro_sample(self, msg: Any) -> None:
-        if self.graph is None or msg["name"] not in self.names or msg["value"] is not None:
+        if self.graph is None or msg["value"] is not None or site_name(self.grammar, msg["name"]) not in self.names:
             return
         fn = msg["fn"]
         drawn = fn.sample()

@@ -11,7 +11,7 @@ from probscene.sampling import Scenes, sample
 
 from ...features.base import Examples
 from ..net import Seen
-from ..sites import Site, quantiles_of, within
+from ..sites import Site, of_scenes, quantiles_of, within
 from .arrangements import Arranged
 from .training import Valued
 
@@ -41,7 +41,8 @@ class ValuedRenders:
         """
         model = self.model if drawn_by is None else drawn_by
         if arranged:
-            model = within(model, Arranged(frozenset(site.name for site in self.node_sites), arranged))
+            names = frozenset(site.name for site in self.node_sites)
+            model = within(model, Arranged(model.grammar, names, arranged))
         return self.of(sample(model, policy, num))
 
     def of(self, scenes: Scenes) -> Valued:
@@ -56,7 +57,7 @@ class ValuedRenders:
             return taken.where((seen.kind >= 0).view(*seen.kind.shape, *(1,) * (taken.ndim - 2)), empty)
 
         u = torch.stack([found[site.name] for site in self.node_sites], -1) if self.node_sites else torch.zeros(N, M, 0)
-        scene = [found[site.name] for site in self.scene_sites]
+        scene = [of_scenes(found[site.name]) for site in self.scene_sites]
         return Valued(
             drawn._replace(
                 label=nodes(drawn.label, -1),

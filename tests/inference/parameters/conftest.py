@@ -1,4 +1,5 @@
-"""A model with every sort of site: trays with balls in them on a floor, none of which can be seen but these two."""
+"""A model with every sort of site: trays with balls in them on a floor, none of which can be seen but these two; and a
+model of two scenarios, the other of which has balls by the same names elsewhere."""
 
 import pyro
 import pyro.distributions as dist
@@ -8,6 +9,7 @@ import torch
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.model import scene_model
+from probscene.scenarios import join
 from probscene.structure import StructurePrior, counts
 
 TRAYS = Grammar("""
@@ -30,7 +32,7 @@ def trays():
         with scene.nodes("tray"):
             x = pyro.sample("tray.x", dist.Normal(32.0, 8.0))
             y = pyro.sample("tray.y", dist.Uniform(10.0, 54.0))
-            wood = pyro.sample("tray.wood", dist.Categorical(torch.ones(3)))
+            pyro.sample("tray.wood", dist.Categorical(torch.ones(3)))
         with scene.nodes("red", "blue"):
             away = pyro.sample("ball.away", dist.Uniform(-8.0, 8.0))
             size = pyro.sample("ball.size", dist.Uniform(2.0, 4.0))
@@ -39,6 +41,8 @@ def trays():
             pyro.sample("ball.odd", dist.Beta(2.0, 2.0))
         with scene.nodes("floor"):
             pyro.sample("floor.turn", dist.Uniform(0.0, 1.0))
+        with scene.nodes("hidden"):
+            pyro.sample("hidden.depth", dist.Uniform(0.0, 1.0))
         with pyro.plate("decoration", scene.kind.shape[1], dim=-1):  # as wide as the nodes, by chance
             pyro.sample("decoration.x", dist.Uniform(0.0, 64.0))
         at = scene.of_parent(scene.of_parent(x)), scene.of_parent(scene.of_parent(y))
@@ -46,7 +50,45 @@ def trays():
         return scene.draw(
             Sprites.disc("tray", x, y, radius=9.0, tint=(0.2, 0.5, 0.2)),
             Sprites.disc(("red", "blue"), at[0] + away, at[1], radius=size, tint=tone),
-            background=(0.05 + wood.sum() * 0.0, 0.05, 0.05),
+            background=(0.05, 0.05, 0.05),
         )
 
     return trays
+
+
+HALL = Grammar("""
+    Scene -> wall wall wall floor lamp Balls
+    Balls -> Ball Balls | ε
+    Ball  -> red | blue
+""")
+
+
+@pytest.fixture(scope="session")
+def rooms(trays):
+    """Trays or a hall, whose shortest scene has more nodes than that of trays and whose longest has fewer."""
+
+    prior = StructurePrior(HALL, Balls=counts(1, 1, 1))
+
+    @scene_model(HALL, prior, canvas=(64, 64), max_steps=20, classes=("red", "blue"))
+    def hall(scene):
+        bright = pyro.sample("scene.bright", dist.Uniform(0.2, 0.6))
+        with scene.nodes("red", "blue"):
+            away = pyro.sample("ball.away", dist.Normal(0.0, 12.0))
+            size = pyro.sample("ball.size", dist.Uniform(1.0, 5.0))
+            shade = pyro.sample("ball.shade", dist.Uniform(0.3, 0.5 + size / 10))
+            pyro.sample("ball.fixed", dist.Uniform(0.0, 1.0))
+        with scene.nodes("floor"):
+            pyro.sample("floor.turn", dist.Uniform(-1.0, 1.0))
+        with scene.nodes("lamp"):
+            pyro.sample("lamp.height", dist.Uniform(0.0, 1.0))
+        tone = (shade * bright)[..., None] * torch.tensor([1.0, 0.4, 0.3])
+        balls = Sprites.disc(("red", "blue"), 32 + away, 32.0, radius=size, tint=tone)
+        return scene.draw(balls, background=(0.05, 0.05, 0.05))
+
+    return join("rooms", {"trays": trays, "hall": hall}, [2.0, 1.0])
+
+
+@pytest.fixture(scope="session", params=["trays", "rooms"])
+def model(request):
+    """A model of one grammar, and one of several scenarios."""
+    return request.getfixturevalue(request.param)

@@ -121,15 +121,17 @@ def test_graphs_are_those_that_were_drawn(trays):
     assert torch.equal(mean[n, m], u)
 
 
-def test_batches_are_joined_as_they_are(trays):
+def test_batches_are_joined_as_they_are(model):
     """Each part's rows come back, padded to the most nodes."""
-    classes = class_table(trays.grammar.kinds, trays.classes)
-    render = SpriteRenderer(trays.canvas)
-    sites = {site.name: site for site in find_sites(trays)}
+    classes = class_table(model.grammar.kinds, model.classes)
+    render = SpriteRenderer(model.canvas)
+    sites = {site.name: site for site in find_sites(model)}
     label = partial(_labels, render, classes)
-    renders = ValuedRenders(trays, label, (sites["tray.x"], sites["ball.away"]), (sites["scene.bright"],))
+    renders = ValuedRenders(
+        model, label, (sites["tray.x"], sites["ball.away"]), (sites["scene.bright"], sites["floor.turn"])
+    )
     seed_everything(0)
-    parts = [renders.draw(3, trays.prior), renders.draw(5, trays.prior)]
+    parts = [renders.draw(3, model.prior), renders.draw(5, model.prior)]
     whole = joined(parts)
     for part, rows in zip(parts, (slice(0, 3), slice(3, 8)), strict=True):
         M = part.parent.shape[1]

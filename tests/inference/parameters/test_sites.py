@@ -1,9 +1,26 @@
 """Which sites of a program can be learnt."""
 
+from contextlib import nullcontext
+
+import pyro
+import pyro.distributions as dist
 import torch
 
-from probscene.inference.parameters.sites import Site, find_sites, quantiles_of
+from probscene.drawing import Sprites
+from probscene.grammar import Grammar
+from probscene.inference.parameters.sites import (
+    Site,
+    find_sites,
+    having,
+    of_scenes,
+    once_in_each,
+    quantiles_of,
+    site_name,
+)
+from probscene.model import scene_model
 from probscene.sampling import sample
+from probscene.scenarios import join
+from probscene.structure import StructurePrior
 
 
 def test_every_site_says_whether_it_can_be_learnt(trays):
@@ -17,19 +34,76 @@ def test_every_site_says_whether_it_can_be_learnt(trays):
     assert found["ball.fixed"].keeps == "the program says so"
     assert found["ball.odd"].keeps == "Beta has no inverse CDF"
     assert found["decoration.x"].keeps == "it belongs to no node of the scene"
-    assert found["floor.turn"].keeps == "it belongs to no node that has a class"
+    assert found["hidden.depth"].keeps == "it belongs to no node that has a class"
 
 
-def test_under_the_prior_quantiles_are_uniform_whatever_the_unit(trays):
+def test_a_node_that_each_scene_has_one_of_is_the_scenes(trays):
+    """Whatever the kind is called, and only if the grammar allows no other number."""
+    found = {site.name: site for site in find_sites(trays)}
+    assert found["floor.turn"] == Site("floor.turn", ()) and not found["floor.turn"].keeps
+    grammar = Grammar("""
+        Scene -> sky Light Extra
+        Light -> sun | lamp
+        Extra -> cat | ε
+    """)
+    assert once_in_each(grammar, ["sky"]) and once_in_each(grammar, ["sun", "lamp"])
+    assert not any(once_in_each(grammar, kinds) for kinds in (["sun"], ["cat"], ["sky", "cat"], ["sky", "sun"]))
+
+
+def test_sites_of_one_name_are_one_of_all_scenarios(rooms):
+    found = {site.name: site for site in find_sites(rooms)}
+    programs = [*sample(rooms, rooms.prior, 20).parameters]
+    assert set(found) == {site_name(rooms.grammar, name) for name in programs}
+    assert found["ball.away"] == Site("ball.away", ("red", "blue")) and found["tray.x"] == Site("tray.x", ("tray",))
+    assert found["scene.bright"] == Site("scene.bright", ()) and found["floor.turn"] == Site("floor.turn", ())
+    assert found["ball.fixed"].keeps == "the program says so"
+    assert found["lamp.height"].keeps == "scenario 'trays' does not have it"
+    assert [name for name in found if name.startswith("ball")] == [
+        f"ball.{x}" for x in ("away", "size", "shade", "fixed", "odd")
+    ]
+
+
+def test_scenarios_whose_sites_do_not_go_together_keep_their_prior():
+    grammar = Grammar("Scene -> ball ball")
+
+    def scenario(*sites, nodes=True):
+        def draw(scene):
+            for name in sites:
+                with scene.nodes("ball") if nodes else nullcontext():
+                    pyro.sample(name, dist.Uniform(0.0, 1.0))
+            return scene.draw(Sprites.disc("ball", 8.0, 8.0, radius=2.0))
+
+        prior = StructurePrior(grammar)
+        return scene_model(grammar, prior, canvas=(16, 16), max_steps=4, classes=("ball",), name="one")(draw)
+
+    turned = find_sites(join("turned", {"a": scenario("x", "y", "z"), "b": scenario("x", "z", "y")}))
+    assert [site.name for site in turned if not site.keeps] == ["x", "z"]
+    assert turned[1] == Site("y", ("ball",), "scenarios sample it in different orders")
+    for_scene = find_sites(join("other", {"a": scenario("x"), "b": scenario("x", nodes=False)}))
+    assert for_scene[0].keeps == "it belongs to nodes in one scenario and to the scene in another"
+    lacking = find_sites(join("lacking", {"a": scenario("x", "y"), "b": scenario("x")}))
+    assert [site.keeps for site in lacking] == ["", "scenario 'b' does not have it"]
+    nested = find_sites(join("nested", {"c": join("inner", {"a": scenario("x")}), "b": scenario("x")}))
+    assert (
+        nested == (Site("x", ("ball",)),)
+        and site_name(join("n", {"c": join("i", {"a": scenario("x")})}).grammar, "c/a/x") == "x"
+    )
+
+
+def test_under_the_prior_quantiles_are_uniform_whatever_the_unit(model):
     torch.manual_seed(0)
-    found = quantiles_of(trays, sample(trays, trays.prior, 800))
-    for name in ("scene.bright", "tray.x", "ball.shade"):
+    found = quantiles_of(model, sample(model, model.prior, 1200))
+    for name in ("scene.bright", "tray.x", "ball.shade", "floor.turn"):
         u = found[name][~found[name].isnan()]
         assert len(u) > 500 and abs(float(u.mean()) - 0.5) < 0.03 and abs(float(u.var()) - 1 / 12) < 0.01, name
 
 
-def test_quantiles_are_nan_where_a_node_has_no_such_site(trays):
-    scenes = sample(trays, trays.prior, 50)
-    found = quantiles_of(trays, scenes)
-    tray = scenes.derivation.kind == trays.grammar.kind("tray")
-    assert torch.equal(~found["tray.x"].isnan(), tray[:, : found["tray.x"].shape[1]])
+def test_quantiles_are_nan_where_a_node_has_no_such_site(model):
+    scenes = sample(model, model.prior, 50)
+    found, kind = quantiles_of(model, scenes), scenes.derivation.trimmed().kind
+    sites = tuple(site for site in find_sites(model) if site.kinds and not site.keeps)
+    has = having(model.grammar, sites, kind)
+    for s, site in enumerate(sites):
+        assert torch.equal(~found[site.name].isnan(), has[..., s]), site.name
+    assert not of_scenes(found["floor.turn"]).isnan().any() and of_scenes(found["floor.turn"]).shape == (50, 1)
+    assert of_scenes(torch.full((2, 3), torch.nan)).isnan().all()

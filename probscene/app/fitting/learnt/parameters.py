@@ -22,7 +22,6 @@ from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
-from probscene.scenarios import JointGrammar
 
 from ...progress import Progress
 from ..observer import RENDERED_AT_ONCE, Observer
@@ -58,8 +57,8 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     counts = inner(net)
-    if not isinstance(counts, CountNet) or isinstance(run.model.grammar, JointGrammar):
-        who = "models of several scenarios are" if isinstance(counts, CountNet) else f"{run.features.name} features are"
+    if not isinstance(counts, CountNet):
+        who = f"{run.features.name} features are"
         say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
         return
     kept = run.read_tensors(NAME)
