@@ -207,7 +207,8 @@ class ParameterLearning:
         label = valued.drawn.label
         kinds = torch.tensor([self.model.grammar.kind(name) for name in self.model.classes] + [-1])
         centre = valued.drawn.centre.where((label >= 0).unsqueeze(-1), torch.nan)
-        return assembly(self.model.grammar, self.model.classes, Graph.of(kinds[label], valued.parent), centre)
+        graph = Graph.of(kinds[label], valued.parent)
+        return assembly(self.model.grammar, self.model.classes, graph, centre, valued.group)
 
 
 def matched(found: Found, valued: Valued) -> Tensor:

@@ -3,7 +3,9 @@
 What a grammar says of that is seen in derivations of the prior: which kinds hang below which, and which of two siblings
 of different kinds comes first. Where siblings are exchangeable, any order of them is as good under the prior, but not
 for a guide that goes from one to the next: they are ordered along the axis along which they vary most in the images,
-unless the model's own program orders them along one. Axis letters: L images, M nodes, K objects.
+unless the model's own program orders them along one. Siblings that hang below several nodes without a class, such as
+lanes, are not exchangeable, and in which group each is cannot be read: they come in random order, of which a guide
+learns no more than holds for any. Axis letters: L images, M nodes, K objects.
 """
 
 from typing import NamedTuple
@@ -16,6 +18,7 @@ from probscene.grammar import Grammar
 from ..net import Graph
 from .reader import Found
 
+FREE, SHUFFLED = -1, -2  # axes
 ORDERED = 0.9  # share of the prior's neighbouring siblings that stand in the order of an axis, which is then theirs
 
 
@@ -26,7 +29,8 @@ class Assembly(NamedTuple):
         kinds: ``(C,)`` int64 the grammar's kind of each class.
         above: ``(C, C + 1)`` bool, whether a class hangs below another; the last column is below none.
         stage: ``(C,)`` int64: siblings of a lower stage come first.
-        axis: ``(C,)`` int64, 0 for x and 1 for y, along which siblings of a class's stage are ordered.
+        axis: ``(C,)`` int64, 0 for x and 1 for y, along which siblings of a class's stage are ordered; ``FREE``, or
+            ``SHUFFLED``.
     """
 
     kinds: Tensor
@@ -57,16 +61,19 @@ class Assembly(NamedTuple):
         return kind, parent, *(_spread_out(part, index, there) for part in (mean, sd))
 
     def _scene(self, found: Found, objects: list[int]) -> list[tuple[int, int]]:
-        label = found.label.tolist()
+        label, anywhere = found.label.tolist(), torch.rand(len(objects)).tolist()
+        drawn = dict(zip(objects, anywhere, strict=True))
         below: dict[int, list[int]] = {}
         for k in objects:
             below.setdefault(self._parent(found, k, objects), []).append(k)
         order: list[tuple[int, int]] = []
 
+        def key(k: int) -> tuple[int, float]:
+            axis = int(self.axis[label[k]])
+            return int(self.stage[label[k]]), drawn[k] if axis == SHUFFLED else float(found.centre[k, axis])
+
         def add(parent: int, place: int) -> None:
-            children = below.get(parent, [])
-            key = lambda k: (int(self.stage[label[k]]), float(found.centre[k, int(self.axis[label[k]])]))  # noqa: E731
-            for k in sorted(children, key=key):
+            for k in sorted(below.get(parent, []), key=key):
                 order.append((k, place))
                 add(k, len(order) - 1)
 
@@ -83,12 +90,15 @@ class Assembly(NamedTuple):
         return some[int(away.argmin())]
 
 
-def assembly(grammar: Grammar, classes: tuple[str, ...], graph: Graph, centre: Tensor) -> Assembly:
+def assembly(
+    grammar: Grammar, classes: tuple[str, ...], graph: Graph, centre: Tensor, group: Tensor | None = None
+) -> Assembly:
     """From scenes of the prior.
 
     Args:
         graph: their nodes of some class.
         centre: ``(N, M, 2)`` pixels of those that can be seen; NaN of others.
+        group: ``(N, M)`` int64 the node of the derivation that each hangs below, whether that has a class or not.
     """
     C = len(classes)
     kinds = torch.tensor([grammar.kind(name) for name in classes])
@@ -112,7 +122,12 @@ def assembly(grammar: Grammar, classes: tuple[str, ...], graph: Graph, centre: T
         rows = (stage[of_class] == number_of) & together & ~(one + other).isnan().any(1)
         forward = (other[rows] > one[rows]).float().mean(0) if rows.any() else torch.zeros(2)
         ordered = (forward >= ORDERED).nonzero().flatten()
-        axis[stage == number_of] = int(forward.argmax()) if len(ordered) else -1
+        axis[stage == number_of] = int(forward.argmax()) if len(ordered) else FREE
+    if group is not None:
+        mixed = group[scene, first] != group[scene, later]
+        of_first, of_later = (stage[label[scene, index]] for index in (first, later))
+        for number_of in of_first[mixed & (of_first == of_later)].unique().tolist():
+            axis[(stage == number_of) & (axis == FREE)] = SHUFFLED
     return Assembly(kinds, above, stage, axis)
 
 
@@ -120,7 +135,7 @@ def along_the_widest(made: Assembly, found: Found) -> Assembly:
     """With an axis for the siblings that no program orders: that along which the objects found vary most."""
     axis = made.axis.clone()
     for stage in made.stage.unique().tolist():
-        free = (made.stage == stage) & (axis < 0)
+        free = (made.stage == stage) & (axis == FREE)
         if not free.any():
             continue
         some = free[found.label]

@@ -29,12 +29,14 @@ class Valued(NamedTuple):
     Attributes:
         drawn: the labels.
         parent: ``(N, M)`` int64 node index of the nearest parent that has a class, -1 for none.
+        group: ``(N, M)`` int64 node index in the derivation of the parent, whether that has a class or not.
         u: ``(N, M, S)``, NaN where a node has none.
         overall: ``(N, G)`` of the scenes' sites.
     """
 
     drawn: Examples
     parent: Tensor
+    group: Tensor
     u: Tensor
     overall: Tensor
 

@@ -66,6 +66,7 @@ class ValuedRenders:
                 visible=nodes(drawn.visible, 0.0),
             ),
             seen.parent,
+            nodes(derivation.parent, -1),
             nodes(u, torch.nan),
             torch.cat(scene, 1) if scene else torch.zeros(N, 0),
         )
@@ -83,7 +84,8 @@ def joined(parts: list[Valued]) -> Valued:
         image=torch.cat([part.drawn.image for part in parts]),
         **{name: all_of(name) for name in ("label", "centre", "size", "visible")},
     )
-    return Valued(drawn, all_of("parent"), all_of("u", torch.nan), torch.cat([part.overall for part in parts]))
+    overall = torch.cat([part.overall for part in parts])
+    return Valued(drawn, all_of("parent"), all_of("group"), all_of("u", torch.nan), overall)
 
 
 def _padded(part: Tensor, nodes: int, empty: float) -> Tensor:

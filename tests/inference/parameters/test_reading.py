@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import truncnorm
 
+from probscene.derivation import expand
+from probscene.grammar import Grammar
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import STRIDE as CELL
 from probscene.inference.features.counting.batches import cells
@@ -102,7 +104,8 @@ def test_graphs_are_those_that_were_drawn(trays):
     seen = Seen.of(trays.grammar, trays.classes, derivation)
     place = torch.rand(*seen.kind.shape, 2) * 60
     place[..., 0] = place[..., 0].sort(1).values  # siblings go from the left to the right
-    made = assembly(trays.grammar, trays.classes, Graph.of(seen.kind, seen.parent), place)
+    group = seen.taken(derivation.parent)
+    made = assembly(trays.grammar, trays.classes, Graph.of(seen.kind, seen.parent), place, group)
     n, m = (seen.kind >= 0).nonzero(as_tuple=True)
     label = torch.tensor([trays.classes.index(trays.grammar.kinds[k]) for k in seen.kind[n, m].tolist()])
     parent = seen.parent[n, m]
@@ -121,6 +124,30 @@ def test_graphs_are_those_that_were_drawn(trays):
     assert torch.equal(mean[n, m], u)
 
 
+def test_siblings_of_groups_that_cannot_be_seen_come_in_any_order():
+    """Below two lanes that have no class, cars' order says nothing; below one it is that along the image."""
+    for text, any_order in (("Scene -> left(Cars) right(Cars) sun", True), ("Scene -> left(Cars) sun", False)):
+        grammar = Grammar(f"{text}\nCars -> car car car")
+        derivation = expand(grammar, lambda t, frontier, previous: frontier.symbol, 20, 4)
+        seen = Seen.of(grammar, ("car", "sun"), derivation)
+        place = torch.rand(20, seen.kind.shape[1], 2, generator=torch.Generator().manual_seed(0))
+        group = seen.taken(derivation.parent)
+        made = assembly(grammar, ("car", "sun"), Graph.of(seen.kind, seen.parent), place, group)
+        n, m = (seen.kind >= 0).nonzero(as_tuple=True)
+        label = (seen.kind[n, m] == grammar.kind("sun")).long()
+        nothing = torch.zeros(len(n), 0, 6)
+        found = Found(n, label, place[n, m], torch.zeros(len(n), 2), nothing, torch.zeros(20, 0, 6))
+        made = along_the_widest(made, found)
+        orders = []
+        for seed in (0, 1):
+            torch.manual_seed(seed)
+            orders.append([[k for k, _ in scene] for scene in made.scenes(found, 20)])
+            for scene in orders[-1]:
+                assert sorted(scene) == list(range(min(scene), max(scene) + 1))
+                assert label[scene[0]] == 1  # the sun comes first, whatever the cars do
+        assert (orders[0] != orders[1]) == any_order
+
+
 def test_batches_are_joined_as_they_are(model):
     """Each part's rows come back, padded to the most nodes."""
     classes = class_table(model.grammar.kinds, model.classes)
@@ -137,7 +164,11 @@ def test_batches_are_joined_as_they_are(model):
         M = part.parent.shape[1]
         assert torch.equal(whole.drawn.image[rows], part.drawn.image)
         assert torch.equal(whole.overall[rows], part.overall)
-        for one, other in ((whole.parent, part.parent), (whole.drawn.label, part.drawn.label)):
+        for one, other in (
+            (whole.parent, part.parent),
+            (whole.group, part.group),
+            (whole.drawn.label, part.drawn.label),
+        ):
             assert torch.equal(one[rows, :M], other) and (one[rows, M:] == -1).all()
         assert torch.equal(whole.u[rows, :M].nan_to_num(-1), part.u.nan_to_num(-1)) and whole.u[rows, M:].isnan().all()
 
