@@ -1,8 +1,8 @@
 """Which sites can be read, and how: tried on renders of the prior that nothing was trained on.
 
 A site is read on a line, on a circle, where u = 0 and u = 1 look alike, or on a circle that u goes round twice, where
-two values look alike. Skill is the share of the variance of u that a reading explains. Axis letters: K objects, S
-sites.
+two values look alike. Skill is the share of the variance of u that a reading explains; of a site of which few objects
+were seen, only as much as is sure. Axis letters: K objects, S sites.
 """
 
 from typing import NamedTuple
@@ -16,6 +16,8 @@ LINE, CIRCLE, TWICE = range(3)
 READABLE = 0.2  # least skill of a site that is learnt
 CLEARLY = 0.05, 0.15  # by how much a circle, and one gone round twice, must explain more than what is simpler
 LEAST_SD = 2e-3
+GUESSES = 41  # values that a guess may have
+SURE = 2.0  # standard errors between a share as it was found and the least that it may be
 
 
 class Skill(NamedTuple):
@@ -23,7 +25,8 @@ class Skill(NamedTuple):
 
     Attributes:
         way: ``(S,)`` int64, ``LINE``, ``CIRCLE`` or ``TWICE``.
-        share: ``(S,)`` of the variance that is explained; NaN where the site was never seen.
+        share: ``(S,)`` of the variance that is explained, at least; NaN where the site was seen in fewer than two
+            objects.
     """
 
     way: Tensor
@@ -46,21 +49,20 @@ class Skill(NamedTuple):
         for s in range(u.shape[1]):
             there = ~u[:, s].isnan()
             true, said = u[there, s], raw[there, s]
-            if not len(true):
+            if len(true) < 2:
                 ways.append(LINE)
                 shares.append(torch.nan)
                 continue
-            errors = (
-                cut_mean(*normal(said)) - true,
-                _apart(_turned(said, 1), true, 1.0),
-                _apart(_turned(said, 2), true, 0.5),
-            )
-            each = [1 - 12 * float(errors[0].square().mean()), 1 - 12 * float(errors[1].square().mean())]
-            each.append(1 - 48 * float(errors[2].square().mean()))
+            found = [
+                _explained(cut_mean(*normal(said)), true, 0),
+                _explained(_turned(said, 1), true, 1),
+                _explained(_turned(said, 2), true, 2),
+            ]
+            each = [share for share, _ in found]
             way = CIRCLE if each[1] > each[0] + CLEARLY[0] else LINE
             way = TWICE if each[2] > each[way] + CLEARLY[1] else way
             ways.append(way)
-            shares.append(each[way])
+            shares.append(each[way] - SURE * found[way][1])
         return Skill(torch.tensor(ways), torch.tensor(shares))
 
     def read(self, raw: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,6 +85,20 @@ def _turned(said: Tensor, times: int) -> Tensor:
     """u by the cosine and sine of so many turns, -0.5..0.5 over ``times``."""
     cosine, sine = said[..., 2 * times], said[..., 2 * times + 1]
     return torch.atan2(sine, cosine) / (2 * torch.pi * times)
+
+
+def _explained(read: Tensor, true: Tensor, times: int) -> tuple[float, float]:
+    """The share of u's variance that a reading explains, against the best guess without one, and its standard error, by
+    the delta method; on a line, or on a circle that u goes round so many times."""
+    whole = 1 / max(times, 1)
+    guess = torch.linspace(0, whole, GUESSES).unsqueeze(1)
+
+    def squared(said: Tensor) -> Tensor:
+        return (_apart(said, true, whole) if times else said - true).square()
+
+    error, least = squared(read), squared(guess[squared(guess).mean(1).argmin()])
+    part = float(error.mean() / least.mean())
+    return 1 - part, float((error - part * least).std() / least.mean()) / len(true) ** 0.5
 
 
 def _apart(one: Tensor, other: Tensor, whole: float) -> Tensor:

@@ -96,6 +96,27 @@ def test_what_says_nothing_is_not_readable():
     assert not Skill.of(raw, torch.full((600, 1), torch.nan)).readable.any()
 
 
+@given(seeds, st.integers(0, 40))
+def test_what_is_the_same_for_all_says_nothing_however_few_they_are(seed, number):
+    rng = torch.Generator().manual_seed(seed)
+    u, raw = torch.rand(number, 1, generator=rng), torch.randn(1, 1, 6, generator=rng).expand(number, 1, 6)
+    share = Skill.of(raw, u).share
+    assert share.isnan().all() if number < 2 else float(share) < 0.05
+
+
+def test_a_site_that_few_objects_have_is_hardly_ever_read_by_chance():
+    torch.manual_seed(0)
+    readable = [bool(Skill.of(torch.randn(20, 1, 6), torch.rand(20, 1)).readable) for _ in range(500)]
+    assert sum(readable) < 5
+
+
+def test_skill_is_the_share_of_the_variance_that_is_explained():
+    u = torch.rand(20_000, generator=torch.Generator().manual_seed(1))
+    for error in (0.02, 0.06):
+        share = float(Skill.of(said(u, error), u[:, None]).share)
+        assert share == pytest.approx(1 - 12 * error**2, abs=0.01)
+
+
 def test_graphs_are_those_that_were_drawn(trays):
     """From the true places of the nodes, and with them as what a reader finds, come the scenes' own graphs."""
     seed_everything(0)
