@@ -20,6 +20,7 @@ from probscene.sampling import Scenes, run_program, sample
 from probscene.world import World
 
 DRAWN = 200  # scenes of which a model's sites are found
+ENOUGH, POINT_MASS = 50, 0.05  # values of a site, and the share of them that are one, that show a point mass
 NEAR = 1e-6  # from 0 and 1; the logit of what is nearer is no number
 LEARN = "learn"  # of a site's ``infer``
 
@@ -101,8 +102,9 @@ def find_sites(model: SceneModel) -> tuple[Site, ...]:
     kind, found = scenes.derivation.kind, []
     for name, value in scenes.parameters.items():
         mask = scenes.site_mask[name]
-        if name in quantiles.kept:
-            found.append(Site(name, (), quantiles.kept[name]))
+        because = quantiles.kept.get(name, "") or _unlike_uniform(quantiles.found.get(name))
+        if because:
+            found.append(Site(name, (), because))
         elif value.shape[1] == 1 and not _masked_as_nodes(mask, kind):
             found.append(Site(name, ()))
         elif mask.shape == kind.shape and not (mask & (kind < 0)).any():  # a plate of another sort may be as wide
@@ -112,6 +114,17 @@ def find_sites(model: SceneModel) -> tuple[Site, ...]:
         else:
             found.append(Site(name, (), "it belongs to no node of the scene"))
     return tuple(found)
+
+
+def _unlike_uniform(u: Tensor | None) -> str:
+    """Why the u of a site is not uniform under its prior; empty where nothing says so."""
+    if u is None:
+        return ""
+    there = u[~u.isnan()]
+    if len(there) < ENOUGH:
+        return ""
+    most = int(there.unique(return_counts=True)[1].max())
+    return "its prior has a point mass" if most > POINT_MASS * len(there) else ""
 
 
 def _masked_as_nodes(mask: Tensor, kind: Tensor) -> bool:

@@ -17,6 +17,7 @@ def test_every_site_says_whether_it_can_be_learnt(trays):
     assert found["ball.fixed"].keeps == "the program says so"
     assert found["ball.odd"].keeps == "Beta has no inverse CDF"
     assert found["decoration.x"].keeps == "it belongs to no node of the scene"
+    assert found["ball.capped"].keeps == "its prior has a point mass"
     assert found["floor.turn"].keeps == "it belongs to no node that has a class"
 
 
