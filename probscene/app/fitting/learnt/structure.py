@@ -27,6 +27,7 @@ from ..storage import Keeper
 from .outcome import compared
 
 FIRST, AGAIN = "guide", "structure-again"  # of the checkpoints
+BEFORE = "guide-first"  # of the guide that parameters are learnt with
 SLOWER = 0.5  # of the first pass's rate
 
 
@@ -41,7 +42,10 @@ def learn_structure(run: RunFolder, observer: Observer, net: FeatureNet, real: T
     """
     preset, seed = run.preset, run.record["seed"]
     seed_everything(batch_seed(seed, 2))
-    guide = run.new_guide()
+    guide, known = run.new_guide(), run.read_tensors(BEFORE)
+    if known is not None:
+        guide.load_state_dict(known)
+        return guide
     objective = _objective(run, run.model, observer, net, guide, preset.draws_per_structure)
     rate, seeds = preset.learning_rate, batch_seed(seed, 3)
     trainer = _trainer(run, run.model, guide, objective, real, preset.batches, rate, seeds)
@@ -57,6 +61,8 @@ def learn_structure(run: RunFolder, observer: Observer, net: FeatureNet, real: T
             progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
         )
     _run(trainer, keep, "structure", progress)
+    if "parameters" in preset.learn:
+        run.write_tensors(BEFORE, guide.state_dict())
     return guide
 
 
