@@ -6,8 +6,8 @@ Targets are those of ``learn_multi_mnist.py``: upright digits of t10k in an even
 the learnt structure alone, and structure and parameters: how far digits are from their places in the row and from its
 line, pixels; how far they are turned, degrees; how many are more than five pixels off; and KID from 500 target images
 in EfficientNet-Lite0's features, with an interval, and its floor, another 500 target images. Total variation of the
-number of digits and of their classes is that of the structures. FOLDER holds the runs, ``results.json`` and a picture
-of each target, ``scenes-K.png``: prior, structure alone, both, target.
+number of digits and of their classes is that of the structures, before and after their second pass. FOLDER holds the
+runs, ``results.json`` and a picture of each target, ``scenes-K.png``: prior, structure alone, both, target.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.chunks import CHUNK, draw_chunk
 from probscene.app.files import write_json
+from probscene.app.fitting.learnt.structure import BEFORE
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.session import timing
 from probscene.app.loading import renderer_for
@@ -87,11 +88,15 @@ def measured(target: int, args: argparse.Namespace) -> dict:
     run = fit("multi_mnist", images, args.preset, args.seed, out=args.out / f"both-{target}", **learn)
     look, real = EfficientNetLite(), ImageFolder(images, run.model.canvas, run.model.channels)
     of_real = look.embed(torch.stack([real.load(i) for i in range(2 * IMAGES)]))
+    first, before = run.new_guide().eval(), run.read_tensors(BEFORE)
+    assert before is not None
+    first.load_state_dict(before)
     row: dict = {
         "target": target,
         "seed": args.seed,
         "seconds": timing(run),
         "total_variation": distances(run.guide, target),
+        "total_variation_before": distances(first, target),
     }
     row["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
     panels, learnt = [], run.guide.suits

@@ -35,6 +35,7 @@ from .sites import Site, find_sites, having
 TRIED = 200  # renders that a reader is tried on
 OWN = 0.65  # of a round's renders are the guide's own
 ARRANGED = 0.5  # of the other renders are arranged
+FEWEST = 20  # readings of a site in the target, from which it is learnt
 NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
 
 
@@ -54,6 +55,7 @@ class ParameterLearning:
         unit, total, done: see ``Training``; steps of all trainings.
         sites: of the model.
         skill: of the reader, for the sites of nodes and then of scenes that are not kept; None before it is tried.
+        readings_of: how many readings of each of these sites there are in the target.
         guide: what is learnt; None before it is known which sites are, and where there are none.
     """
 
@@ -81,16 +83,33 @@ class ParameterLearning:
         self.lengths += [schedule.round_reader_steps, schedule.round_steps] * schedule.rounds
         self.total, self.done, self.phase = sum(self.lengths), 0, 0
         self.skill: Skill | None = None
+        self.readings_of = torch.zeros(0, dtype=torch.int64)
         self.guide: ParameterGuide | None = None
         self.inner: Training | None = None
 
     @property
     def learnt(self) -> tuple[Site, ...]:
-        """The sites that can be read, in the order of the program; empty before the reader was tried."""
-        if self.skill is None:
-            return ()
-        good = dict(zip((*self.node_sites, *self.scene_sites), self.skill.readable.tolist(), strict=True))
+        """The sites that can be read, and are in the target, in the order of the program; empty before the reader was
+        tried."""
+        good = dict(zip((*self.node_sites, *self.scene_sites), self._good.tolist(), strict=False))
         return tuple(site for site in self.sites if good.get(site))
+
+    def why_not(self, site: Site) -> str:
+        """Why a site keeps its prior; empty where it is learnt."""
+        if site.keeps or site in self.learnt:
+            return site.keeps
+        assert self.skill is not None
+        number = [*self.node_sites, *self.scene_sites].index(site)
+        if not self.skill.readable[number]:
+            return "it cannot be read in renders"
+        return f"it was read {int(self.readings_of[number])} times in the target, of {FEWEST} that it takes"
+
+    @property
+    def _good(self) -> Tensor:
+        """``(S + G,)`` bool."""
+        if self.skill is None:
+            return torch.zeros(0, dtype=torch.bool)
+        return self.skill.readable & (self.readings_of >= FEWEST)
 
     def run(self, each: Report | None = None) -> None:
         """Take the steps that are left.
@@ -127,7 +146,7 @@ class ParameterLearning:
         tensors = {f"reader.{key}": value for key, value in self.reader.state_dict().items()}
         tensors["phase"] = torch.tensor(self.phase)
         if self.skill is not None:
-            tensors |= {"skill.way": self.skill.way, "skill.share": self.skill.share}
+            tensors |= {"skill.way": self.skill.way, "skill.share": self.skill.share, "readings": self.readings_of}
         if self.guide is not None:
             tensors |= {f"guide.{key}": value for key, value in self.guide.net.state_dict().items()}
         if self.inner is not None:
@@ -140,7 +159,7 @@ class ParameterLearning:
         self.reader.load_state_dict(_within(tensors, "reader."))
         self.reader.eval()
         if "skill.way" in tensors:
-            self.skill = Skill(tensors["skill.way"], tensors["skill.share"])
+            self.skill, self.readings_of = Skill(tensors["skill.way"], tensors["skill.share"]), tensors["readings"]
             self.guide = self._new_guide()
         if self.guide is not None:
             self.guide.net.load_state_dict(_within(tensors, "guide."))
@@ -180,20 +199,40 @@ class ParameterLearning:
         of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
         of_scenes = Skill.of(found.overall, valued.overall)
         self.skill = Skill(*(torch.cat(pair) for pair in zip(of_nodes, of_scenes, strict=True)))
+        images = self.images()
+        objects = self.reader.find(images).label.bincount(minlength=len(self.model.classes))
+        of_class = dict(zip(self.model.classes, objects.tolist(), strict=True))
+        number = [sum(of_class.get(kind, 0) for kind in site.kinds) for site in self.node_sites]
+        self.readings_of = torch.tensor([*number, *(len(images) for _ in self.scene_sites)], dtype=torch.int64)
         self.guide = self._new_guide()
 
     def _new_guide(self) -> ParameterGuide | None:
         """Of the sites that can be read; None where there are none."""
         return ParameterGuide(self.model, self.learnt, self.structure) if self.learnt else None
 
+    def readings(self, images: Tensor) -> dict[str, Tensor]:
+        """u of each learnt site as it is read in ``(L, C, H, W)`` uint8 images, of all objects that have it or of all
+        scenes."""
+        found, (nodes, scenes) = self.reader.find(images), self._skills()
+        kind = torch.tensor([self.model.grammar.kind(name) for name in self.model.classes])[found.label]
+        has = having(self.model.grammar, self.node_sites, kind).unbind(1)
+        each = [u[there] for u, there in zip(nodes.read(found.raw)[0].unbind(1), has, strict=True)]
+        names = [site.name for site in (*self.node_sites, *self.scene_sites)]
+        columns = dict(zip(names, [*each, *scenes.read(found.overall)[0].unbind(1)], strict=True))
+        return {site.name: columns[site.name].clamp(0, 1) for site in self.learnt}
+
+    def _skills(self) -> tuple[Skill, Skill]:
+        """Of the sites of nodes, and of scenes."""
+        assert self.skill is not None
+        S = len(self.node_sites)
+        return Skill(*(part[:S] for part in self.skill)), Skill(*(part[S:] for part in self.skill))
+
     def _read(self) -> Values:
         """What the reader reads in the target."""
-        assert self.skill is not None
         seed_everything(batch_seed(self.seed, 3, self.phase))
         images = self.images()
-        found, S = self.reader.find(images), len(self.node_sites)
-        skills = Skill(*(part[:S] for part in self.skill)), Skill(*(part[S:] for part in self.skill))
-        node, scene = (skill.readable.nonzero().flatten() for skill in skills)
+        found, skills, S = self.reader.find(images), self._skills(), len(self.node_sites)
+        node, scene = (some.nonzero().flatten() for some in self._good.tensor_split([S]))
         mean, sd = (part[:, node] for part in skills[0].read(found.raw))
         scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
         kind, parent, *nodes = along_the_widest(self._assembly(), found).values(found, len(images), mean, sd)

@@ -28,6 +28,7 @@ from probscene.support import Support
 from probscene.world import World
 
 DRAWN = 200  # scenes of which a model's sites are found
+ENOUGH, POINT_MASS = 50, 0.05  # values of a site, and the share of them that are one, that show a point mass
 NEAR = 1e-6  # from 0 and 1; the logit of what is nearer is no number
 LEARN = "learn"  # of a site's ``infer``
 
@@ -117,8 +118,9 @@ def _sites(model: SceneModel, classes: tuple[str, ...]) -> tuple[Site, ...]:
     kind, found = scenes.derivation.kind, []
     for name, value in scenes.parameters.items():
         mask = scenes.site_mask[name]
-        if name in quantiles.kept:
-            found.append(Site(name, (), quantiles.kept[name]))
+        because = quantiles.kept.get(name, "") or _unlike_uniform(quantiles.found.get(name))
+        if because:
+            found.append(Site(name, (), because))
         elif value.shape[1] == 1 and not _masked_as_nodes(mask, kind):
             found.append(Site(name, ()))
         elif mask.shape == kind.shape and not (mask & (kind < 0)).any():  # a plate of another sort may be as wide
@@ -196,6 +198,17 @@ def site_name(grammar: Grammar, name: str) -> str:
     return name
 
 
+def _unlike_uniform(u: Tensor | None) -> str:
+    """Why the u of a site is not uniform under its prior; empty where nothing says so."""
+    if u is None:
+        return ""
+    there = u[~u.isnan()]
+    if len(there) < ENOUGH:
+        return ""
+    most = int(there.unique(return_counts=True)[1].max())
+    return "its prior has a point mass" if most > POINT_MASS * len(there) else ""
+
+
 def _masked_as_nodes(mask: Tensor, kind: Tensor) -> bool:
     """Whether a site with one value a scene stands on a plate of nodes, of which there is one."""
     return mask.shape == kind.shape and not mask.all()
@@ -223,7 +236,7 @@ def of_scenes(u: Tensor) -> Tensor:
 
 
 def having(grammar: Grammar, sites: tuple[Site, ...], kind: Tensor) -> Tensor:
-    """``(N, M, S)`` bool, which nodes have which of S sites, by the nodes' kinds ``(N, M)``; -1 pads."""
+    """``(..., S)`` bool, which nodes have which of S sites, by the nodes' kinds ``(...)``; -1 pads."""
     has = torch.zeros(len(grammar.kinds) + 1, len(sites), dtype=torch.bool)  # the last is padding
     for s, site in enumerate(sites):
         has[[grammar.kind(name) for name in site.kinds], s] = True

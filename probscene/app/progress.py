@@ -33,6 +33,7 @@ STAGES = {
     "pretraining": ("Pretraining", "epochs"),
     "structure": ("Structure", "batches"),
     "parameters": ("Parameters", "steps"),
+    "structure-again": ("Structure again", "batches"),
     "outcome": ("Outcome", "scenes"),
     "drawing": ("Drawing a target", "images"),
     "generating": ("Generating", "images"),

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from probscene.errors import ModelError
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import Scenes, sample
@@ -46,8 +47,13 @@ class ValuedRenders:
         return self.of(sample(model, policy, num))
 
     def of(self, scenes: Scenes) -> Valued:
-        """Of scenes of the model, whatever drew their parameters."""
+        """Of scenes of the model, whatever drew their parameters.
+
+        Raises:
+            ModelError: the program did not sample one of the sites.
+        """
         drawn, found = self.label(scenes), quantiles_of(self.model, scenes)
+        self._check(found)
         derivation = scenes.derivation.trimmed()
         seen = Seen.of(self.model.grammar, self.model.classes, derivation)
         N, M = derivation.kind.shape
@@ -70,6 +76,15 @@ class ValuedRenders:
             nodes(u, torch.nan),
             torch.cat(scene, 1) if scene else torch.zeros(N, 0),
         )
+
+    def _check(self, found: dict[str, Tensor]) -> None:
+        for site in (*self.node_sites, *self.scene_sites):
+            if site.name not in found:
+                raise ModelError(
+                    f"Expected site {site.name!r} in every call of the program of model {self.model.name!r}, actual a "
+                    "call without it; sample it always, inside scene.nodes(...) where only some scenes have it, or "
+                    "leave it out of learning with infer={'learn': False}."
+                )
 
 
 def joined(parts: list[Valued]) -> Valued:

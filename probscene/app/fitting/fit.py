@@ -1,8 +1,8 @@
 """The stages of a fit: from a model and unlabelled images to a learnt guide.
 
-Four stages: the feature network on prior renders, features of the target images, the guide's pretraining, and the
-learning of structure. Each goes on after an interruption to the same result. Labels play no part, but for a handful
-that a feature network may be given.
+The feature network on prior renders, features of the target images, the guide's pretraining and the learning of
+structure, of parameters, and of structure once more (``learnt``). Each goes on after an interruption to the same
+result. Labels play no part, but for a handful that a feature network may be given.
 """
 
 import json
@@ -16,12 +16,7 @@ from torch import Tensor, nn
 from probscene.dataset import ImageFolder, Images
 from probscene.errors import DataError, RunError
 from probscene.inference.features.base import FeatureNet, embed_all
-from probscene.inference.guides.base import Guide
-from probscene.inference.holding import Held
 from probscene.inference.judging.two_sample import NEEDED, check_features
-from probscene.inference.learn import Trainer
-from probscene.inference.objective import ScoreFunction
-from probscene.inference.pretrain import pretrain
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
@@ -33,6 +28,7 @@ from ..progress import Progress
 from .cache import NetworkCache
 from .learnt.outcome import compared, conclude, give_up
 from .learnt.parameters import learn_parameters
+from .learnt.structure import AGAIN, FIRST, learn_structure, learn_structure_again
 from .observer import RENDERED_AT_ONCE, Observer
 from .parts import inner
 from .run import RunFolder
@@ -80,12 +76,14 @@ def fit(
         if which is not None and not which.any():
             said = give_up(run)
         else:
-            guide = _learn(run, observer, net.net, real, progress)
+            guide = learn_structure(run, observer, net.net, real, progress)
             if "parameters" in run.preset.learn:
                 with threads(run.record["threads"]):
                     learn_parameters(run, observer, net.net, guide, images, progress, say or (lambda text: None))
+                learn_structure_again(run, net.net, real, guide, progress)
             said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
-    (run.path / "guide-checkpoint.safetensors").unlink(missing_ok=True)
+    for name in (FIRST, AGAIN):
+        (run.path / f"{name}-checkpoint.safetensors").unlink(missing_ok=True)
     if said and say is not None:
         say(said)
     return run.guide
@@ -249,52 +247,3 @@ def open_target(run: RunFolder, progress: Progress) -> Images:
         run.record["skip_bad"],
         lambda done, total: progress("reading", done, total, ""),
     )
-
-
-def _learn(run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, progress: Progress) -> Guide:
-    preset, model, seed = run.preset, run.model, run.record["seed"]
-    seed_everything(batch_seed(seed, 2))
-    guide = run.new_guide()
-    held = Held(model, {*run.unread, *(model.stuff if run.readings else ())}, preset.num_scenes)
-    objective = ScoreFunction(
-        held.beside(observer.observe(net, preset.draws_per_structure)),
-        held.added_to(run.divergence(inner(net))),
-        baseline=preset.baseline,
-        updates=preset.updates,
-        scale=preset.scale,
-        strata=guide.strata,
-        incompletion_weight=preset.incompletion_weight,
-        prior=model.pretraining_policy,
-        prior_kl_weight=preset.prior_kl_weight,
-    )
-    trainer = Trainer(
-        model,
-        guide,
-        objective,
-        real,
-        preset.batches,
-        preset.num_scenes,
-        preset.num_real,
-        preset.learning_rate,
-        preset.cosine,
-        seed=batch_seed(seed, 3),
-    )
-    keep = Keeper(run, "guide", trainer)
-    if trainer.done == 0:
-        epochs = preset.pretrain_epochs
-        pretrain(
-            guide,
-            model.pretraining_policy,
-            preset.pretrain_derivations,
-            epochs,
-            learning_rate=preset.pretrain_rate,
-            progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
-        )
-
-    def each(trainer: Training, diagnostics: dict[str, float]) -> None:
-        keep({"stage": "structure", **diagnostics})
-        progress("structure", trainer.done, preset.batches, f"cost {diagnostics['cost']:.3f}")
-
-    trainer.run(each)
-    keep.finish()
-    return guide

@@ -55,6 +55,7 @@ class Preset:
         prior_if_worse: keep the prior where what was learnt is farther from the target, beyond chance.
         learn: ``"structure"``, or ``"structure,parameters"``, where things stand and how they look as well.
         parameters: the schedule of the latter.
+        batches_again: of structure's second pass, whose scenes have learnt parameters; none where 0.
     """
 
     features: str = "count"
@@ -93,6 +94,7 @@ class Preset:
     prior_if_worse: bool = True
     learn: str = STRUCTURE
     parameters: ParameterSchedule = field(default_factory=ParameterSchedule)
+    batches_again: int = 20
 
     @staticmethod
     def of(record: dict[str, Any]) -> "Preset":

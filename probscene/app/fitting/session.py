@@ -34,7 +34,8 @@ from .scene_features import UNLIKE, unlike
 from .storage import check_free
 
 TIMING = "timing.json"
-STAGES = ("reading", "features", "readings", "target", "pretraining", "structure", "parameters", "outcome")
+BEFORE = ("reading", "features", "readings", "target", "pretraining")
+STAGES = (*BEFORE, "structure", "parameters", "structure-again", "outcome")
 
 Target = Path | str | Sequence[Path | str] | Any
 """A folder, a list of files, an array or a dataset of images, see ``open_images``."""

@@ -3,11 +3,13 @@
     run.json               the configuration, the model, the target, the version that wrote it
     model.py               a copy of the model's file, where it is not a built-in one
     guide.safetensors      the learnt guide; there once the fit is finished
+    guide-first.safetensors
+                           the guide before parameters were learnt, where they are
+    parameters.json        which sites are learnt, and what was read of them
     features.safetensors   the feature network
-    readings.json          how its features are read in the target's images, where they are suited to them
     outcome.json           how far prior and learnt scenes are from the target, and which are kept
     real.safetensors       features of the target images
-    readings.json          how each class is read, where a fit has chosen that
+    readings.json          how each class is read, where features are suited to the target's images
     log.jsonl              one line an update
     checkpoint.safetensors what ``--resume`` goes on from
 

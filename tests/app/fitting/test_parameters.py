@@ -12,24 +12,26 @@ import torch
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.fitting import storage
-from probscene.app.fitting.learnt import parameters
+from probscene.app.fitting.learnt import judged, parameters, structure
 from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
+from probscene.inference.judging.farther import Farther
 from probscene.inference.parameters.reading import reader, skill
 from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
 from probscene.structure import StructurePrior, counts
 
-LEARN = ("--learn", "structure,parameters")
+LEARN = ("--learn", "structure,parameters", "--set", "batches_again=3")
 ROW = Grammar("Scene -> Dots\nDots -> dot Dots | ε")
 PRIOR = StructurePrior(ROW, Dots=counts(0, 1, 1, 1))
 
 
 def anything_is_read(patch):
-    """Also what a reader of six steps says."""
+    """Also what a reader of six steps says; and it is kept."""
     patch.setattr(skill, "READABLE", -1e9)
     patch.setattr(reader, "LEAST_MASS", 1e-3)
+    patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -91,12 +93,9 @@ def test_parameters_that_are_no_better_are_not_used(both, tmp_path):
     assert RunFolder.at(run.path).guide.suits is None
 
 
-@pytest.mark.parametrize("stop", [6, 8, 11])  # in the reader's training, in likelihood, in a round
-def test_a_fit_goes_on_to_the_same_bytes(both, stop, call, discs, target, tmp_path, monkeypatch):
-    words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
-    monkeypatch.setattr(storage, "SAVE_EVERY", 0)
-    anything_is_read(monkeypatch)
-    run = parameters.ParameterLearning.run
+def interrupted_at(training, stop):
+    """A training's ``run`` that is interrupted after so many steps."""
+    run = training.run
 
     def interrupted(self, each=None):
         def heard(training, line):
@@ -106,13 +105,42 @@ def test_a_fit_goes_on_to_the_same_bytes(both, stop, call, discs, target, tmp_pa
 
         run(self, heard)
 
+    return interrupted
+
+
+@pytest.mark.parametrize(
+    ("of", "stop"),
+    [("ParameterLearning", 6), ("ParameterLearning", 8), ("ParameterLearning", 11), ("Again", 2)],
+    ids=["reader", "likelihood", "round", "structure again"],
+)
+def test_a_fit_goes_on_to_the_same_bytes(both, of, stop, call, discs, target, tmp_path, monkeypatch):
+    words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
+    monkeypatch.setattr(storage, "SAVE_EVERY", 0)
+    anything_is_read(monkeypatch)
     with monkeypatch.context() as patch:
-        patch.setattr(parameters.ParameterLearning, "run", interrupted)
+        if of == "Again":
+            trainer = structure.Trainer
+            again = type("Again", (trainer,), {"run": interrupted_at(trainer, stop)})
+            first = iter((trainer, again))
+            patch.setattr(structure, "Trainer", lambda *args, **named: next(first)(*args, **named))
+        else:
+            patch.setattr(parameters.ParameterLearning, "run", interrupted_at(parameters.ParameterLearning, stop))
         assert call(*words).code != 0
     assert not (tmp_path / "run" / "guide.safetensors").exists()
     done = call("fit", "--resume", "--out", tmp_path / "run")
     assert done.code == 0, done.err
     assert (tmp_path / "run" / "guide.safetensors").read_bytes() == (both / "guide.safetensors").read_bytes()
+    assert not list((tmp_path / "run").glob("*-checkpoint.safetensors"))
+
+
+def test_structure_is_learnt_again_in_the_learnt_layout(both):
+    lines = [json.loads(line) for line in (both / "log.jsonl").read_text().splitlines()]
+    assert [line["batch"] for line in lines if line["stage"] == "structure-again"] == [1, 2, 3]
+    site = RunFolder.at(both).parameters["sites"][0]["read"]
+    assert {name: len(site[name]) for name in ("prior", "learnt", "target")} == dict.fromkeys(
+        site.keys() - {"distance"}, 21
+    )
+    assert set(site["distance"]) == {"prior", "learnt", "floor"}
 
 
 def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_path):

@@ -22,6 +22,13 @@ TRAYS = Grammar("""
 TRAYS_PRIOR = StructurePrior(TRAYS, Trays=counts(1, 2, 2), Balls=counts(1, 1, 1, 1))
 
 
+class Capped(dist.Uniform):
+    """A third of its values are the largest."""
+
+    def rsample(self, sample_shape=()):
+        return super().rsample(torch.Size(sample_shape)).mul(1.5).clamp(max=0.999)
+
+
 @pytest.fixture(scope="session")
 def trays():
     """The model; a ball's place depends on its tray's, and its shade on its size."""
@@ -39,6 +46,7 @@ def trays():
             shade = pyro.sample("ball.shade", dist.Uniform(0.3, 0.5 + size / 8))
             pyro.sample("ball.fixed", dist.Uniform(0.0, 1.0), infer={"learn": False})
             pyro.sample("ball.odd", dist.Beta(2.0, 2.0))
+            pyro.sample("ball.capped", Capped(0.0, 1.0))
         with scene.nodes("floor"):
             pyro.sample("floor.turn", dist.Uniform(0.0, 1.0))
         with scene.nodes("hidden"):

@@ -1,10 +1,18 @@
 """Parameters learnt from values, and from images."""
 
+from functools import partial
+
 import pytest
 import torch
 
+from probscene.inference.features.base import class_table, examples
+from probscene.inference.features.counting.net import CountNet
+from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, log_density, posterior_draws
 from probscene.inference.parameters.net import Graph, ParameterNet
+from probscene.inference.parameters.reading import reader
+from probscene.inference.parameters.schedule import ParameterSchedule
+from probscene.renderers.sprites import SpriteRenderer
 
 
 def rows(number=300, sd=0.01, noise=0.0, seed=0):
@@ -66,3 +74,31 @@ def test_learning_goes_on_to_the_same_bits():
     second.run()
     for one, other in zip(whole.net.parameters(), second.net.parameters(), strict=True):
         assert torch.equal(one, other)
+
+
+def test_one_layout_in_all_images_is_learnt_as_such():
+    torch.manual_seed(0)
+    net, values = ParameterNet(1, 2, 0, hidden=8), rows(60, sd=1e-6)
+    MaximumLikelihood(net, values, steps=120, images=60, learning_rate=2e-2).run()
+    again = posterior_draws(net, values, 4).nodes
+    assert torch.isfinite(again).all() and float((again - values.nodes).abs().max()) < 1e-4
+
+
+def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
+    """Nothing is learnt of a site that was hardly read, and it is said."""
+    monkeypatch.setattr(reader, "LEAST_MASS", 10.0)  # no object is found
+    counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=0, reader_images=2)
+    empty = torch.zeros(30, 3, 64, 64, dtype=torch.uint8)
+    learning = ParameterLearning(trays, trays.prior, counts, label, lambda: empty, schedule)
+    learning.run()
+    assert learning.skill is not None
+    learning.skill = learning.skill._replace(share=torch.ones_like(learning.skill.share))
+    site = next(site for site in learning.sites if site.name == "ball.away")
+    assert [site.name for site in learning.learnt] == ["scene.bright"]
+    assert learning.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
+
+
+def _labels(render, classes, scenes):
+    return examples(render(scenes.drawing), classes)

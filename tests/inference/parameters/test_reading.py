@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import truncnorm
 
 from probscene.derivation import expand
+from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import STRIDE as CELL
@@ -19,7 +20,7 @@ from probscene.inference.parameters.reading.assembly import along_the_widest, as
 from probscene.inference.parameters.reading.reader import Found, blocks, circles, cut_draw, cut_mean
 from probscene.inference.parameters.reading.skill import CIRCLE, LINE, TWICE, Skill
 from probscene.inference.parameters.reading.valued import ValuedRenders, joined
-from probscene.inference.parameters.sites import find_sites
+from probscene.inference.parameters.sites import Site, find_sites
 from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
@@ -192,6 +193,12 @@ def test_batches_are_joined_as_they_are(model):
         ):
             assert torch.equal(one[rows, :M], other) and (one[rows, M:] == -1).all()
         assert torch.equal(whole.u[rows, :M].nan_to_num(-1), part.u.nan_to_num(-1)) and whole.u[rows, M:].isnan().all()
+
+
+def test_a_site_that_a_call_leaves_out_is_named(trays):
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    with pytest.raises(ModelError, match=r"site 'tray\.gone' in every call of the program of model 'trays'"):
+        ValuedRenders(trays, label, (Site("tray.gone", ("tray",)),), ()).draw(3, trays.prior)
 
 
 def _labels(render, classes, scenes):

@@ -35,6 +35,7 @@ def test_every_site_says_whether_it_can_be_learnt(trays):
     assert found["ball.odd"].keeps == "Beta has no inverse CDF"
     assert found["decoration.x"].keeps == "it belongs to no node of the scene"
     assert found["hidden.depth"].keeps == "it belongs to no node that has a class"
+    assert found["ball.capped"].keeps == "its prior has a point mass"
 
 
 def test_a_node_that_each_scene_has_one_of_is_the_scenes(trays):

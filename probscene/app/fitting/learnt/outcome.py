@@ -59,7 +59,8 @@ def conclude(
     policies: tuple[Policy, ...] = (guide.eval(), run.model.prior)
     for i, policy in enumerate(policies):
         seed_everything(batch_seed(run.record["seed"], 4, i))
-        observe, parts, counts = observer.observe(net, run.preset.draws_per_structure), [], []
+        draws = 1 if policy.suits else run.preset.draws_per_structure
+        observe, parts, counts = observer.observe(net, draws), [], []
         for first in range(0, number, RENDERED_AT_ONCE):
             scenes = sample(run.model, policy, min(RENDERED_AT_ONCE, number - first))
             parts.append(observe(scenes))

@@ -14,19 +14,17 @@ from probscene.dataset import Images
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.guides.base import Guide
-from probscene.inference.judging.farther import farther
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.sites import Site
 from probscene.inference.training import Training, batch_seed
-from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.sampling import sample, seed_everything
 
 from ...progress import Progress
-from ..observer import RENDERED_AT_ONCE, Observer
+from ..observer import Observer
 from ..parts import inner
 from ..storage import Keeper
+from .judged import judged
 
 if TYPE_CHECKING:
     from ..run import RunFolder
@@ -83,7 +81,7 @@ def learn_parameters(
         learning.run(each)
         keep.finish()
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
-        run.write_parameters(_record(learning) | _judged(run, guide, learning.guide, _some(target, held, JUDGED)))
+        run.write_parameters(_record(run, guide, learning, _some(target, held, JUDGED)))
         run.write_tensors(NAME, kept)
         (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
     say(_said(run.parameters))
@@ -120,42 +118,19 @@ def _some(images: Images, which: Tensor, most: int) -> Tensor:
     return torch.stack([images.load(row) for row in rows.tolist()])
 
 
-def _record(learning: ParameterLearning) -> dict[str, Any]:
+def _record(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Tensor) -> dict[str, Any]:
     """For JSON."""
     assert learning.skill is not None
     shares = learning.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
+    found = judged(run, guide, learning, held)
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
         share, is_learnt = skill.get(site, torch.nan), site in learning.learnt
-        because = site.keeps or ("" if is_learnt else "it cannot be read in renders")
-        known = share if share == share else None
+        known, because = share if share == share else None, learning.why_not(site)
         about = {"name": site.name, "kinds": site.kinds, "learnt": is_learnt, "skill": known, "because": because}
-        sites.append(about)
-    return {"sites": sites}
-
-
-def _judged(run: "RunFolder", guide: Guide, learnt: ParameterGuide | None, held: Tensor) -> dict[str, Any]:
-    """Whether learnt parameters come nearer to images that nothing was learnt from than the prior's, by EfficientNet's
-    pooled features."""
-    if learnt is None:
-        return {"kept": "prior"}
-    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
-
-    look = EfficientNetLite().embed
-    found = []
-    for i, model in enumerate((learnt.suited(run.model), run.model)):
-        seed_everything(batch_seed(run.record["seed"], 6, i))
-        found.append(torch.cat([look(images) for images in _renders(run, model, guide, len(held))]).double().numpy())
-    distances = farther(found[0], found[1], look(held).double().numpy())
-    kept = "learnt" if distances.one < distances.other else "prior"
-    return {"kept": kept, "learnt": distances.one, "prior": distances.other}
-
-
-def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> list[Tensor]:
-    observer = Observer(model, run.record["threads"])
-    starts = range(0, number, RENDERED_AT_ONCE)
-    return [observer.labelled(sample(model, guide, min(RENDERED_AT_ONCE, number - i))).image for i in starts]
+        sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
+    return {"sites": sites, **found.distances}
 
 
 def _said(record: dict[str, Any]) -> str:

@@ -1,0 +1,82 @@
+"""Learnt parameters, judged by images that nothing was learnt from.
+
+Axis letters: L images, C H W.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.stats import wasserstein_distance
+from torch import Tensor
+
+from probscene.inference.guides.base import Guide
+from probscene.inference.judging.farther import farther
+from probscene.inference.parameters.learning import ParameterLearning
+from probscene.inference.training import batch_seed
+from probscene.model import SceneModel
+from probscene.sampling import sample, seed_everything
+
+from ..observer import RENDERED_AT_ONCE, Observer
+
+if TYPE_CHECKING:
+    from ..run import RunFolder
+
+QUANTILES = np.linspace(0, 1, 21)
+
+
+class Judged(NamedTuple):
+    """For JSON.
+
+    Attributes:
+        distances: ``kept``, ``"learnt"`` where its renders are nearer to the images than those with the prior's
+            parameters, else ``"prior"``; and both energy distances.
+        sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
+            21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
+    """
+
+    distances: dict[str, Any]
+    sites: dict[str, dict[str, Any]]
+
+
+def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Tensor) -> Judged:
+    """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features."""
+    if learning.guide is None:
+        return Judged({"kept": "prior"}, {})
+    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
+
+    look, images = EfficientNetLite().embed, {"target": held}
+    for i, (name, model) in enumerate({"learnt": learning.guide.suited(run.model), "prior": run.model}.items()):
+        seed_everything(batch_seed(run.record["seed"], 6, i))
+        images[name] = _renders(run, model, guide, len(held))
+    seen = {name: look(some).double().numpy() for name, some in images.items()}
+    apart = farther(seen["learnt"], seen["prior"], seen["target"])
+    kept = "learnt" if apart.one < apart.other else "prior"
+    seed_everything(batch_seed(run.record["seed"], 6, 2))
+    readings = {name: learning.readings(some) for name, some in images.items()}
+    halves = [learning.readings(held[i::2]) for i in (0, 1)]
+    sites = {}
+    for site in learning.learnt:
+        each = {name: _quantiles(found[site.name]) for name, found in readings.items()}
+        away = {
+            name: _distance(readings[name][site.name], readings["target"][site.name]) for name in ("prior", "learnt")
+        }
+        sites[site.name] = each | {"distance": away | {"floor": _distance(*(half[site.name] for half in halves))}}
+    return Judged({"kept": kept, "learnt": apart.one, "prior": apart.other}, sites)
+
+
+def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> Tensor:
+    observer = Observer(model, run.record["threads"])
+    starts = range(0, number, RENDERED_AT_ONCE)
+    parts = [observer.labelled(sample(model, guide, min(RENDERED_AT_ONCE, number - i))).image for i in starts]
+    return torch.cat(parts)
+
+
+def _quantiles(u: Tensor) -> list[float]:
+    """Empty where nothing is read."""
+    return np.quantile(u.numpy(), QUANTILES).tolist() if len(u) else []
+
+
+def _distance(one: Tensor, other: Tensor) -> float | None:
+    """None where nothing is read in one of them."""
+    return float(wasserstein_distance(one.numpy(), other.numpy())) if len(one) and len(other) else None
