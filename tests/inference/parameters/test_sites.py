@@ -60,7 +60,7 @@ def test_sites_of_one_name_are_one_of_all_scenarios(rooms):
     assert found["ball.fixed"].keeps == "the program says so"
     assert found["lamp.height"].keeps == "scenario 'trays' does not have it"
     assert [name for name in found if name.startswith("ball")] == [
-        f"ball.{x}" for x in ("away", "size", "shade", "fixed", "odd")
+        f"ball.{x}" for x in ("away", "size", "shade", "fixed", "odd", "capped")
     ]
 
 
