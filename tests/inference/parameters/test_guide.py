@@ -38,8 +38,11 @@ def test_zero_weights_are_the_prior(trays, seed):
     guide = guide_of(trays, spread=0)
     one, other = drawn(trays, seed=seed), drawn(guide.suited(trays), seed=seed)
     assert torch.equal(one.derivation.rules, other.derivation.rules)
+    u = quantiles_of(trays, one)
     for name, value in one.parameters.items():
-        assert torch.allclose(value, other.parameters[name], atol=2e-3), name  # there and back through u in float32
+        tail = (u[name] < 1e-4) | (u[name] > 1 - 1e-4) if name in u else torch.zeros_like(value, dtype=torch.bool)
+        near = 5e-3 * float(value.double().std())  # there and back through u in float32, which is coarse in the tails
+        assert torch.allclose(value[~tail], other.parameters[name][~tail], atol=near), name
     assert torch.allclose(one.log_prob, other.log_prob, atol=2e-2)
 
 
