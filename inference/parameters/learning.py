@@ -19,12 +19,12 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
-from ..features.counting.net import CountNet
 from ..training import Report, Training, batch_seed
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
 from .net import Graph
 from .reading.assembly import along_the_widest, assembly
+from .reading.eyes import Eye
 from .reading.reader import Found, Reader
 from .reading.skill import Skill
 from .reading.training import MIN_VISIBLE, ReaderTraining, Valued
@@ -35,7 +35,7 @@ from .sites import Site, find_sites, having
 TRIED = 200  # renders that a reader is tried on
 OWN = 0.65  # of a round's renders are the guide's own
 ARRANGED = 0.5  # of the other renders are arranged
-FEWEST = 20  # readings of a site in the target, from which it is learnt
+ENOUGH = 20  # readings of a site in the target, from which it is learnt
 NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
 
 
@@ -45,7 +45,7 @@ class ParameterLearning:
     Args:
         model: the scene model.
         structure: the policy of the structures.
-        counts: a trained count network.
+        eye: what the reader sees by.
         label: renders and labels scenes.
         images: gives the target's, ``(L, C, H, W)`` uint8.
         schedule: how long.
@@ -65,7 +65,7 @@ class ParameterLearning:
         self,
         model: SceneModel,
         structure: Policy,
-        counts: CountNet,
+        eye: Eye,
         label: Label,
         images: Callable[[], Tensor],
         schedule: ParameterSchedule,
@@ -78,7 +78,7 @@ class ParameterLearning:
         self.node_sites = tuple(site for site in open_to if not site.of_scene)
         self.scene_sites = tuple(site for site in open_to if site.of_scene)
         self.renders = ValuedRenders(model, label, self.node_sites, self.scene_sites)
-        self.reader = Reader(counts, len(model.classes), len(self.node_sites), len(self.scene_sites))
+        self.reader = Reader(eye, len(model.classes), len(self.node_sites), len(self.scene_sites))
         self.lengths = [schedule.reader_steps, schedule.steps]
         self.lengths += [schedule.round_reader_steps, schedule.round_steps] * schedule.rounds
         self.total, self.done, self.phase = sum(self.lengths), 0, 0
@@ -102,14 +102,14 @@ class ParameterLearning:
         number = [*self.node_sites, *self.scene_sites].index(site)
         if not self.skill.readable[number]:
             return "it cannot be read in renders"
-        return f"it was read {int(self.readings_of[number])} times in the target, of {FEWEST} that it takes"
+        return f"it was read {int(self.readings_of[number])} times in the target, of {ENOUGH} that it takes"
 
     @property
     def _good(self) -> Tensor:
         """``(S + G,)`` bool."""
         if self.skill is None:
             return torch.zeros(0, dtype=torch.bool)
-        return self.skill.readable & (self.readings_of >= FEWEST)
+        return self.skill.readable & (self.readings_of >= ENOUGH)
 
     def run(self, each: Report | None = None) -> None:
         """Take the steps that are left.

@@ -13,14 +13,12 @@ References:
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from probscene.sampling import seed_everything
-
-from ..training import Report, batch_seed, check_finite, restore_training, training_state
+from ..steps import StepTraining
 from .net import Graph, ParameterNet
 from .reading.reader import cut_draw
 from .sites import NEAR
@@ -119,22 +117,19 @@ def log_density(net: ParameterNet, values: Values) -> Tensor:
     return torch.stack(parts, 1)
 
 
-class MaximumLikelihood:
-    """Resumable training of a ``ParameterNet``.
+class MaximumLikelihood(StepTraining):
+    """Resumable training of a ``ParameterNet``; its loss is in nats an image.
 
     Args:
         net: trained in place.
         values: what was read.
-        steps: of Adam, along a cosine.
+        steps: of Adam.
         images: a step, at most.
         learning_rate: the largest.
         seed: of everything random.
-
-    Attributes:
-        unit, total, done: see ``Training``.
     """
 
-    unit = "steps"
+    what = "the parameters"
 
     def __init__(
         self,
@@ -145,52 +140,16 @@ class MaximumLikelihood:
         learning_rate: float = 5e-3,
         seed: int = 0,
     ):
-        self.net, self.values, self.total, self.images = net, values, steps, images
-        self.learning_rate, self.seed, self.done = learning_rate, seed, 0
-        self.optimiser = torch.optim.Adam(net.parameters(), lr=learning_rate)
+        super().__init__(net, torch.optim.Adam(net.parameters(), lr=learning_rate), steps, seed, longest=10.0)
+        self.net, self.values, self.images = net, values, images
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the steps that are left; ``each`` hears the mean loss, nats an image, after every tenth.
-
-        Raises:
-            ProbsceneError: the loss is no longer finite.
-        """
-        losses = []
-        while self.done < self.total:
-            seed_everything(batch_seed(self.seed, self.done))
-            rate = self.learning_rate * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
-            for group in self.optimiser.param_groups:
-                group["lr"] = rate
-            rows = torch.randperm(len(self.values.kind))[: self._number()]
-            some = self.values.of(rows)
-            drawn = some.drawn() if self.done < ALONE * self.total else posterior_draws(self.net, some)
-            loss = -log_density(self.net, drawn).sum(1).mean()
-            self.optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.net.parameters(), 10.0)
-            self.optimiser.step()
-            losses.append(loss.item())
-            self.done += 1
-            if self.done % 10 == 0 or self.done == self.total:
-                mean, losses = sum(losses) / len(losses), []
-                where = f"at step {self.done}"
-                check_finite(mean, self.net.parameters(), "the parameters", where, "begin again with a lower rate")
-                if each is not None:
-                    each(self, {"loss": mean})
+    def loss(self) -> Tensor:
+        """See ``StepTraining``."""
+        some = self.values.of(torch.randperm(len(self.values.kind))[: self._number()])
+        drawn = some.drawn() if self.done < ALONE * self.total else posterior_draws(self.net, some)
+        return -log_density(self.net, drawn).sum(1).mean()
 
     def _number(self) -> int:
         """Images a step: fewer where each has many values."""
         each = max(1, self.net.node_sites) * self.values.kind.shape[1]
         return max(FEWEST, min(self.images, VALUES // each))
-
-    def summary(self) -> dict[str, Any]:
-        """Nothing more for the log."""
-        return {}
-
-    def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
-        return training_state(self.net, {"adam": self.optimiser}, done=self.done)
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        self.done = int(restore_training(self.net, {"adam": self.optimiser}, tensors)["done"])

@@ -58,11 +58,11 @@ class LogisticMixture(NamedTuple):
                 middle = (low + high) / 2
                 below = self.cdf(middle) < v
                 low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-            logit = (low + high) / 2
+            logit, slack = (low + high) / 2, high - low  # the root may be an end of the interval
             for _ in range(STEPS):
                 slope = (self.log_prob(logit.sigmoid()) + F.logsigmoid(logit) + F.logsigmoid(-logit)).exp()
                 newton = logit - (self.cdf(logit) - v) / slope
-                logit = torch.where((newton > low) & (newton < high), newton, logit)
+                logit = torch.where((newton > low - slack) & (newton < high + slack), newton, logit)
             u = logit.sigmoid().clamp(NEAR, 1 - NEAR)
         if not torch.is_grad_enabled() or not self.location.requires_grad:
             return u

@@ -3,8 +3,8 @@
 Sites come in the order of the program. Within a site, nodes come in the order of their derivation, parents before
 children. A node's mixture depends on the scene's sites and the number of nodes of each kind, its kind, its place among
 its siblings, its own earlier sites and the mean of its siblings', its parent and its sibling before with all that is
-known of them, and, through a GRU, on all nodes before it. Axis letters: N scenes, M nodes, S sites of nodes, G sites of
-scenes, H units.
+known of them, the siblings that are like it (``mates``), and, through a GRU, on all nodes before it. Axis letters: N
+scenes, M nodes, S sites of nodes, G sites of scenes, H units.
 """
 
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from probscene.derivation import Derivation
 from probscene.grammar import Grammar
 
+from .mates import Mates
 from .mixture import LogisticMixture
 
 COMPONENTS = 6
@@ -42,6 +43,12 @@ class Graph(NamedTuple):
     number: Tensor
     same_rank: Tensor
     same_number: Tensor
+
+    @property
+    def together(self) -> Tensor:
+        """``(N, M, M)`` bool, who is whose sibling, itself included."""
+        parent = self.parent.where(self.kind >= 0, -2)
+        return (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & (parent > -2).unsqueeze(-1)
 
     @staticmethod
     def of(kind: Tensor, parent: Tensor) -> "Graph":
@@ -126,6 +133,7 @@ class ParameterNet(nn.Module):
         self.of_place = nn.Linear(6, hidden)
         self.of_values = nn.Linear(9 * max(S, 1), hidden)
         self.of_siblings = nn.Linear(3 * max(S, 1), hidden)
+        self.mates = Mates(S, hidden)
         self.read = nn.Linear(hidden + 3 * S, hidden)
         self.cell = nn.GRU(hidden, hidden, batch_first=True)
         self.join = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
@@ -160,7 +168,8 @@ class ParameterNet(nn.Module):
         memory = F.pad(states, (0, 0, 1, 0))[:, :-1]
         own = known.where(torch.arange(self.node_sites) < s, torch.nan)
         around = [own, _gathered(known, graph.parent), _gathered(known, graph.before)]
-        place = self._place(graph, scene, s) + self._siblings(graph, own)
+        ties, at_s = self.mates.ties(graph.together, own, s), known[..., s].unsqueeze(1).expand(-1, known.shape[1], -1)
+        place = self._place(graph, scene, s) + self._siblings(graph, own) + self.mates(ties.place, ties.share, at_s)
         return self._mixture(place, torch.cat([_code(x) for x in around], -1), memory, s)
 
     def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
@@ -173,7 +182,8 @@ class ParameterNet(nn.Module):
         N, M = v.shape
         earlier = torch.arange(self.node_sites) < s
         rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
-        place = self._place(graph, scene, s) + self._siblings(graph, torch.stack(columns, 1))
+        own = torch.stack(columns, 1)
+        place, ties = self._place(graph, scene, s) + self._siblings(graph, own), self.mates.ties(graph.together, own, s)
         memory, found = v.new_zeros(N, self.cell.hidden_size), []
         w: Any = self.cell  # torch names its weights as it makes them
         for m in range(M):
@@ -182,7 +192,9 @@ class ParameterNet(nn.Module):
                 table = torch.stack(columns[: m + 1], 1)  # parents and siblings before come earlier
                 around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
             code = torch.cat([_code(x) for x in around], -1)
-            u = self._mixture(place[:, m], code, memory, s).icdf(v[:, m])
+            so_far = torch.stack(columns, 1)[..., s]
+            here = place[:, m] + self.mates(ties.place[:, m], ties.share[:, m], so_far)
+            u = self._mixture(here, code, memory, s).icdf(v[:, m])
             found.append(u.where(has[:, m], v[:, m]))
             at_s = torch.arange(self.node_sites) == s
             columns[m] = torch.where(at_s, u.where(has[:, m], torch.nan)[:, None], columns[m])
@@ -219,9 +231,7 @@ class ParameterNet(nn.Module):
 
     def _siblings(self, graph: Graph, own: Tensor) -> Tensor:
         """``(N, M, H)``, the mean of what is known of a node's siblings and itself, of all sites before."""
-        parent = graph.parent.where(graph.kind >= 0, -2)
-        together = (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & (parent > -2).unsqueeze(-1)
-        share = together.to(own.dtype) / graph.number.clamp(min=1).unsqueeze(-1)
+        share = graph.together.to(own.dtype) / graph.number.clamp(min=1).unsqueeze(-1)
         return self.of_siblings(share @ _code(own))
 
     def _scene(self, graph: Graph, scene: Tensor) -> Tensor:

@@ -10,7 +10,6 @@ References:
     [1] Seitzer et al., *On the pitfalls of heteroscedastic uncertainty estimation*, ICLR 2022.
 """
 
-import copy
 import math
 from typing import NamedTuple, cast
 
@@ -18,11 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...features.base import enter
-from ...features.counting.net import CountNet, conv
+from .eyes import WIDTH, Eye
 
-STRIDE = 4  # pixels of a reduced image a cell
-WIDTH = 64  # channels
 HIDDEN = 96
 LEAST_MASS = 0.4  # of an object's unit, in four cells
 MOST = 200  # objects in an image
@@ -50,21 +46,16 @@ class Found(NamedTuple):
 
 
 class Reader(nn.Module):
-    """On a copy of a count network's convolutions, which know the classes.
+    """On what an eye sees.
 
     Args:
-        counts: a trained count network.
+        eye: what it sees by.
         classes, sites, scene_sites: C, S and G.
     """
 
-    def __init__(self, counts: CountNet, classes: int, sites: int, scene_sites: int):
+    def __init__(self, eye: Eye, classes: int, sites: int, scene_sites: int):
         super().__init__()
-        self.classes, self.sites, self.scene_sites = classes, sites, scene_sites
-        self.channels, self.reduce = counts.channels, counts.reduce
-        fine, coarse, (b, c) = counts.stages()
-        self.fine, self.coarse = copy.deepcopy(fine), copy.deepcopy(coarse)
-        self.side, self.down = nn.Conv2d(b, WIDTH, 1, bias=False), nn.Conv2d(c, WIDTH, 1, bias=False)
-        self.both = nn.Sequential(nn.BatchNorm2d(WIDTH), nn.ReLU(inplace=True), *conv(WIDTH, WIDTH, 3, 1))
+        self.eye, self.classes, self.sites, self.scene_sites = eye, classes, sites, scene_sites
         self.what = nn.Conv2d(WIDTH, 1 + classes, 1)
         self.hidden = nn.Conv2d(WIDTH + 2, HIDDEN, 1)
         self.values = nn.Conv2d(HIDDEN, 2 + sites * (2 + HARMONICS), 1)
@@ -76,17 +67,10 @@ class Reader(nn.Module):
             bias.zero_()
             bias[0] = 3.0
 
-    def enter(self, images: Tensor) -> Tensor:
-        """Reduced images, padded to whole cells."""
-        x = enter(images, self.channels, self.reduce)
-        return F.pad(x, (0, -x.shape[-1] % (2 * STRIDE), 0, -x.shape[-2] % (2 * STRIDE)))
-
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of reduced images: logits ``(N, 1 + C, h, w)``; how many cells away an object's parent is ``(N, 2, h, w)``;
-        what is said of u of nodes ``(N, S, 2 + HARMONICS, h, w)`` and of scenes ``(N, G, 2 + HARMONICS)``."""
-        fine = self.fine(x.contiguous(memory_format=torch.channels_last))
-        coarse = F.interpolate(self.down(self.coarse(fine)), scale_factor=2, mode="nearest")
-        seen = self.both(self.side(fine) + coarse)
+        """Of what has entered the eye: logits ``(N, 1 + C, h, w)``; how many cells away an object's parent is ``(N, 2,
+        h, w)``; what is said of u of nodes ``(N, S, 2 + HARMONICS, h, w)`` and of scenes ``(N, G, 2 + HARMONICS)``."""
+        seen = self.eye(x)
         h, w = seen.shape[-2:]
         y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
         place = torch.stack([x, y]).expand(len(seen), 2, h, w)
@@ -103,7 +87,7 @@ class Reader(nn.Module):
         return Found(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
     def _find(self, images: Tensor, first: int) -> Found:
-        logits, parent, values, overall = self(self.enter(images))
+        logits, parent, values, overall = self(self.eye.enter(images))
         mass = logits.softmax(1)[:, 1:]
         n, y, x = blocks(mass.sum(1))
         rows, columns = torch.stack([y, y, y + 1, y + 1], 1), torch.stack([x, x + 1, x, x + 1], 1)  # (K, 4)
@@ -112,7 +96,7 @@ class Reader(nn.Module):
         share = mass[image, label[:, None], rows, columns]
         share = (share / share.sum(1, keepdim=True).clamp(min=1e-6)).unsqueeze(-1)  # of what each of the cells says
         here = torch.stack([columns, rows], -1) + 0.5
-        scale = STRIDE * self.reduce
+        scale = self.eye.cell
         return Found(
             n + first,
             label,

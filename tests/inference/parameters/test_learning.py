@@ -11,6 +11,7 @@ from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, log_density, posterior_draws
 from probscene.inference.parameters.net import Graph, ParameterNet
 from probscene.inference.parameters.reading import reader
+from probscene.inference.parameters.reading.eyes import RenderEye
 from probscene.inference.parameters.schedule import ParameterSchedule
 from probscene.renderers.sprites import SpriteRenderer
 
@@ -91,7 +92,7 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=0, reader_images=2)
     empty = torch.zeros(30, 3, 64, 64, dtype=torch.uint8)
-    learning = ParameterLearning(trays, trays.prior, counts, label, lambda: empty, schedule)
+    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: empty, schedule)
     learning.run()
     assert learning.skill is not None
     learning.skill = learning.skill._replace(share=torch.ones_like(learning.skill.share))

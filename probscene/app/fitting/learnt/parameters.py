@@ -12,13 +12,14 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.inference.features.base import FeatureNet
-from probscene.inference.features.counting.net import CountNet
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
+from probscene.inference.parameters.reading.eyes import Eye
 from probscene.inference.parameters.sites import Site
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
+from probscene.sampling import seed_everything
 
 from ...progress import Progress
 from ..observer import Observer
@@ -54,8 +55,9 @@ def learn_parameters(
     Raises:
         ProbsceneError: a loss is no longer finite.
     """
-    counts = inner(net)
-    if not isinstance(counts, CountNet):
+    seed_everything(batch_seed(run.record["seed"], 5))
+    eye = Eye.of(inner(net))
+    if eye is None:
         who = f"{run.features.name} features are"
         say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
         return
@@ -66,7 +68,7 @@ def learn_parameters(
         learning = ParameterLearning(
             run.model,
             guide,
-            counts,
+            eye,
             observer.labelled,
             lambda: _some(target, ~held, run.preset.parameters.images),
             run.preset.parameters,

@@ -1,0 +1,57 @@
+"""What a reader sees of an image."""
+
+import numpy as np
+import pytest
+import torch
+
+from probscene.inference.features.counting.net import CountNet
+from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.presence import PresenceNet
+from probscene.inference.parameters.reading.eyes import WIDTH, Eye, RenderEye, cell_colours
+from probscene.inference.parameters.reading.reader import Reader
+
+CLASSES = ("red", "blue")
+
+
+def eye_of(kind, canvas):
+    net = CountNet(CLASSES, 3, canvas, width=(4, 8, 8)) if kind == "renders" else PretrainedCountNet(CLASSES, canvas)
+    eye = Eye.of(net)
+    assert eye is not None
+    return eye.eval()
+
+
+@pytest.mark.parametrize("kind", ["renders", "photographs"])
+@pytest.mark.parametrize("canvas", [(64, 64), (96, 128)])
+def test_cells_cover_the_image(kind, canvas):
+    eye = eye_of(kind, canvas)
+    seen = eye(eye.enter(torch.randint(0, 256, (2, 3, *canvas), dtype=torch.uint8)))
+    across, down = (seen.shape[3] * eye.cell[0], seen.shape[2] * eye.cell[1])
+    assert seen.shape[:2] == (2, WIDTH)
+    assert 0 <= float(across) - canvas[1] < 2 * eye.cell[0] and 0 <= float(down) - canvas[0] < 2 * eye.cell[1]
+
+
+@pytest.mark.parametrize("kind", ["renders", "photographs"])
+def test_what_is_found_does_not_depend_on_the_other_images(kind):
+    torch.manual_seed(0)
+    eye = eye_of(kind, (64, 64))
+    reader = Reader(eye, 2, 1, 1).eval()
+    torch.nn.init.normal_(reader.what.weight, std=30.0)
+    images = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
+    alone, together = reader.find(images[3:4]), reader.find(images)
+    rows = together.image == 3
+    assert len(alone.image) and torch.allclose(alone.centre, together.centre[rows], atol=1e-3)
+    assert torch.allclose(alone.overall[0], together.overall[3], atol=1e-4)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_colours_are_those_of_each_cell(channels):
+    images = torch.randint(0, 256, (2, channels, 24, 32), dtype=torch.uint8)
+    found = cell_colours(images, (6, 8))
+    x = np.broadcast_to(images.numpy(), (2, 3, 24, 32)).reshape(2, 3, 6, 4, 8, 4) / 128.0 - 1
+    assert np.allclose(found[:, :3], x.mean((3, 5)), atol=1e-5)
+    assert np.allclose(found[:, 3:], 3 * x.std((3, 5)), atol=1e-2)
+
+
+def test_features_without_places_give_no_eye():
+    assert Eye.of(PresenceNet(CLASSES)) is None
+    assert isinstance(Eye.of(CountNet(CLASSES, 3, (64, 64))), RenderEye)
