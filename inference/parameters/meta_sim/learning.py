@@ -92,14 +92,13 @@ class MetaSimLearning:
 
     def _step(self, guide: ParameterTransform) -> float:
         drawn = Drawn.of(self.model, self.structure, self.learnt, self.schedule.scenes)
-        moved = [logit.sigmoid() for logit in guide.net(drawn.graph, drawn.scene, drawn.nodes)]
-        u = [values.detach() for values in moved]
-        features = self.differences.features(drawn, *u).requires_grad_()
+        scene, nodes = (logit.sigmoid() for logit in guide.net(drawn.graph, drawn.scene, drawn.nodes))
+        features = self.differences.features(drawn, scene.detach(), nodes.detach()).requires_grad_()
         loss = self.discrepancy(features)
         (slope,) = torch.autograd.grad(loss, features)
-        gradients = self.differences.gradient(drawn, *u, slope)
+        of_scene, of_nodes = self.differences.gradient(drawn, scene.detach(), nodes.detach(), slope)
         self.optimiser.zero_grad()
-        sum((values * gradient).sum() for values, gradient in zip(moved, gradients, strict=True)).backward()
+        ((scene * of_scene).sum() + (nodes * of_nodes).sum()).backward()
         torch.nn.utils.clip_grad_norm_(guide.net.parameters(), LARGEST)
         self.optimiser.step()
         return loss.item()

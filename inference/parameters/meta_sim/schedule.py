@@ -20,7 +20,7 @@ class MetaSimSchedule:
         rounds: of its message passing.
     """
 
-    steps: int = 60
+    steps: int = 100
     scenes: int = 48
     values: int | None = 200
     rate: float = 1e-3

@@ -81,11 +81,11 @@ class TaskLearning:
                 scenes = with_values(guide.model, guide.sites, drawn, *(logit.sigmoid() for logit in logits))
             score = float(self.score(scenes))
             baseline = score if self.baseline is None else self.baseline
-            log_q = [_log_normal(x, mean, self.spread) for x, mean in zip(logits, means, strict=True)]
-            there = [~u.isnan() for u in (drawn.scene, drawn.nodes)]
-            total = sum(one.where(has, 0.0).sum() for one, has in zip(log_q, there, strict=True))
+            log_q = drawn.scene.new_zeros(())
+            for x, mean, u in zip(logits, means, (drawn.scene, drawn.nodes), strict=True):
+                log_q = log_q - 0.5 * ((x - mean) / self.spread).square().where(~u.isnan(), 0.0).sum()  # and a constant
             self.optimiser.zero_grad()
-            (-(score - baseline) * total / self.scenes).backward()
+            (-(score - baseline) * log_q / self.scenes).backward()
             self.optimiser.step()
             self.baseline = KEPT * baseline + (1 - KEPT) * score
             self.done += 1
@@ -108,8 +108,3 @@ class TaskLearning:
         numbers = restore_training(self.guide.net, {"adam": self.optimiser}, tensors)
         self.done, baseline = int(numbers["done"]), numbers["baseline"]
         self.baseline = None if baseline != baseline else baseline
-
-
-def _log_normal(x: Tensor, mean: Tensor, spread: float) -> Tensor:
-    """But for a constant."""
-    return -0.5 * ((x - mean) / spread).square()
