@@ -139,16 +139,16 @@ def differentiated(trays, seed=0, most=None):
         return looked_at(scenes.parameters, scenes.site_mask)
 
     found = Differences(trays, sites, embed, 0.01, most).gradient(before, scene, nodes, ways)
-    scene.requires_grad_(), nodes.requires_grad_()
-    base = with_values(trays, sites, before, scene.detach(), nodes.detach())
+    base = with_values(trays, sites, before, scene, nodes)
+    for values in (scene, nodes):
+        values.requires_grad_()
     u, empty = {}, torch.full(before.seen.place.shape, torch.nan)
     for site in sites:
         column = [other.name for other in sites if other.of_scene == site.of_scene].index(site.name)
         u[site.name] = scene[:, column : column + 1] if site.of_scene else before.seen.put(nodes[..., column], empty)
         u[site.name] = u[site.name].where(base.site_mask[site.name], torch.nan)
-    known = before.derivation.sites() | before.parameters
     with pyro.poutine.trace() as trace, pyro.poutine.condition(data=before.derivation.sites()):
-        within(trays, At(u, known))(12)
+        within(trays, At(u, before.parameters))(12)
     values = {name: node["value"] for name, node in trace.trace.nodes.items() if name in NAMES}
     cost = (looked_at(values, base.site_mask) * ways).sum()
     return found, torch.autograd.grad(cost, [scene, nodes])
@@ -207,8 +207,7 @@ def learning(steps, seed=3):
     torch.manual_seed(1)
     real = (torch.tensor([44.0, 20.0]) + 2.0 * torch.randn(100, 2)) / 64
     schedule = MetaSimSchedule(steps=steps, scenes=16, rate=1e-2, values=None, hidden=16, rounds=1)
-    embed = lambda scenes: places(render(scenes.drawing).image)  # noqa: E731
-    return MetaSimLearning(dots, dots.prior, embed, real, schedule, seed)
+    return MetaSimLearning(dots, dots.prior, lambda scenes: places(render(scenes.drawing).image), real, schedule, seed)
 
 
 def test_what_images_show_is_learnt():
