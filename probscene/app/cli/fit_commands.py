@@ -38,6 +38,9 @@ def fit(
         str | None,
         typer.Option(metavar="WHAT", help="structure, or structure,parameters: where things stand and how they look."),
     ] = None,
+    parameters: Annotated[
+        str | None, typer.Option(metavar="NAME", help="How the latter are learnt: likelihood, or meta-sim, a baseline.")
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
     ] = None,
@@ -67,7 +70,7 @@ def fit(
     if seed is not None:
         checked_seed(seed)
     name = str(preset or PresetName.default)
-    settings = with_learn(settings or [], learn)
+    settings = with_learn(settings or [], learn, parameters)
     chosen, parts = chosen_preset(name, features, objective, guide, settings)
     other = preset_for_photographs(name, features, objective, guide, settings)
     if scenarios is not None:
