@@ -1,7 +1,8 @@
 """What a driving scene draws at random on which node: a uniform number each, in metres and radians unless said.
 
-Shares (0 to 1) choose: ``make`` a mesh, ``colour`` a tint, ``place`` where along its strip a thing stands and
-``across`` where across it, ``lane`` which of its lanes the camera takes. ``turn`` is beside the way a thing faces.
+Shares (0 to 1) choose: ``make`` a mesh, from the smallest to the largest, ``colour`` a tint, from the darkest to the
+brightest, so that neighbouring shares look alike; ``place`` where along its strip a thing stands and ``across`` where
+across it, ``lane`` which of its lanes the camera takes. ``turn`` is beside the way a thing faces.
 """
 
 import math
@@ -84,7 +85,7 @@ _CLOTHES = [[0.15, 0.17, 0.24], [0.75, 0.73, 0.70], [0.30, 0.33, 0.38], [0.55, 0
 _WALLS = [[1.0, 1.0, 1.0], [0.94, 0.90, 0.82], [0.82, 0.84, 0.88], [0.92, 0.80, 0.72], [0.78, 0.76, 0.72]]
 _PLAIN = [[1.0, 1.0, 1.0], [0.85, 0.85, 0.85], [0.7, 0.7, 0.7]]
 TINTS = MappingProxyType({
-    kind: torch.tensor(table)
+    kind: torch.tensor(sorted(table, key=sum))
     for kinds, table in (
         (("car", "van", "truck"), _PAINT), (("pedestrian", "cyclist"), _CLOTHES), (("building",), _WALLS),
         (("tree", "bush"), _GREENS), (("pole", "sign", "object"), _PLAIN),

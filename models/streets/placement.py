@@ -40,7 +40,8 @@ def things(nodes: Nodes, meshes: Mapping[str, tuple[Mesh, ...]]) -> tuple[Street
     size, base, tint = torch.zeros(*mesh.shape, 2), torch.zeros(*mesh.shape, 2), torch.ones(*mesh.shape, 3)
     for kind in nodes.things:
         mine = graph.mask(kind)
-        index, _ = choice(nodes.of(kind, "make"), len(meshes[kind]))
+        by_size = torch.tensor([float(each.size.prod()) for each in meshes[kind]]).argsort(stable=True)
+        index = by_size[choice(nodes.of(kind, "make"), len(meshes[kind]))[0]]
         sizes, bases = map(torch.tensor, zip(*(footprint(each, kind) for each in meshes[kind]), strict=True))
         mesh, mine = torch.where(mine, index, mesh), mine.unsqueeze(-1)
         size, base = torch.where(mine, sizes[index], size), torch.where(mine, bases[index], base)

@@ -35,7 +35,7 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    for where, name in ((fit, "_learn"), (module, "generate"), (module, "evaluate")):
+    for where, name in ((fit, "learn_structure"), (module, "generate"), (module, "evaluate")):
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(where, name, interrupt)
             go()

@@ -3,8 +3,8 @@
 A small network looks at the whole image and says of every cell which class has its middle there, where that object's
 parent is, and the u of each of its sites (``sites``): a normal distribution, cut off at 0 and 1, and, as some sites
 turn in a circle, where u = 0 and u = 1 look alike, the cosine and sine of one and of two turns of u. Cells see where
-they are, so that a place is read like any other site. Sites of the whole scene are read from all cells together. Axis
-letters: N images, C classes, S sites of nodes, G sites of scenes, h w cells.
+they are, so that a place is read like any other site. Sites of the whole scene are read from the whole image
+(``overall``). Axis letters: N images, C classes, S sites of nodes, G sites of scenes, h w cells.
 
 References:
     [1] Seitzer et al., *On the pitfalls of heteroscedastic uncertainty estimation*, ICLR 2022.
@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .eyes import WIDTH, Eye
+from .overall import Overall
 
 HIDDEN = 96
 LEAST_MASS = 0.4  # of an object's unit, in four cells
@@ -59,25 +60,23 @@ class Reader(nn.Module):
         self.what = nn.Conv2d(WIDTH, 1 + classes, 1)
         self.hidden = nn.Conv2d(WIDTH + 2, HIDDEN, 1)
         self.values = nn.Conv2d(HIDDEN, 2 + sites * (2 + HARMONICS), 1)
-        last = nn.Linear(HIDDEN, max(1, scene_sites) * (2 + HARMONICS))
-        self.overall = nn.Sequential(nn.Linear(2 * WIDTH, HIDDEN), nn.ReLU(), last)
+        self.overall = Overall(max(1, scene_sites), 2 + HARMONICS)
         with torch.no_grad():  # nearly every cell holds nothing
             self.what.weight.mul_(0.3)
             bias = cast(Tensor, self.what.bias)
             bias.zero_()
             bias[0] = 3.0
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, entered: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of what has entered the eye: logits ``(N, 1 + C, h, w)``; how many cells away an object's parent is ``(N, 2,
         h, w)``; what is said of u of nodes ``(N, S, 2 + HARMONICS, h, w)`` and of scenes ``(N, G, 2 + HARMONICS)``."""
-        seen = self.eye(x)
+        seen = self.eye(entered)
         h, w = seen.shape[-2:]
         y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
         place = torch.stack([x, y]).expand(len(seen), 2, h, w)
         hidden = F.relu(self.hidden(torch.cat([seen, place], 1)))
         parent, values = self.values(hidden).tensor_split([2], 1)
-        overall = self.overall(torch.cat([seen.mean((2, 3)), seen.amax((2, 3))], 1))
-        overall = overall.unflatten(1, (-1, 2 + HARMONICS))[:, : self.scene_sites]
+        overall = self.overall(entered, seen)[:, : self.scene_sites]
         return self.what(seen), parent, values.reshape(len(seen), self.sites, 2 + HARMONICS, h, w), overall
 
     @torch.no_grad()
