@@ -3,7 +3,7 @@
 A pixel's centre is mapped back into the sprite, whose premultiplied texels are filtered bilinearly; beyond the sprite
 everything is clear. A sprite drawn smaller than it is comes from a box-filtered level, its texels over half a pixel and
 at most one, chosen for x and y apart; one drawn larger keeps edges one pixel wide. Sprites are blended in painter's
-order into 8-bit channels. A node's id is written where its sprite's own alpha is at least one half; a sprite without a
+order into 8-bit channels, which the drawing's ``Photo`` then changes. A node's id is written where its sprite's own alpha is at least one half; a sprite without a
 label erases ids there. At angle 0 and scale 1, with texels on pixels, an opaque sprite's bytes appear unchanged.
 """
 
@@ -16,6 +16,7 @@ from probscene.errors import ModelError
 from probscene.world import World
 
 from . import engine
+from .photo import PhotoFinish
 from .sprite import kernel
 from .sprite.instances import Instances, instances
 from .sprite.sheet import Sheet
@@ -40,7 +41,7 @@ class SpriteRenderer:
 
     def __init__(self, canvas: tuple[int, int], threads: int | None = None):
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
-        self._sheet = Sheet()
+        self._sheet, self._finish = Sheet(), PhotoFinish(self.canvas, self.threads)
 
     def __call__(self, drawing: Drawing | World) -> RenderBatch:
         """Render every scene of a drawing.
@@ -72,6 +73,8 @@ class SpriteRenderer:
                 np.zeros(1, np.int32), first[start : stop + 1].copy(), table.whole, table.real, self._sheet.texels,
                 self._sheet.colours, rgb, rgb.view(np.uint32), ids, ids.view(np.int64), result[start:stop].reshape(-1),
             )  # fmt: skip
+        if drawing.photo is not None and scenes:
+            self._finish(drawing.photo, image, toned=False)
         return _batch(
             drawing,
             table,

@@ -3,8 +3,8 @@
 from ...engine import ti
 from .. import tables
 from . import shading
-from .lanes import LANES, SHIFT, floats, whole, words
-from .raster import LEAST, high
+from ...kernels.lanes import LANES, SHIFT, floats, high, whole, words
+from .raster import LEAST
 from .shading import nearness, record_of
 
 i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32

@@ -2,8 +2,7 @@
 
 from ...engine import ti
 from ..texture_atlas import AT, LEVELS
-from .lanes import LANES, natural, whole
-from .raster import high, low
+from ...kernels.lanes import LANES, high, low, natural, whole
 
 i32, u32, f32 = ti.i32, ti.u32, ti.f32
 PAIR = 0x00FF00FF  # red and blue of a texel
