@@ -91,7 +91,8 @@ def sample_photo(num_scenes: int, looks: dict[str, Look | None]) -> Photo:
     for name in LIMITS:  # the program's order of sites does not depend on the caller's
         look = looks.get(name)
         if isinstance(look, tuple | list | dist.Distribution):
-            values[name] = _site(name, num_scenes, look if isinstance(look, dist.Distribution) else _uniform(name, look))
+            prior = look if isinstance(look, dist.Distribution) else _uniform(name, look)
+            values[name] = _site(name, num_scenes, prior)
         elif look is not None:
             values[name] = look
     if "noise" in values:

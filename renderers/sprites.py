@@ -3,8 +3,10 @@
 A pixel's centre is mapped back into the sprite, whose premultiplied texels are filtered bilinearly; beyond the sprite
 everything is clear. A sprite drawn smaller than it is comes from a box-filtered level, its texels over half a pixel and
 at most one, chosen for x and y apart; one drawn larger keeps edges one pixel wide. Sprites are blended in painter's
-order into 8-bit channels, which the drawing's ``Photo`` then changes. A node's id is written where its sprite's own alpha is at least one half; a sprite without a
+order into 8-bit channels. A node's id is written where its sprite's own alpha is at least one half; a sprite without a
 label erases ids there. At angle 0 and scale 1, with texels on pixels, an opaque sprite's bytes appear unchanged.
+
+A drawing's ``Photo`` then changes the images, and nothing else.
 """
 
 import numpy as np

@@ -78,23 +78,28 @@ def to_planes(
     half = wide_room >> 1
     for cell_row in range(high_room >> 1):
         for cell in range(half):
-            bluer, redder = f32(0.0), f32(0.0)
+            bluer, redder = i32(0), i32(0)
             for down, across in ti.static(ti.ndrange(2, 2)):
                 row, column = 2 * cell_row + down, 2 * cell + across
                 at = 3 * (first + ti.min(row, height - 1) * width + ti.min(column, width - 1))
-                r, g, b = ti.cast(image[at], f32), ti.cast(image[at + 1], f32), ti.cast(image[at + 2], f32)
-                y = nearest(f32(0.299) * r + f32(0.587) * g + f32(0.114) * b)
-                scratch[luminance + row * wide_room + column] = y - f32(128.0)
-                bluer += nearest(f32(-0.168736) * r - f32(0.331264) * g + f32(0.5) * b)
-                redder += nearest(f32(0.5) * r - f32(0.418688) * g - f32(0.081312) * b)
-            odd = ti.cast(1 + (cell & 1), f32)  # libjpeg rounds up and down by turns
-            scratch[blue + cell_row * half + cell] = ti.floor((bluer + odd) * f32(0.25))
-            scratch[red + cell_row * half + cell] = ti.floor((redder + odd) * f32(0.25))
+                r, g, b = ti.cast(image[at], i32), ti.cast(image[at + 1], i32), ti.cast(image[at + 2], i32)
+                y = (19595 * r + 38470 * g + 7471 * b + 32768) >> 16
+                scratch[luminance + row * wide_room + column] = ti.cast(y - 128, f32)
+                bluer += (-11059 * r - 21709 * g + 32768 * b + 32767) >> 16
+                redder += (32768 * r - 27439 * g - 5329 * b + 32767) >> 16
+            odd = 1 + (cell & 1)  # libjpeg rounds up and down by turns
+            scratch[blue + cell_row * half + cell] = ti.cast((bluer + odd) >> 2, f32)
+            scratch[red + cell_row * half + cell] = ti.cast((redder + odd) >> 2, f32)
+
+
+@ti.func
+def clipped(value: i32):
+    return ti.cast(low(high(value, 0), 255), ti.u8)
 
 
 @ti.func
 def column_sum(plane: i32, near: i32, far: i32, cell: i32, scratch: ti.template()):
-    return f32(3.0) * scratch[plane + near + cell] + scratch[plane + far + cell]
+    return 3 * ti.cast(scratch[plane + near + cell], i32) + ti.cast(scratch[plane + far + cell], i32)
 
 
 @ti.func
@@ -110,21 +115,15 @@ def from_planes(
         near, far = near * half, far * half
         for column in range(width):
             cell, odd = column >> 1, column & 1
-            beside, bias = ti.min(ti.max(cell + 2 * odd - 1, 0), cells - 1), ti.cast(8 - odd, f32)
-            b = f32(3.0) * column_sum(blue, near, far, cell, scratch) + column_sum(blue, near, far, beside, scratch)
-            r = f32(3.0) * column_sum(red, near, far, cell, scratch) + column_sum(red, near, far, beside, scratch)
-            b, r = ti.floor((b + bias) * f32(0.0625)), ti.floor((r + bias) * f32(0.0625))
-            y = scratch[luminance + row * wide_room + column] + f32(128.0)
-            green = y - nearest(f32(0.344136) * b + f32(0.714136) * r)
+            beside = ti.min(ti.max(cell + 2 * odd - 1, 0), cells - 1)
+            b = 3 * column_sum(blue, near, far, cell, scratch) + column_sum(blue, near, far, beside, scratch)
+            r = 3 * column_sum(red, near, far, cell, scratch) + column_sum(red, near, far, beside, scratch)
+            b, r = (b + 8 - odd) >> 4, (r + 8 - odd) >> 4
+            y = ti.cast(scratch[luminance + row * wide_room + column], i32) + 128
             at = 3 * (first + row * width + column)
-            image[at] = clipped(y + nearest(f32(1.402) * r))
-            image[at + 1] = clipped(green)
-            image[at + 2] = clipped(y + nearest(f32(1.772) * b))
-
-
-@ti.func
-def clipped(value: f32):
-    return ti.cast(ti.cast(low(high(value, f32(0.0)), f32(255.0)), i32), ti.u8)
+            image[at] = clipped(y + ((91881 * r + 32768) >> 16))
+            image[at + 1] = clipped(y + ((-22554 * b - 46802 * r + 32768) >> 16))
+            image[at + 2] = clipped(y + ((116130 * b + 32768) >> 16))
 
 
 @ti.func

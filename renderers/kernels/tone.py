@@ -6,7 +6,19 @@ from .lanes import LANES, SHIFT, floats, high, low, whole
 # Columns of a photo, one row a scene, float64: whether colours change, by what 3 x 3 matrix and bias, what is missing a
 # square pixel from the middle, where that is; noise before the blur and after it, of 1; radius of the blur, pixels;
 # whether there is JPEG.
-TONED, MATRIX, BIAS, VIGNETTE, MIDDLE_U, MIDDLE_V, NOISE, LATER, RADIUS, JPEG, PHOTO = 0, 1, 10, 11, 12, 13, 14, 15, 16, 17, 18
+TONED, MATRIX, BIAS, VIGNETTE, MIDDLE_U, MIDDLE_V, NOISE, LATER, RADIUS, JPEG, PHOTO = (
+    0,
+    1,
+    10,
+    11,
+    12,
+    13,
+    14,
+    15,
+    16,
+    17,
+    18,
+)
 
 i32, i64, u32, u64, f32 = ti.i32, ti.i64, ti.u32, ti.u64, ti.f32
 

@@ -5,11 +5,11 @@ row gets the ground and is labelled, shaded and cleared for the next scene.
 """
 
 from ...engine import ti
+from ...kernels.lanes import LANES, floats, whole_lanes, words
+from ...kernels.tone import NOISE, TONED, develop, tone_of
 from .. import tables
 from . import shading
 from .geometry import draw_instance, lay_ground, unstamp
-from ...kernels.lanes import LANES, floats, whole_lanes, words
-from ...kernels.tone import NOISE, TONED, develop, tone_of
 from .raster import lay_row, strip_row
 from .rows import add_colours, add_samples, clear, compare, label, read_ground, read_pixels, repeat_last, take_colours
 from .samples import Samples

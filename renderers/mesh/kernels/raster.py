@@ -6,8 +6,8 @@ The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above 
 """
 
 from ...engine import ti
-from .. import tables
 from ...kernels.lanes import high, low, whole_lanes
+from .. import tables
 
 LEAST = 1e-9  # of 1/z, which rounding may not take to 0 or below
 

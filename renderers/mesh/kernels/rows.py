@@ -1,9 +1,9 @@
 """A row of the image: from the visibility buffer into samples, and from there to ids, classes and depth."""
 
 from ...engine import ti
+from ...kernels.lanes import LANES, SHIFT, floats, high, whole, words
 from .. import tables
 from . import shading
-from ...kernels.lanes import LANES, SHIFT, floats, high, whole, words
 from .raster import LEAST
 from .shading import nearness, record_of
 

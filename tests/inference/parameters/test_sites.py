@@ -33,3 +33,13 @@ def test_quantiles_are_nan_where_a_node_has_no_such_site(trays):
     found = quantiles_of(trays, scenes)
     tray = scenes.derivation.kind == trays.grammar.kind("tray")
     assert torch.equal(~found["tray.x"].isnan(), tray[:, : found["tray.x"].shape[1]])
+
+
+def test_a_photos_sites_are_the_scenes_own(smeared):
+    found = {site.name: site for site in find_sites(smeared)}
+    assert set(found) == {"photo.exposure", "photo.blur", "photo.noise", "photo.seed", "disc.x"}
+    for name in ("photo.exposure", "photo.blur", "photo.noise"):
+        assert found[name] == Site(name, ()) and found[name].of_scene
+    assert found["photo.seed"].keeps == "the program says so"
+    u = quantiles_of(smeared, sample(smeared, smeared.prior, 400))["photo.blur"]
+    assert u.shape == (400, 1) and abs(float(u.mean()) - 0.5) < 0.05
