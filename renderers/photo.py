@@ -12,7 +12,6 @@ from probscene.photo import Photo
 
 from .kernels import tone
 from .kernels.finish import finish
-from .kernels.lanes import LANES
 
 _CHUNK = 1 << 28  # pixels of one launch; the kernel's offsets are 32-bit
 _GREY = np.array([0.299, 0.587, 0.114])
@@ -62,7 +61,7 @@ class PhotoFinish:
             return
         seeds, weights, steps = seeds_of(photo), _weights(photo, table), _steps(photo)
         most = int(table[:, tone.RADIUS].max())
-        blurred = 3 * height * (width + 2 * most) + LANES if most else 0
+        blurred = 3 * (height + 2) * width + 6 * most if most else 0
         coded = _coded(height, width) if table[:, tone.JPEG].any() else 0
         room = max(1, blurred, coded)
         step = max(8, _CHUNK // pixels // 8 * 8)  # images begin at whole words
@@ -156,8 +155,8 @@ def _cosines() -> np.ndarray:
 
 def _coded(height: int, width: int) -> int:
     """Numbers that JPEG needs of scratch, see ``kernels.jpeg.compress``."""
-    high, wide = -(-height // 16) * 16, -(-width // 32) * 32
-    return high * wide * 3 // 2 + 8 * wide
+    high, wide = -(-height // 16) * 16, -(-width // 16) * 16
+    return high * wide * 3 // 2 + 16 * wide
 
 
 _COSINES = _cosines()

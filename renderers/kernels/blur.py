@@ -1,57 +1,62 @@
-"""A Gaussian over an image, down its columns into scratch and from there along its rows."""
+"""A Gaussian over an image: down its columns into a line of scratch, and from there along the row."""
 
 from ..engine import ti
-from .lanes import LANES, floats
 from .tone import byte
 
 i32, f32 = ti.i32, ti.f32
 
 
+@ti.real_func
+def spread(at: i32, count: i32, image: ti.types.ndarray(ti.u8, 1), to: i32, scratch: ti.types.ndarray(f32, 1)):
+    """Bytes into scratch."""
+    for i in range(count):
+        scratch[to + i] = ti.cast(image[at + i], f32)
+
+
+@ti.real_func
+def weigh(to: i32, one: i32, other: i32, count: i32, weight: f32, scratch: ti.types.ndarray(f32, 1)):
+    """A first term: two lines, which may be one, times a weight."""
+    for i in range(count):
+        scratch[to + i] = weight * (scratch[one + i] + scratch[other + i])
+
+
+@ti.real_func
+def add(to: i32, one: i32, other: i32, count: i32, weight: f32, scratch: ti.types.ndarray(f32, 1)):
+    """Another term."""
+    for i in range(count):
+        scratch[to + i] = scratch[to + i] + weight * (scratch[one + i] + scratch[other + i])
+
+
+@ti.real_func
+def gather(at: i32, count: i32, image: ti.types.ndarray(ti.u8, 1), line: i32, scratch: ti.types.ndarray(f32, 1)):
+    """Scratch, 0..255, into bytes."""
+    for i in range(count):
+        image[at + i] = ti.cast(byte(scratch[line + i] * f32(1 / 255)), ti.u8)
+
+
 @ti.func
 def blur(
-    first: i32, height: i32, width: i32, radius: i32, weights_base: i32, scratch_base: i32, weights: ti.template(),
+    first: i32, height: i32, width: i32, radius: i32, weights_base: i32, base: i32, weights: ti.template(),
     image: ti.template(), scratch: ti.template(),
 ):  # fmt: skip
     """Blur the image whose first pixel is ``first`` of all; ``weights`` from the middle to ``radius``.
 
-    The scratch holds its rows, continued by ``radius`` pixels on either side.
+    The scratch holds the image, a row that goes on for ``radius`` pixels on either side, and a row.
     """
-    line, start = 3 * width, 3 * first
-    stride = line + 6 * radius
+    line = 3 * width
+    wide = base + height * line
+    row_at, done = wide + 3 * radius, wide + line + 6 * radius
+    spread(3 * first, height * line, image, base, scratch)
     for row in range(height):
-        x, to = i32(0), scratch_base + row * stride + 3 * radius
-        while x < line:
-            count = ti.min(line - x, i32(LANES))
-            total = floats(0)
-            for k in range(radius + 1):
-                above = start + ti.max(row - k, 0) * line + x
-                below = start + ti.min(row + k, height - 1) * line + x
-                weight = weights[weights_base + k]
-                if count == LANES:
-                    for i in range(i32(LANES)):
-                        pair = ti.cast(image[above + i], i32) + ti.cast(image[below + i], i32)
-                        total[i] = total[i] + weight * ti.cast(pair, f32)
-                else:
-                    for i in range(count):
-                        pair = ti.cast(image[above + i], i32) + ti.cast(image[below + i], i32)
-                        total[i] = total[i] + weight * ti.cast(pair, f32)
-            for i in range(count):
-                scratch[to + x + i] = total[i]
-            x += i32(LANES)
+        weigh(row_at, base + row * line, base + row * line, line, weights[weights_base], scratch)
+        for k in range(1, radius + 1):
+            above, below = base + ti.max(row - k, 0) * line, base + ti.min(row + k, height - 1) * line
+            add(row_at, above, below, line, weights[weights_base + k], scratch)
         for k in range(1, radius + 1):
             for channel in ti.static(range(3)):
-                scratch[to - 3 * k + channel] = scratch[to + channel]
-                scratch[to + line + 3 * (k - 1) + channel] = scratch[to + line - 3 + channel]
-    for row in range(height):
-        x, at = i32(0), scratch_base + row * stride + 3 * radius
-        while x < line:
-            count = ti.min(line - x, i32(LANES))
-            total = floats(0)
-            for k in range(radius + 1):
-                weight = weights[weights_base + k]
-                for i in range(i32(LANES)):
-                    pair = scratch[at + x + i - 3 * k] + scratch[at + x + i + 3 * k]
-                    total[i] = total[i] + weight * pair
-            for i in range(count):
-                image[start + row * line + x + i] = ti.cast(byte(total[i] * f32(1 / 255)), ti.u8)
-            x += i32(LANES)
+                scratch[row_at - 3 * k + channel] = scratch[row_at + channel]
+                scratch[row_at + line + 3 * (k - 1) + channel] = scratch[row_at + line - 3 + channel]
+        weigh(done, row_at, row_at, line, weights[weights_base], scratch)
+        for k in range(1, radius + 1):
+            add(done, row_at - 3 * k, row_at + 3 * k, line, weights[weights_base + k], scratch)
+        gather(3 * first + row * line, line, image, done, scratch)

@@ -52,7 +52,7 @@ def finish(
                             while column < width:
                                 at = line + column
                                 count = ti.cast(ti.min(width - column, i32(LANES) - (at & i32(LANES - 1))), i32)
-                                read_bytes(at, count, image, some)
+                                read_bytes(at, count, some, image, image_words)
                                 develop(
                                     column, row, row * width + column, at, count, changes, noise, photo, seeds[scene],
                                     some, image, image_words,

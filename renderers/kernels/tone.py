@@ -62,12 +62,24 @@ def byte(value: f32):
 
 
 @ti.func
-def read_bytes(out: i32, count: i32, image: ti.template(), some: ti.template()):
-    """The colours of ``count`` pixels from ``out`` of all."""
-    for i in range(count):
-        some.red[i] = ti.cast(image[3 * (out + i)], f32) * f32(1 / 255)
-        some.green[i] = ti.cast(image[3 * (out + i) + 1], f32) * f32(1 / 255)
-        some.blue[i] = ti.cast(image[3 * (out + i) + 2], f32) * f32(1 / 255)
+def read_bytes(out: i32, count: i32, some: ti.template(), image: ti.template(), image_words: ti.template()):
+    """The colours of ``count`` pixels from ``out`` of all; of ``LANES`` where a block begins."""
+    colours = whole(0)
+    if count == LANES:
+        for eight in ti.static(range(LANES // 8)):
+            at = (out >> SHIFT) * (LANES * 3 // 8) + 3 * eight
+            a, b, c = image_words[at], image_words[at + 1], image_words[at + 2]
+            each = [a, a >> 24, (a >> 48) | (b << 16), b >> 8, b >> 32, (b >> 56) | (c << 8), c >> 16, c >> 40]
+            for i in ti.static(range(8)):
+                colours[8 * eight + i] = ti.cast(ti.cast(each[i], u32), i32)
+    else:
+        for i in range(count):
+            for channel in ti.static(range(3)):
+                colours[i] = colours[i] | (ti.cast(image[3 * (out + i) + channel], i32) << (8 * channel))
+    for i in range(i32(LANES)):
+        some.red[i] = ti.cast(colours[i] & 255, f32) * f32(1 / 255)
+        some.green[i] = ti.cast((colours[i] >> 8) & 255, f32) * f32(1 / 255)
+        some.blue[i] = ti.cast((colours[i] >> 16) & 255, f32) * f32(1 / 255)
 
 
 @ti.func
