@@ -6,10 +6,12 @@ on its batch.
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from probscene.errors import ModelError
 from probscene.photo import Photo
 
+from . import engine
 from .kernels import tone
 from .kernels.finish import finish
 
@@ -76,6 +78,28 @@ class PhotoFinish:
                 table[part].ravel(), seeds[part], weights[part].ravel(), steps[part].ravel(), _COSINES, self._scratch,
                 bytes_, bytes_[: bytes_.size // 8 * 8].view(np.uint64),
             )  # fmt: skip
+
+
+def photographed(photo: Photo, image: Tensor, threads: int = 1) -> Tensor:
+    """Photos of images ``(N, 3, H, W)`` uint8, for renderers of one's own.
+
+    Args:
+        photo: every value ``(N,)``, as a drawing has it.
+        image: as they are without a photo.
+        threads: how many threads work.
+
+    Raises:
+        ModelError: images or values of another shape.
+    """
+    if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3:
+        raise ModelError(f"Expected images as uint8 (N, 3, H, W), actual {image.dtype} {tuple(image.shape)}.")
+    number, _, height, width = image.shape
+    flat = image.permute(0, 2, 3, 1).flatten().numpy()
+    flat = np.concatenate([flat, np.zeros(8, np.uint8)])  # to whole words
+    if number:
+        engine.start()
+        PhotoFinish((height, width), threads)(photo, flat, toned=False)
+    return torch.from_numpy(flat[:-8]).view(number, height, width, 3).permute(0, 3, 1, 2)
 
 
 def photo_table(photo: Photo, canvas: tuple[int, int], exposed: bool) -> np.ndarray:

@@ -54,11 +54,9 @@ def random_world(shapes, seed, sun=True, lying=True):
     light = Light(
         uniform(-3, 3, number, 1), uniform(0.3, 1.4, number, 1), 0.6 if sun else 0.0, haze=uniform(0, 0.03, number, 1)
     )
-    names = "exposure", "contrast", "saturation", "red_gain", "blue_gain"
-    photo = Photo(
-        **{name: uniform(0.7, 1.3, number, 1) for name in names}, vignette=uniform(0, 0.6, number, 1),
-        noise=uniform(0, 9, number, 1), seed=seed % 1000,
-    )  # fmt: skip
+    photo = Photo(*(uniform(0.7, 1.3, number, 1) for _ in range(3)), noise=uniform(0, 9, number, 1), seed=seed % 1000)
+    gains = torch.from_numpy(np.random.default_rng(seed).uniform(0.8, 1.2, (2, number, 1)))
+    photo = replace(photo, red_gain=gains[0], blue_gain=gains[1], vignette=1.5 * (1.2 - gains[0]))
     layers = [
         layer("car", nodes, present=some(nodes)),
         layer("car", nodes, present=some(nodes) & some(nodes), labelled=bool(generator.integers(0, 2))),

@@ -207,7 +207,7 @@ def test_jpeg_is_what_opencv_writes_and_reads(quality, size):
         _, written = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
         theirs = cv2.imdecode(written, cv2.IMREAD_COLOR)[..., ::-1].astype(int)
         lost, apart = np.abs(theirs - image), np.abs(theirs - ours)
-        assert apart.mean() < min(0.6, 0.1 + 0.15 * lost.mean()), (apart.mean(), lost.mean())
+        assert apart.mean() < min(0.6, 0.2 + 0.15 * lost.mean()), (apart.mean(), lost.mean())
 
 
 @given(SEED, st.lists(st.integers(1, 100), min_size=2, max_size=2, unique=True))
@@ -235,7 +235,17 @@ def test_a_world_and_a_drawing_that_show_the_same_give_the_same_photo(shapes):
     assert shapes.same(found._replace(image=plain.image), plain)
 
 
+@given(SEED, st.integers(0, 3), SIZE, SIZE)
+def test_renderers_of_ones_own_get_the_same(seed, number, height, width):
+    drawing = drawing_of(noise_of(seed, max(1, number), height, width), random_photo(seed, max(1, number)))[:number]
+    renderer = SpriteRenderer((height, width), threads=1)
+    plain = renderer(replace(drawing, photo=None)).image
+    assert torch.equal(photo_module.photographed(drawing.photo, plain.contiguous()), renderer(drawing).image)
+
+
 def test_a_photo_of_other_scenes_is_named():
     drawing = drawing_of(noise_of(0, 2, 5, 6))
+    with pytest.raises(ModelError, match=r"uint8 \(N, 3, H, W\), actual torch.uint8 \(2, 5, 6, 3\)"):
+        photo_module.photographed(resolve_scene(Photo(), 2), torch.zeros(2, 5, 6, 3, dtype=torch.uint8))
     with pytest.raises(ModelError, match="one value a scene.*resolve_scene"):
         SpriteRenderer((5, 6))(replace(drawing, photo=Photo()))
