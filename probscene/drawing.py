@@ -5,7 +5,7 @@ pixel in row i and column j is (j + 0.5, i + 0.5). Axis letters: N scenes, M nod
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -200,7 +200,8 @@ def of_scenes(part: AnyPart, scenes: slice) -> AnyPart:
     """A dataclass with some of the scenes' rows of all its tensors; what has none is as it is."""
     if part is None:
         return part
-    return replace(part, **{k: v[scenes] for k, v in vars(part).items() if isinstance(v, Tensor)})
+    values = {k: v[scenes] for k, v in vars(part).items() if isinstance(v, Tensor)}
+    return replace(cast(Any, part), **values)
 
 
 def resolve(sprites: Sprites, present: Tensor) -> Layer:

@@ -43,20 +43,22 @@ def blur(
 
     The scratch holds the image, a row that goes on for ``radius`` pixels on either side, and a row.
     """
-    line = 3 * width
+    line, edge = i32(3) * width, i32(3) * radius
     wide = base + height * line
-    row_at, done = wide + 3 * radius, wide + line + 6 * radius
-    spread(3 * first, height * line, image, base, scratch)
+    row_at, done = wide + edge, wide + line + edge + edge
+    start = i32(3) * first
+    spread(start, height * line, image, base, scratch)
     for row in range(height):
         weigh(row_at, base + row * line, base + row * line, line, weights[weights_base], scratch)
-        for k in range(1, radius + 1):
-            above, below = base + ti.max(row - k, 0) * line, base + ti.min(row + k, height - 1) * line
+        for k in range(i32(1), radius + i32(1)):
+            above = base + ti.max(row - k, i32(0)) * line
+            below = base + ti.min(row + k, height - i32(1)) * line
             add(row_at, above, below, line, weights[weights_base + k], scratch)
-        for k in range(1, radius + 1):
+        for k in range(i32(1), radius + i32(1)):
             for channel in ti.static(range(3)):
                 scratch[row_at - 3 * k + channel] = scratch[row_at + channel]
                 scratch[row_at + line + 3 * (k - 1) + channel] = scratch[row_at + line - 3 + channel]
         weigh(done, row_at, row_at, line, weights[weights_base], scratch)
-        for k in range(1, radius + 1):
-            add(done, row_at - 3 * k, row_at + 3 * k, line, weights[weights_base + k], scratch)
-        gather(3 * first + row * line, line, image, done, scratch)
+        for k in range(i32(1), radius + i32(1)):
+            add(done, row_at - i32(3) * k, row_at + i32(3) * k, line, weights[weights_base + k], scratch)
+        gather(start + row * line, line, image, done, scratch)

@@ -39,7 +39,7 @@ def finish(
             scene = ti.atomic_add(queue[0], i32(1))
             while scene < scenes:
                 photo, first = tone_of(scene, photos), scene * height * width
-                for stage in range(ti.select(toned != 0, 1, 0), 2):
+                for stage in range(ti.select(toned != 0, i32(1), i32(0)), i32(2)):
                     changes, noise = photo[TONED], photo[NOISE]
                     if stage == 1:
                         changes, noise = f32(0.0), photo[LATER]
@@ -59,5 +59,5 @@ def finish(
                                 )  # fmt: skip
                                 column += count
                 if photo[JPEG] != 0:
-                    compress(first, height, width, base, scene * 128, steps, cosines, image, scratch)
+                    compress(first, height, width, base, scene * i32(128), steps, cosines, image, scratch)
                 scene = ti.atomic_add(queue[0], i32(1))

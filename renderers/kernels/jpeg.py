@@ -40,18 +40,18 @@ def transform(
     to: i32, source: i32, lines: i32, count: i32, cosines_base: i32, cosines: ti.template(), scratch: ti.template()
 ):
     """Eight lines as sums of eight others; either lie ``lines`` apart."""
-    for k in range(8):
-        line, c = to + k * lines, cosines_base + 8 * k
+    for k in range(i32(8)):
+        line, c = to + k * lines, cosines_base + i32(8) * k
         blend(line, source, source + lines, count, cosines[c], cosines[c + 1], scratch)
-        for pair in range(1, 4):
-            at, which = source + 2 * pair * lines, c + 2 * pair
+        for pair in range(i32(1), i32(4)):
+            at, which = source + i32(2) * pair * lines, c + i32(2) * pair
             add(line, at, at + lines, count, cosines[which], cosines[which + 1], scratch)
 
 
 @ti.real_func
 def move(to: i32, to_lines: i32, source: i32, lines: i32, count: i32, scratch: array):
     """Eight lines to elsewhere."""
-    for k in range(8):
+    for k in range(i32(8)):
         for i in range(count):
             scratch[to + k * to_lines + i] = scratch[source + k * lines + i]
 
@@ -76,19 +76,19 @@ def quantise(
     scratch: ti.template(),
 ):  # fmt: skip
     """A plane through its cosine transforms in whole steps and back, to whole numbers in -128..127."""
-    strip, other = 8 * blocks, spare + 64 * blocks
-    for first in range(rows // 8):
+    strip, other = i32(8) * blocks, spare + i32(64) * blocks
+    for first in range(rows >> i32(3)):
         at = plane + first * strip
         move(spare, strip, at, rows * blocks, strip, scratch)
         transform(other, spare, strip, strip, i32(0), cosines, scratch)
-        for column in range(8):
+        for column in range(i32(8)):
             here, there = other + column * strip, spare + column * strip
             transform(there, here, blocks, blocks, i32(0), cosines, scratch)
-            for row in range(8):
+            for row in range(i32(8)):
                 settle(there + row * blocks, blocks, steps[steps_base + 8 * row + column], scratch)
             transform(here, there, blocks, blocks, i32(COSINES), cosines, scratch)
         transform(spare, other, strip, strip, i32(COSINES), cosines, scratch)
-        limit(spare, 8 * strip, scratch)
+        limit(spare, i32(8) * strip, scratch)
         move(at, rows * blocks, spare, strip, strip, scratch)
 
 
@@ -104,8 +104,8 @@ def to_planes(
     image: ti.template(), scratch: ti.template(),
 ):  # fmt: skip
     """Luminance, and at half of the resolution what is bluer and redder, less 128; the border is continued."""
-    for cell_row in range(rows >> 1):
-        for cell in range(blocks * 4):
+    for cell_row in range(rows >> i32(1)):
+        for cell in range(blocks * i32(4)):
             bluer, redder = i32(0), i32(0)
             for down, across in ti.static(ti.ndrange(2, 2)):
                 row, column = 2 * cell_row + down, 2 * cell + across
@@ -113,8 +113,8 @@ def to_planes(
                 r, g, b = ti.cast(image[at], i32), ti.cast(image[at + 1], i32), ti.cast(image[at + 2], i32)
                 y = (19595 * r + 38470 * g + 7471 * b + 32768) >> 16
                 scratch[luminance + place(row, column, rows, blocks)] = ti.cast(y - 128, f32)
-                bluer += (-11059 * r - 21709 * g + 32768 * b + 32767) >> 16
-                redder += (32768 * r - 27439 * g - 5329 * b + 32767) >> 16
+                bluer += ti.cast((-11059 * r - 21709 * g + 32768 * b + 32767) >> 16, i32)
+                redder += ti.cast((32768 * r - 27439 * g - 5329 * b + 32767) >> 16, i32)
             odd = 1 + (cell & 1)  # libjpeg rounds up and down by turns
             at = place(cell_row, cell, rows >> 1, blocks >> 1)
             scratch[blue + at] = ti.cast((bluer + odd) >> 2, f32)
@@ -139,17 +139,18 @@ def from_planes(
     image: ti.template(), scratch: ti.template(),
 ):  # fmt: skip
     """Planes to the bytes of an image."""
-    cells, cell_rows = (width + 1) >> 1, (height + 1) >> 1
+    cells, cell_rows = (width + i32(1)) >> i32(1), (height + i32(1)) >> i32(1)
+    high_half, wide_half = rows >> i32(1), blocks >> i32(1)
     for row in range(height):
         near = row >> 1
         far = ti.min(ti.max(near + 2 * (row & 1) - 1, 0), cell_rows - 1)
-        b = three_to_one(blue, near, far, i32(0), rows >> 1, blocks >> 1, scratch)
-        r = three_to_one(red, near, far, i32(0), rows >> 1, blocks >> 1, scratch)
+        b = three_to_one(blue, near, far, i32(0), high_half, wide_half, scratch)
+        r = three_to_one(red, near, far, i32(0), high_half, wide_half, scratch)
         left_b, left_r = b, r
         for cell in range(cells):
             beside = ti.min(cell + 1, cells - 1)
-            right_b = three_to_one(blue, near, far, beside, rows >> 1, blocks >> 1, scratch)
-            right_r = three_to_one(red, near, far, beside, rows >> 1, blocks >> 1, scratch)
+            right_b = three_to_one(blue, near, far, beside, high_half, wide_half, scratch)
+            right_r = three_to_one(red, near, far, beside, high_half, wide_half, scratch)
             for odd in ti.static(range(2)):
                 column = 2 * cell + odd
                 if column < width:
@@ -170,14 +171,14 @@ def compress(
 ):  # fmt: skip
     """The image whose first pixel is ``first`` of all, as a JPEG decoder gives it; ``steps`` 64 for luminance and 64
     for colours. The scratch holds 1.5 planes of whole blocks, 16 pixels wide and high, and 16 rows."""
-    rows, blocks = (height + 15) & -16, ((width + 15) & -16) >> 3
+    rows, blocks = (height + i32(15)) & i32(-16), ((width + i32(15)) & i32(-16)) >> i32(3)
     luminance = base
-    blue = luminance + rows * blocks * 8
-    red = blue + rows * blocks * 2
-    spare = red + rows * blocks * 2
+    blue = luminance + rows * blocks * i32(8)
+    red = blue + rows * blocks * i32(2)
+    spare = red + rows * blocks * i32(2)
     to_planes(first, height, width, rows, blocks, luminance, blue, red, image, scratch)
     quantise(luminance, rows, blocks, spare, steps_base, steps, cosines, scratch)
-    for colour in range(2):
+    for colour in range(i32(2)):
         plane = ti.select(colour == 0, blue, red)
-        quantise(plane, rows >> 1, blocks >> 1, spare, steps_base + 64, steps, cosines, scratch)
+        quantise(plane, rows >> i32(1), blocks >> i32(1), spare, steps_base + i32(64), steps, cosines, scratch)
     from_planes(first, height, width, rows, blocks, luminance, blue, red, image, scratch)

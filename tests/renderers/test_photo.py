@@ -1,5 +1,7 @@
 """Laws of photos: against their numpy twin, against OpenCV's encoder, and against themselves."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
@@ -249,3 +251,30 @@ def test_a_photo_of_other_scenes_is_named():
         photo_module.photographed(resolve_scene(Photo(), 2), torch.zeros(2, 5, 6, 3, dtype=torch.uint8))
     with pytest.raises(ModelError, match="one value a scene.*resolve_scene"):
         SpriteRenderer((5, 6))(replace(drawing, photo=Photo()))
+
+
+OWN = """
+import hashlib, sys
+import torch
+from probscene.photo import Photo
+from probscene.renderers import engine
+from probscene.renderers.photo import photographed
+from probscene.world import resolve_scene
+if sys.argv[1] == "own":
+    engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)
+image = torch.randint(0, 256, (2, 3, 37, 53), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+photo = Photo(1.2, 0.8, 0.7, 1.1, 0.9, 0.3, torch.tensor([[0.0], [1.5]]), 5.0, torch.tensor([[60.0], [torch.inf]]))
+found = photographed(resolve_scene(photo, 2), image)
+print(hashlib.sha256(found.contiguous().numpy().tobytes()).hexdigest())
+"""
+
+
+def test_a_users_own_taichi_gives_the_same_bytes():
+    """Where whole numbers have 64 bits, and real ones as well."""
+    digests = []
+    for whose in ("own", "ours"):
+        command = [sys.executable, "-W", "error", "-c", OWN, whose]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0 and done.stderr == "", done.stderr
+        digests.append(done.stdout.split()[-1])
+    assert digests[0] == digests[1]
