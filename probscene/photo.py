@@ -25,8 +25,9 @@ class Photo:
     """What a camera makes of an image; all are numbers or broadcast to ``(N, 1)``. The defaults leave every byte as it
     is; labels, and depth in 3D, never change.
 
-    The effects come in this order. Colours are sRGB in 0..1, and each stage ends in bytes: vignette, exposure, gains,
-    saturation and contrast together; blur; noise; JPEG.
+    The effects come in this order: vignette, exposure, gains, saturation and contrast, on sRGB in 0..1; blur; noise;
+    JPEG. What they are given and what they leave are bytes; only colours and noise without a blur between them are
+    rounded once.
 
     Args:
         exposure: factor of all light, 1 for as it is.

@@ -142,7 +142,7 @@ class MeshRenderer:
             if name not in self._scratch or self._scratch[name].size < workers * size:
                 self._scratch[name] = _zeros(max(1, workers * size), dtype)
         self._scratch["opened"][:] = 0
-        atlas, photos = self._atlas, photo_table(world.photo, self.canvas, exposed=True).ravel()
+        atlas, photos = self._atlas, photo_table(world.photo, N, self.canvas, exposed=True).ravel()
         buffers = [self._scratch[name] for name in each]
         buffers += [image, instance, semantic, depth, self._scratch["seen"].reshape(-1, LANES)]
         buffers += [_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)]
@@ -154,7 +154,7 @@ class MeshRenderer:
             atlas.positions, atlas.corners, atlas.faces, atlas.textures.table, atlas.textures.texels,
             *buffers,
         )  # fmt: skip
-        self._finish(world.photo, image, toned=True)
+        self._finish(world.photo, image, N, toned=True)
 
 
 def _zeros(size: int, dtype: type) -> np.ndarray:

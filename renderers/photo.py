@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from probscene.errors import ModelError
-from probscene.photo import Photo
+from probscene.photo import Photo, check_photo
 
 from . import engine
 from .kernels import tone
@@ -43,21 +43,20 @@ class PhotoFinish:
         self.canvas, self.threads = canvas, threads
         self._scratch = np.zeros(1, np.float32)
 
-    def __call__(self, photo: Photo, image: np.ndarray, toned: bool) -> None:
+    def __call__(self, photo: Photo, image: np.ndarray, number: int, toned: bool) -> None:
         """Finish images.
 
         Args:
             photo: every value ``(N,)``.
-            image: N images, flat uint8 and contiguous, no less than whole words of 64 bits; those behind are not
-                looked at.
+            image: flat uint8, contiguous, of at least 8 bytes; what is behind the images stays as it is.
+            number: N, how many images.
             toned: whether their colours have been developed already.
 
         Raises:
-            ModelError: values of another shape.
+            ModelError: see ``photo_table``.
         """
-        height, width = self.canvas
-        table = photo_table(photo, self.canvas, exposed=toned)
-        number, pixels = len(table), height * width
+        (height, width), pixels = self.canvas, self.canvas[0] * self.canvas[1]
+        table = photo_table(photo, number, self.canvas, exposed=toned)
         late = table[:, tone.RADIUS] + table[:, tone.JPEG] > 0
         if not (late if toned else late | (table[:, tone.TONED] != 0) | (table[:, tone.NOISE] > 0)).any():
             return
@@ -72,11 +71,11 @@ class PhotoFinish:
             workers = max(1, min(self.threads, part.stop - start, ((1 << 31) - 1) // room))
             if self._scratch.size < workers * room:
                 self._scratch = np.zeros(workers * room, np.float32)
-            bytes_ = image[3 * start * pixels : 3 * part.stop * pixels]
+            some = image[3 * start * pixels : 3 * part.stop * pixels + 8]
             finish(
                 int(toned), workers, part.stop - start, height, width, room, weights.shape[1], np.zeros(1, np.int32),
                 table[part].ravel(), seeds[part], weights[part].ravel(), steps[part].ravel(), _COSINES, self._scratch,
-                bytes_, bytes_[: bytes_.size // 8 * 8].view(np.uint64),
+                some, some[: some.size // 8 * 8].view(np.uint64),
             )  # fmt: skip
 
 
@@ -89,38 +88,38 @@ def photographed(photo: Photo, image: Tensor, threads: int = 1) -> Tensor:
         threads: how many threads work.
 
     Raises:
-        ModelError: images or values of another shape.
+        ModelError: images of another shape; see ``photo_table``.
     """
     if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3:
         raise ModelError(f"Expected images as uint8 (N, 3, H, W), actual {image.dtype} {tuple(image.shape)}.")
     number, _, height, width = image.shape
-    flat = image.permute(0, 2, 3, 1).flatten().numpy()
-    flat = np.concatenate([flat, np.zeros(8, np.uint8)])  # to whole words
-    if number:
-        engine.start()
-        PhotoFinish((height, width), threads)(photo, flat, toned=False)
+    flat = np.append(image.permute(0, 2, 3, 1).flatten().numpy(), np.zeros(8, np.uint8))
+    engine.start()
+    PhotoFinish((height, width), threads)(photo, flat, number, toned=False)
     return torch.from_numpy(flat[:-8]).view(number, height, width, 3).permute(0, 3, 1, 2)
 
 
-def photo_table(photo: Photo, canvas: tuple[int, int], exposed: bool) -> np.ndarray:
+def photo_table(photo: Photo, number: int, canvas: tuple[int, int], exposed: bool) -> np.ndarray:
     """``(N, PHOTO)`` float64, see ``kernels.tone``.
 
     Args:
         photo: every value ``(N,)``.
+        number: N.
         canvas: height and width, pixels.
         exposed: whether the colours have the exposure already.
 
     Raises:
-        ModelError: values of another shape.
+        ModelError: values of another shape, or that a photo cannot have.
     """
-    values = {name: torch.as_tensor(value).detach().cpu().numpy() for name, value in vars(photo).items()}
-    number = len(values["seed"]) if values["seed"].ndim else 0
-    if any(value.shape != (number,) for value in values.values()):
-        shapes = {name: value.shape for name, value in values.items()}
+    values = {name: torch.as_tensor(value).detach().cpu() for name, value in vars(photo).items()}
+    shapes = {name: tuple(value.shape) for name, value in values.items() if value.shape != (number,)}
+    if shapes:
         raise ModelError(
-            f"Expected a photo with one value a scene, actual {shapes}; make it with probscene.world.resolve_scene."
+            f"Expected a photo with one value for each of {number} scenes, actual {shapes}; make it with "
+            "probscene.world.resolve_scene."
         )
-    value = {name: array.astype(np.float64) for name, array in values.items()}
+    check_photo(values)
+    value = {name: tensor.numpy().astype(np.float64) for name, tensor in values.items()}
     table = np.zeros((number, tone.PHOTO))
     gains = np.stack([value["red_gain"], np.ones(number), value["blue_gain"]], 1)
     if not exposed:

@@ -75,8 +75,8 @@ class SpriteRenderer:
                 np.zeros(1, np.int32), first[start : stop + 1].copy(), table.whole, table.real, self._sheet.texels,
                 self._sheet.colours, rgb, rgb.view(np.uint32), ids, ids.view(np.int64), result[start:stop].reshape(-1),
             )  # fmt: skip
-        if drawing.photo is not None and scenes:
-            self._finish(drawing.photo, image, toned=False)
+        if drawing.photo is not None:
+            self._finish(drawing.photo, image, scenes, toned=False)
         return _batch(
             drawing,
             table,
