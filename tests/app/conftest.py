@@ -32,7 +32,7 @@ SHORT = {
     "parameters.round_reader_steps": 2,
     "parameters.round_steps": 2,
 }
-SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache"]
+SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache", "--no-verdict"]
 SETTINGS += [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
 
 
