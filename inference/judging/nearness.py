@@ -65,8 +65,8 @@ class Nearness(NamedTuple):
         learnt: that of what was learnt.
         others: those of what it is held against, by name; without those that cannot be compared.
         floor: what chance leaves, between two halves of the real rows, in 97.5 % of splits.
-        left: the learnt sample's over the nearest other's; None where there is no other, or it is no farther than the
-            floor.
+        left: the learnt sample's over the nearest other's; None where there is no other, or it is no farther than
+            chance leaves between samples of their sizes.
         low, high: 95 % of ``left`` over resamples; 0 and infinity where it is None.
         rows: real rows that were compared.
     """
@@ -90,15 +90,15 @@ class Nearness(NamedTuple):
         return self.learnt <= self.floor
 
     @property
-    def word(self) -> Word:
+    def word(self) -> Word | None:
         """Good where at most a tenth is surely left of the nearest other's distance, or surely less than half and no
-        more than chance leaves; where nothing was to be covered, if chance would leave as much. Else better where
-        surely a tenth or more is covered."""
-        if self.left is None:
-            return Word.GOOD if self.close else Word.NO_BETTER
-        if self.high <= NEAR or (self.close and self.high < HALF):
+        more than chance leaves; better where surely a tenth or more is covered. None where chance would leave as much,
+        and the rows are too few to say whether the other is farther: the prior, if it is right, is not called good."""
+        if self.left is not None and (self.high <= NEAR or (self.close and self.high < HALF)):
             return Word.GOOD
-        return Word.BETTER if self.high <= CLEARLY else Word.NO_BETTER
+        if self.left is not None and self.high <= CLEARLY:
+            return Word.BETTER
+        return None if self.close and self.low < HALF else Word.NO_BETTER
 
     def record(self) -> dict[str, Any]:
         """For JSON; distances are square roots, so metrics."""
@@ -134,7 +134,7 @@ def nearness(
         return None
     here = _Side.of(real, real, rng)
     beside = cdist(real.features, real.features, metric)
-    found: dict[str, NDArray[np.floating]] = {}
+    found: dict[str, tuple[NDArray[np.floating], float]] = {}
     for name, sample in {"learnt": learnt, **others}.items():
         if len(sample.features) < LEAST:
             continue
@@ -146,16 +146,19 @@ def nearness(
     if "learnt" not in found:
         return None
     tail = 0.025 / tests
-    floor = float(np.quantile(_halves(here, beside, rng), 1 - tail))
-    mine = found.pop("learnt")
-    values = {name: float(energies[0]) for name, energies in found.items()}
+    floor = max(0.0, float(np.quantile(_halves(here, beside, rng), 1 - tail)))
+    mine, _ = found.pop("learnt")
+    values = {name: float(energies[0]) for name, (energies, _) in found.items()}
     name = min(values, key=values.__getitem__, default=None)
     left, low, high = None, 0.0, float("inf")
-    if name is not None and values[name] > max(0.0, floor):
-        left = float(mine[0] / found[name][0])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratios = np.where(found[name] > 0, mine / found[name], np.inf)[1:]
-        low, high = (float(np.quantile(ratios, q, method="inverted_cdf")) for q in (tail, 1 - tail))
+    if name is not None:
+        theirs, rows = found[name]
+        # Under chance a distance is as 1 / N + 1 / L, between the halves 4 / L.
+        if values[name] > floor * (1 / rows + 1 / len(beside)) * len(beside) / 4:
+            left = float(mine[0] / theirs[0])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratios = np.where(theirs > 0, mine / theirs, np.inf)[1:]
+            low, high = (float(np.quantile(ratios, q, method="inverted_cdf")) for q in (tail, 1 - tail))
     return Nearness(float(mine[0]), values, floor, left, low, high, len(real.features))
 
 
@@ -192,16 +195,18 @@ def _energies(
     across: NDArray[np.floating],
     within: NDArray[np.floating],
     beside: NDArray[np.floating],
-) -> NDArray[np.floating] | None:
-    """Squared distances ``(1 + R,)``, of the samples and of resamples; None where too few rows have common numbers."""
+) -> tuple[NDArray[np.floating], float] | None:
+    """Squared distances ``(1 + R,)``, of the samples and of resamples, and how many rows the sample has in effect; None
+    where too few have common numbers."""
     mine, theirs = side.drawn @ side.bins, real.drawn @ real.bins  # (1 + R, B)
     both = (mine > 0) & (theirs > 0)
     ratio = np.divide(theirs, mine, out=np.zeros_like(mine), where=both)
     weight, of_real = side.drawn * (ratio @ side.bins.T), real.drawn * (both @ real.bins.T)
     kept = of_real[0].sum() / len(of_real[0])
-    if kept < COMMON or _effective(weight[:1])[0] < LEAST or _effective(of_real[:1])[0] < LEAST:
+    rows = _effective(weight[0])
+    if kept < COMMON or rows < LEAST or _effective(of_real[0]) < LEAST:
         return None
-    return _energy(weight, of_real, across, within, beside)
+    return _energy(weight, of_real, across, within, beside), rows
 
 
 def _energy(
@@ -219,9 +224,9 @@ def _energy(
     return far
 
 
-def _effective(weight: NDArray[np.floating]) -> NDArray[np.floating]:
-    """How many rows of equal weight say as much [2], ``(R,)``."""
-    return weight.sum(1) ** 2 / np.maximum((weight**2).sum(1), 1e-12)
+def _effective(weight: NDArray[np.floating]) -> float:
+    """How many rows of equal weight say as much [2]."""
+    return float(weight.sum() ** 2 / max((weight**2).sum(), 1e-12))
 
 
 def _halves(real: _Side, beside: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.floating]:

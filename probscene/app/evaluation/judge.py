@@ -108,7 +108,7 @@ def judge(
         )
     preset, model, net = run.preset, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)
-    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target)
+    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
 
     def each(images: int) -> None:
         nonlocal done
@@ -120,7 +120,7 @@ def judge(
     draws = preset.draws_per_structure
     scenes = [_features(run, policy, eye, draws, num, seed) for policy, eye in zip(policies, eyes, strict=True)]
     real = _real(run, target, net, each)
-    seen = looked.look(run, target, net, EfficientNetLite(), each, seed=seed)
+    seen = looked.look(run, target, net, EfficientNetLite(), each, looked.IMAGES, seed)
     rendered = np.concatenate([seen[name].looks.features for name in (looked.LEARNT, looked.PRIOR)])
     which = compared(net)
     which = torch.ones(real.shape[1], dtype=torch.bool) if which is None else which

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from probscene.inference.judging.nearness import Nearness, Sample, Word, nearness, root, worst
+from probscene.inference.judging.nearness import Nearness, Sample, Word, nearness, worst
 from probscene.inference.judging.trust import Trust
 from probscene.inference.judging.verdict import Verdict
 
@@ -23,6 +23,7 @@ from .looked import ALL, LEARNT, PRIOR, STRUCTURE, TARGET, Looked
 
 COUNTED = 500  # rows of each source whose counts are compared
 KINDS = ("structure", "layout", "looks")
+ABSENT, UNSURE, UNREAD = "not judged", "cannot be told", "cannot be read"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class Aspect:
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
-        said = {"word": None if self.word is None else str(self.word), "verdict": self.verdict or "not judged"}
+        said = {"word": None if self.word is None else str(self.word), "verdict": self.verdict or ABSENT}
         said |= {"because": self.because, "remedy": self.remedy}
         return said if self.figures is None else said | self.figures.record()
 
@@ -56,12 +57,12 @@ class Aspects:
 
     Attributes:
         parts: by ``KINDS``.
-        classes: the words for ``counts`` and ``layout`` of each class; None where one is not judged.
+        classes: the words for ``counts`` and ``layout`` of each class, as a person reads them.
         unread: sites that keep the prior, and why.
     """
 
     parts: dict[str, Aspect]
-    classes: dict[str, dict[str, Word | None]]
+    classes: dict[str, dict[str, str]]
     unread: dict[str, str]
 
     @property
@@ -90,10 +91,7 @@ class Aspects:
             "because": self.head.because,
             "remedy": self.head.remedy,
             "parts": {name: part.record() for name, part in self.parts.items()},
-            "classes": {
-                name: {what: None if word is None else str(word) for what, word in words.items()}
-                for name, words in self.classes.items()
-            },
+            "classes": self.classes,
             "sites_not_learnt": self.unread,
         }
 
@@ -114,7 +112,7 @@ def aspects(
     words = {}
     for name in run.model.classes:
         if name in counts or name in of_classes:
-            words[name] = {"counts": counts.get(name), "layout": of_classes.get(name)}
+            words[name] = {"counts": counts.get(name, ABSENT), "layout": of_classes.get(name, ABSENT)}
     parts = {
         "structure": _structure(run, found, features, seed),
         "layout": layout,
@@ -128,22 +126,29 @@ def unread_sites(run: RunFolder) -> dict[str, str]:
     return {site["name"]: site["because"] for site in run.parameters.get("sites", []) if not site["learnt"]}
 
 
-def called(word: Word, verdict: Verdict) -> Word:
+def called(word: Word | None, verdict: Verdict) -> Word:
     """The word for structure: its verdict may be worse than how near its features are."""
     if verdict is Verdict.GOOD:
         return Word.GOOD
-    lost = verdict in (Verdict.NOT_FITTED, Verdict.ANOTHER_DOMAIN)
+    lost = word is None or verdict in (Verdict.NOT_FITTED, Verdict.ANOTHER_DOMAIN)
     return Word.NO_BETTER if lost else worst((word, Word.BETTER))
 
 
 def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: int) -> Aspect:
     sides = {name: Sample(_some(each)) for name, each in features.items()}
     figures = nearness(sides[TARGET], sides[LEARNT], {PRIOR: sides[PRIOR]}, seed=seed)
-    word = called(Word.NO_BETTER if figures is None else figures.word, found.verdict)
+    word = called(None if figures is None else figures.word, found.verdict)
     return Aspect(word, found.because, found.remedy, figures, str(found.verdict))
 
 
-def _layout(run: RunFolder, looked: dict[str, Looked], seed: int) -> tuple[Aspect, dict[str, Word | None]]:
+def said(figures: Nearness | None) -> str:
+    """The word for a comparison, as a person reads it."""
+    if figures is None:
+        return ABSENT
+    return UNSURE if figures.word is None else str(figures.word)
+
+
+def _layout(run: RunFolder, looked: dict[str, Looked], seed: int) -> tuple[Aspect, dict[str, str]]:
     """Good only where no class is no better than in the prior."""
     if not looked[TARGET].layouts:
         why = f"Not judged: {run.features.name} features do not say where objects are."
@@ -153,8 +158,8 @@ def _layout(run: RunFolder, looked: dict[str, Looked], seed: int) -> tuple[Aspec
         sides = _sides(looked, lambda seen, name=name: seen.layouts[name])
         found[name] = nearness(*sides, metric="cityblock", tests=1 if name == ALL else len(names) - 1, seed=seed)
     whole = found.pop(ALL)
-    words = {name: None if figures is None else figures.word for name, figures in found.items()}
-    worse = [name for name, word in words.items() if word is Word.NO_BETTER]
+    words = {name: said(figures) for name, figures in found.items()}
+    worse = [name for name, word in words.items() if word == Word.NO_BETTER]
     return _aspect(run, "layout", whole, ", ".join(worse)), words
 
 
@@ -163,30 +168,21 @@ def _aspect(run: RunFolder, name: str, figures: Nearness | None, worse: str) -> 
         why = "Not judged: too few learnt scenes have as many objects as the target's images."
         return Aspect(None, why, "Mend the structure first.")
     word, because = figures.word, _because(figures)
+    if word is None:
+        why = f"Of {figures.rows} images neither what was learnt nor the prior can be told from the target."
+        return Aspect(None, why, "More photographs would tell.", figures, UNSURE)
     if worse and word is Word.GOOD:
         word, because = Word.BETTER, f"{because} By themselves these are not nearer than in the prior: {worse}."
     return Aspect(word, because, remedy(run, name, word, figures), figures, str(word))
 
 
 def _because(figures: Nearness) -> str:
-    nearest = figures.nearest
-    if figures.left is not None:
-        limits = f"{_percent(figures.low)} to {_percent(figures.high)}"
-        share = f"{_percent(figures.left)} ({limits}) of the squared distance of {_of(nearest)} from the target is left"
-        return f"{share}{'; chance alone would leave as much' if figures.close else ''}."
-    if figures.close:
-        return f"As near as two halves of the target are to one another{_so_is(nearest)}."
-    return f"Farther from the target, {root(figures.learnt):.3g}, than chance leaves{_so_is(nearest, ', which')}."
-
-
-def _of(name: str | None) -> str:
-    return {PRIOR: "the prior", STRUCTURE: "structure alone"}.get(name or "", "the prior")
-
-
-def _so_is(name: str | None, which: str = ", and so") -> str:
-    if name is None:
-        return ""
-    return f"{which} is {_of(name)}" if which == ", and so" else f", which {_of(name)} is not"
+    if figures.left is None:
+        return "It is farther from the target than chance leaves, and the prior is not."
+    limits = f"{_percent(figures.low)} to {_percent(figures.high)}"
+    nearest = STRUCTURE if figures.nearest == STRUCTURE else "the prior"
+    share = f"{_percent(figures.left)} ({limits}) of the squared distance of {nearest} from the target is left"
+    return f"{share}{'; chance alone would leave as much' if figures.close else ''}."
 
 
 def _percent(share: float) -> str:
@@ -198,8 +194,8 @@ def _sides(looked: dict[str, Looked], of: Callable[[Looked], Sample]) -> tuple[S
     return of(looked[TARGET]), of(looked[LEARNT]), others
 
 
-def _counts(run: RunFolder, features: dict[str, Tensor], seed: int) -> dict[str, Word | None]:
-    """Of each class that the features count, how near its numbers are; None for classes that cannot be read."""
+def _counts(run: RunFolder, features: dict[str, Tensor], seed: int) -> dict[str, str]:
+    """Of each class that the features count, how near its numbers are."""
     net = run.network()
     unit = getattr(net, "unit", 1.0)
     each: dict[str, np.ndarray] = {}
@@ -207,15 +203,15 @@ def _counts(run: RunFolder, features: dict[str, Tensor], seed: int) -> dict[str,
         counts = class_counts(run.model, run.feature_names, found * unit)
         if counts is not None:
             each[source] = counts.clamp(min=0).round().double().numpy()
-    words: dict[str, Word | None] = {}
+    words: dict[str, str] = {}
     names = counted_classes(run.model, run.feature_names) if each else ()
     for c, name in enumerate(names):
         if name in run.unread or name in run.model.stuff:
-            words[name] = None
+            words[name] = UNREAD if name in run.unread else ABSENT
             continue
         real, learnt, prior = (Sample(_some(each[source][:, c : c + 1])) for source in (TARGET, LEARNT, PRIOR))
         figures = nearness(real, learnt, {PRIOR: prior}, tests=len(names), seed=seed)
-        words[name] = None if figures is None else figures.word
+        words[name] = said(figures)
     return words
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from probscene.dataset import Images
+from probscene.errors import ModelError
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.features.counting.layout import LEAST, objects, scales
 from probscene.inference.judging.nearness import Sample
@@ -68,7 +69,7 @@ def look(
     net: FeatureNet,
     appearance: FeatureNet,
     each: Each,
-    num: int = IMAGES,
+    num: int,
     seed: int = 0,
 ) -> dict[str, Looked]:
     """Look at up to ``num`` images of the target, evenly spread, and ``num`` of each of the other sources.
@@ -76,6 +77,9 @@ def look(
     Args:
         net: the run's own.
         appearance: what looks are seen by.
+
+    Raises:
+        ModelError: a user's own network whose ``cells`` are none.
     """
 
     def seen(parts) -> Looked:
@@ -86,7 +90,9 @@ def look(
             cells += [] if found is None else [found]
             each(len(images))
         whole = torch.cat(cells) if cells else None
-        return Looked(Sample(torch.cat(looks).double().numpy()), {} if whole is None else _layouts(run, whole))
+        return Looked(
+            Sample(torch.cat(looks).double().numpy()), {} if whole is None else _layouts(run, located(run, net), whole)
+        )
 
     with threads(run.record["threads"]):
         rows = np.linspace(0, len(target) - 1, min(num, len(target))).astype(int)
@@ -98,7 +104,7 @@ def look(
     return found
 
 
-def number_of(run: RunFolder, target: Images, num: int = IMAGES) -> int:
+def number_of(run: RunFolder, target: Images, num: int) -> int:
     """How many images that are."""
     return min(num, len(target)) + num * len(policies(run))
 
@@ -115,14 +121,18 @@ def _cells(run: RunFolder, net: FeatureNet, images: Tensor) -> Tensor | None:
     names, own = located(run, net), inner(net)
     if not names:
         return None
-    columns = [own.classes.index(name) for name in names]  # pyright: ignore[reportAttributeAccessIssue]: asked for before
-    return own.cells(images)[:, columns]  # pyright: ignore[reportAttributeAccessIssue]
+    classes, found = own.classes, own.cells(images)  # pyright: ignore[reportAttributeAccessIssue]: asked for before
+    shape = tuple(found.shape)
+    if len(shape) != 4 or shape[:2] != (len(images), len(classes)) or not (found >= 0).all():
+        raise ModelError(
+            f"Expected of {type(own).__name__}.cells numbers that are not negative ({len(images)}, {len(classes)}, h, "
+            f"w), actual {shape}; see docs/extending.md."
+        )
+    return found[:, [classes.index(name) for name in names]]
 
 
-def _layouts(run: RunFolder, cells: Tensor) -> dict[str, Sample]:
-    """Of images with ``cells (N, C, h, w)``."""
-    net = run.network()
-    names = () if net is None else located(run, net)
+def _layouts(run: RunFolder, names: tuple[str, ...], cells: Tensor) -> dict[str, Sample]:
+    """Of images with ``cells (N, C, h, w)`` of the named classes."""
     groups = run.model.groups
     counted = [c for c, name in enumerate(names) if groups is None or name != groups.kind]
     maps = {name: cells[:, c] for c, name in enumerate(names)} if len(names) > 1 else {}

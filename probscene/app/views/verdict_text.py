@@ -12,6 +12,7 @@ from probscene.inference.judging.two_sample import Apart
 from probscene.inference.judging.verdict import Gap
 
 from ..evaluation.judge import Judged
+from ..judging.aspects import ABSENT
 from ..judging.looked import LEARNT, PRIOR, STRUCTURE
 
 HEAD = ("", "this fit", "the floor")
@@ -110,8 +111,8 @@ def by_class(record: dict[str, Any]) -> list[str]:
     for what in ("counts", "layout"):
         words: dict[str, list[str]] = {}
         for name, each in classes.items():
-            words.setdefault(each[what] or "not judged", []).append(name)
-        if set(words) != {"not judged"}:
+            words.setdefault(each[what], []).append(name)
+        if set(words) != {ABSENT}:
             each = "; ".join(f"{word} for {', '.join(names)}" for word, names in words.items())
             said.append(f"{what.capitalize()} by class: {each}.")
     return said

@@ -1,5 +1,6 @@
 """The verdict on real renders: right where one knows it, held against labels, shown by both commands."""
 
+import functools
 import json
 from types import SimpleNamespace
 
@@ -14,10 +15,12 @@ from probscene.app.evaluation.label_agreement import agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
 from probscene.app.fitting.run import RunFolder
+from probscene.app.judging import looked
 from probscene.app.labelling.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
+from probscene.inference.features import pretrained
 from probscene.inference.judging.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
 
@@ -29,9 +32,10 @@ def quiet(*_):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def fewer_looks():
+def fewer_and_smaller_looks():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verdict, "LOOKS", 12)
+        patch.setattr(looked, "IMAGES", 60)
+        patch.setattr(pretrained, "EfficientNetLite", functools.partial(pretrained.EfficientNetLite, 96))
         yield
 
 
@@ -108,7 +112,8 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
     assert all(picture.shape == (64, 64, 3) for picture in found.generated_unmatched)
     assert not found.trust.pretrained
     record = json.loads(json.dumps(found.record(), allow_nan=False))
-    assert record["verdict"] == str(expected) and "labels" not in record
+    assert record["verdict"] == record["parts"]["structure"]["verdict"] == str(expected) and "labels" not in record
+    assert (record["overall"] == "good") is (record["parts"]["structure"]["word"] == "good")
     assert set(record["single_features"]) == {"red", "blue", "total"}
 
 

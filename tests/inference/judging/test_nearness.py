@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from probscene.inference.judging.nearness import HALF, NEAR, Nearness, Sample, Word, nearness, worst
 
+RANKED = [Word.GOOD, Word.BETTER, None, Word.NO_BETTER]
 WORDS = list(Word)
 
 
@@ -57,10 +58,19 @@ def test_a_fit_is_held_against_the_nearest_of_the_others():
     assert found.nearest == "structure alone" and found.word is Word.NO_BETTER
 
 
-def test_where_the_prior_is_right_what_was_learnt_is_good_only_if_it_is_as_well():
+def test_where_the_prior_is_right_nothing_is_called_good():
     found = judged(normal(0), normal(1), normal(2))
-    assert found.left is None and found.word is Word.GOOD
+    assert found.left is None and found.close and found.word is None
     assert judged(normal(0), normal(1, shift=0.4), normal(2)).word is Word.NO_BETTER
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize(("rows", "shift"), [(20, 1.0), (40, 0.3), (40, 1.0), (100, 0.2), (200, 0.1), (200, 2.0)])
+def test_the_prior_is_never_good(seed, rows, shift):
+    """However few images there are, and however near it is."""
+    real, prior = normal(seed, rows), normal(seed + 50, rows, shift)
+    for learnt in (prior, normal(seed + 100, rows, shift)):
+        assert judged(real, learnt, prior).word is not Word.GOOD
 
 
 @settings(max_examples=15, deadline=None)
@@ -68,16 +78,18 @@ def test_where_the_prior_is_right_what_was_learnt_is_good_only_if_it_is_as_well(
 def test_farther_away_never_has_a_better_word(seed, shifts):
     real, prior, learnt = normal(seed), normal(seed + 1, shift=0.8), normal(seed + 2)
     away = np.sign((learnt - real).mean(0)) * 0.5  # never back toward the real mean
-    words = [WORDS.index(judged(real, learnt + shift * away, prior).word) for shift in sorted(shifts)]
+    words = [RANKED.index(judged(real, learnt + shift * away, prior).word) for shift in sorted(shifts)]
     assert words == sorted(words)
 
 
 @given(st.floats(0, 2), st.floats(0, 2), st.floats(1e-3, 1), st.floats(1, 3), st.booleans())
 def test_more_distance_never_has_a_better_word(one, other, floor, wide, covered):
     def word(distance):
-        left = distance if covered else None  # the prior's being 1
-        figures = Nearness(distance, {"prior": 1.0}, floor, left, 0.0, wide * distance if covered else np.inf, 100)
-        return WORDS.index(figures.word)
+        if not covered:
+            return RANKED.index(Nearness(distance, {"prior": 1.0}, floor, None, 0.0, np.inf, 100).word)
+        limits = distance / wide, distance * wide
+        figures = Nearness(distance, {"prior": 1.0}, floor, distance, *limits, 100)
+        return RANKED.index(figures.word)
 
     near, far = sorted((one, other))
     assert word(near) <= word(far)
@@ -116,7 +128,7 @@ def test_without_common_numbers_nothing_is_compared():
     real, none, prior = with_numbers(0, [0, 0, 1]), with_numbers(1, [0.5, 0.5, 0]), with_numbers(2, [0, 0, 1], 1.0)
     assert nearness(real, none, {"prior": prior}) is None
     found = nearness(real, with_numbers(3, [0, 0, 1]), {"prior": none})
-    assert found.others == {} and found.nearest is None and found.word is Word.GOOD
+    assert found.others == {} and found.nearest is None and found.word is None
     few = Sample(normal(0, 5))
     assert nearness(few, real, {}) is None and nearness(real, few, {}) is None
 
