@@ -15,7 +15,7 @@ References:
 
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ CLEARLY = 0.9  # of it is left at most where a fit is clearly nearer
 BINS = 8  # of numbers, at most
 LEAST = 15  # rows of a sample, in effect
 COMMON = 0.5  # of the real rows whose number the other sample has, too
+
+Metric = Literal["euclidean", "cityblock"]
 
 
 class Word(StrEnum):
@@ -118,7 +120,7 @@ def nearness(
     real: Sample,
     learnt: Sample,
     others: Mapping[str, Sample],
-    metric: str = "euclidean",
+    metric: Metric = "euclidean",
     tests: int = 1,
     seed: int = 0,
 ) -> Nearness | None:
@@ -126,7 +128,7 @@ def nearness(
 
     Args:
         others: what the learnt sample is held against, such as the prior's; those with too few such rows are left out.
-        metric: of rows, scipy's name; one of negative type, such as the Euclidean or the city block distance.
+        metric: of rows; both are of negative type.
         tests: how many such comparisons are made together: the confidence of each is raised (Bonferroni).
     """
     rng = np.random.default_rng(seed)
@@ -146,7 +148,7 @@ def nearness(
     if "learnt" not in found:
         return None
     tail = 0.025 / tests
-    floor = max(0.0, float(np.quantile(_halves(here, beside, rng), 1 - tail)))
+    floor = max(0.0, float(np.quantile(_halves(beside, seed), 1 - tail)))
     mine, _ = found.pop("learnt")
     values = {name: float(energies[0]) for name, (energies, _) in found.items()}
     name = min(values, key=values.__getitem__, default=None)
@@ -171,7 +173,7 @@ class _Side(NamedTuple):
     @staticmethod
     def of(sample: Sample, real: Sample, rng: np.random.Generator) -> "_Side":
         N = len(sample.features)
-        drawn = np.concatenate([np.ones((1, N)), rng.multinomial(N, np.full(N, 1 / N), RESAMPLES)])
+        drawn = np.concatenate([np.ones((1, N)), rng.multinomial(N, np.full(N, 1 / N), RESAMPLES).astype(float)])
         if sample.number is None or real.number is None:
             return _Side(np.ones((N, 1)), drawn)
         return _Side(_bins(sample.number, real.number), drawn)
@@ -229,8 +231,9 @@ def _effective(weight: NDArray[np.floating]) -> float:
     return float(weight.sum() ** 2 / max((weight**2).sum(), 1e-12))
 
 
-def _halves(real: _Side, beside: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.floating]:
-    """Squared distances between random halves of the real rows, ``(SPLITS,)``."""
-    L = beside.shape[0]
-    which = rng.permuted(np.tile(np.arange(L) < L // 2, (SPLITS, 1)), axis=1).astype(float)
+def _halves(beside: NDArray[np.floating], seed: int) -> NDArray[np.floating]:
+    """Squared distances between random halves of the real rows, ``(SPLITS,)``; the same whatever is compared."""
+    L = len(beside)
+    halves = np.tile(np.arange(L) < L // 2, (SPLITS, 1))
+    which = np.random.default_rng([seed, 1]).permuted(halves, axis=1).astype(float)
     return _energy(which, 1 - which, beside, beside, beside)

@@ -49,7 +49,8 @@ def _unread(record: dict[str, Any]) -> str:
     names = [site["name"] for site in record.get("sites", []) if not site["learnt"]]
     if not names:
         return ""
-    return f"Not learnt: {', '.join(names)}. Set their priors by hand, or write the program so that images show them."
+    what = "Set the priors of these by hand, or write the program so that images show them."
+    return f"Not learnt: {', '.join(names)}. {what}"
 
 
 def _far(record: dict[str, Any]) -> str:

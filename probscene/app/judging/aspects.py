@@ -130,8 +130,9 @@ def called(word: Word | None, verdict: Verdict) -> Word:
     """The word for structure: its verdict may be worse than how near its features are."""
     if verdict is Verdict.GOOD:
         return Word.GOOD
-    lost = word is None or verdict in (Verdict.NOT_FITTED, Verdict.ANOTHER_DOMAIN)
-    return Word.NO_BETTER if lost else worst((word, Word.BETTER))
+    if word is None or verdict in (Verdict.NOT_FITTED, Verdict.ANOTHER_DOMAIN):
+        return Word.NO_BETTER
+    return worst((word, Word.BETTER))
 
 
 def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: int) -> Aspect:

@@ -95,9 +95,9 @@ def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def what_to_do(record: dict[str, Any]) -> list[str]:
-    """Of the parts that the verdict is not called by and that are not good: why, and what to do."""
+    """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said."""
     return [
-        f"{name.capitalize()}: {part['because']} {part['remedy']}"
+        f"{name.capitalize()}: {part['because']} {part['remedy'].removeprefix(record['remedy']).strip()}".strip()
         for name, part in record["parts"].items()
         if part["word"] != "good" and part["because"] != record["because"]
     ]

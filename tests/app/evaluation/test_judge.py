@@ -2,6 +2,7 @@
 
 import functools
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,7 +77,7 @@ def seeing(call, drawn, discs, tmp_path_factory):
     out = tmp_path_factory.mktemp("seeing") / "run"
     settings = [word.replace("count.steps=48", "count.steps=300") for word in discs.settings]
     done = call("fit", discs.file, "--target", drawn.target.path, "--out", out, *settings)
-    assert done.code == 0, done.err
+    assert done.code == 0 and "Verdict" not in done.out, done.err
     return out
 
 
@@ -171,6 +172,17 @@ def test_both_commands_say_it(call, seeing, drawn, tmp_path):
     assert done.code == 0, done.err
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Can this fit be trusted?" in page and "Target images least like any generated scene: 000" in page
+
+
+def test_a_fit_ends_with_its_verdict(call, drawn, discs, tmp_path):
+    words = [word for word in discs.settings if word != "--no-verdict"]
+    done = call("fit", discs.file, "--target", drawn.target.path, "--out", tmp_path / "run", *words)
+    assert done.code == 0, done.err
+    assert re.match(r"Verdict: [\w ]+\.\n", done.out) and "\nLearnt." in done.out
+    for part in ("structure", "layout", "looks"):
+        assert re.search(rf"│ {part} +│", done.out)
+    again = call("fit", "--resume", "--out", tmp_path / "run")
+    assert again.code == 0 and "Verdict" not in again.out  # it was finished
 
 
 def test_too_few_images_have_no_verdict_and_are_still_compared(call, seeing, drawn, tmp_path):
