@@ -23,7 +23,7 @@ from scipy.spatial.distance import cdist
 
 from .two_sample import Features
 
-RESAMPLES, SPLITS = 400, 200
+RESAMPLES, SPLITS = 400, 1000
 NEAR = 0.1  # of the squared distance that was to be covered
 HALF = 0.5
 CLEARLY = 0.9  # of it is left at most where a fit is clearly nearer

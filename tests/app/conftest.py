@@ -45,6 +45,14 @@ def _own_cache(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _few_images_are_looked_at():
+    """By a verdict on layout and looks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("probscene.app.judging.looked.IMAGES", 60)
+        yield
+
+
 def probscene(*words) -> SimpleNamespace:
     """Call the command line in this process: ``code``, ``out`` and ``err``."""
     result = CliRunner().invoke(app, [str(word) for word in words])

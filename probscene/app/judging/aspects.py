@@ -17,6 +17,7 @@ from probscene.inference.judging.trust import Trust
 from probscene.inference.judging.verdict import Verdict
 
 from ..evaluation.estimate import class_counts, counted_classes
+from ..fitting.learnt.outcome import compared
 from ..fitting.run import RunFolder
 from .advice import remedy
 from .looked import ALL, LEARNT, PRIOR, STRUCTURE, TARGET, Looked
@@ -136,7 +137,9 @@ def called(word: Word | None, verdict: Verdict) -> Word:
 
 
 def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: int) -> Aspect:
-    sides = {name: Sample(_some(each)) for name, each in features.items()}
+    net = run.network()
+    which = None if net is None else compared(net)
+    sides = {name: Sample(_some(each if which is None else each[:, which])) for name, each in features.items()}
     figures = nearness(sides[TARGET], sides[LEARNT], {PRIOR: sides[PRIOR]}, seed=seed)
     word = called(None if figures is None else figures.word, found.verdict)
     return Aspect(word, found.because, found.remedy, figures, str(found.verdict))

@@ -16,7 +16,6 @@ from probscene.app.evaluation.label_agreement import agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
 from probscene.app.fitting.run import RunFolder
-from probscene.app.judging import looked
 from probscene.app.labelling.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
@@ -35,7 +34,6 @@ def quiet(*_):
 @pytest.fixture(scope="module", autouse=True)
 def fewer_and_smaller_looks():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(looked, "IMAGES", 60)
         patch.setattr(pretrained, "EfficientNetLite", functools.partial(pretrained.EfficientNetLite, 96))
         yield
 
