@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
+from probscene.errors import ProbsceneError
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features
 from probscene.model import SceneModel
@@ -17,7 +18,7 @@ from ..arguments import checked_seed
 from ..fitting import session
 from ..fitting.overrides import override
 from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
-from ..fitting.presets import FOR_PHOTOGRAPHS, FOR_RENDERS, Preset
+from ..fitting.presets import BOTH, FOR_PHOTOGRAPHS, FOR_RENDERS, STRUCTURE, Preset
 from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
 from ..loading import load_model
@@ -164,7 +165,17 @@ def chosen_preset(
 def with_learn(
     settings: Mapping[str, Any] | Sequence[str], learn: str | None, parameters: str | None = None
 ) -> list[str]:
-    """Settings as words ``key=value``, and what is to be learnt among them, and how."""
+    """Settings as words ``key=value``, and what is to be learnt among them, and how; who says how parameters are learnt
+    means that they are.
+
+    Raises:
+        ProbsceneError: only structure is to be learnt, and yet it is said how parameters are.
+    """
+    if parameters is not None and learn == STRUCTURE:
+        raise ProbsceneError(
+            f"Expected learn={BOTH} where parameters={parameters} says how, actual learn={STRUCTURE}; leave one out."
+        )
+    learn = BOTH if learn is None and parameters is not None else learn
     words = [f"{key}={_word(value)}" for key, value in settings.items()] if isinstance(settings, Mapping) else settings
     more = {"learn": learn, "parameter_method": parameters}
     return [*words, *(f"{key}={word}" for key, word in more.items() if word is not None)]

@@ -117,8 +117,8 @@ def judge(
 
     each(0)
     eyes = [_Eyes(net, each, keep) for keep in (True, False)]
-    draws = preset.draws_per_structure
-    scenes = [_features(run, policy, eye, draws, num, seed) for policy, eye in zip(policies, eyes, strict=True)]
+    draws = [1 if policy.suits else preset.draws_per_structure for policy in policies]
+    scenes = [_features(run, *each_of, num, seed) for each_of in zip(policies, eyes, draws, strict=True)]
     real = _real(run, target, net, each)
     seen = looked.look(run, target, net, EfficientNetLite(), each, looked.IMAGES, seed)
     rendered = np.concatenate([seen[name].looks.features for name in (looked.LEARNT, looked.PRIOR)])

@@ -20,7 +20,7 @@ CHOICES = {
     "learn": (STRUCTURE, BOTH),
     "parameter_method": (LIKELIHOOD, META_SIM),
 }
-LEAST = {"num_scenes": 2, "scenes": 2}
+LEAST = {"num_scenes": 2, "scenes": 2, "batches_again": 0, "rounds": 0}
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate", "difference")
 
 

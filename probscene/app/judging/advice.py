@@ -3,14 +3,13 @@
 from typing import Any
 
 from probscene.inference.judging.nearness import CLEARLY, Nearness, Word
-from probscene.scenarios import JointGrammar
 
 from ..fitting.presets import BOTH
 from ..fitting.run import RunFolder
 
 PHOTO = (
-    "Put an image-level site for light, colour, focus and noise into the model, or its sprites and textures nearer to "
-    "the images."
+    "Put scene.photo(...), with light, colour, focus and noise, into the model, or sprites and textures nearer to the "
+    "images."
 )
 FARTHER = 2.0  # floors, from which on a site is named
 UNSURE = 0.7  # of the distance is left, and it is not sure that it is less than all
@@ -31,8 +30,6 @@ def _learn(run: RunFolder) -> str:
     """How parameters are learnt, or better."""
     record = run.parameters
     if not record:
-        if isinstance(run.model.grammar, JointGrammar):
-            return "Parameters of several scenarios together are not learnt yet: fit one of them alone."
         if run.preset.learn != BOTH:
             return f"Learn parameters, too: fit again with --learn {BOTH}."
         return "Parameters are not learnt by these features: fit again with --features count."

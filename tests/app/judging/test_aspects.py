@@ -136,7 +136,7 @@ def test_a_class_whose_layout_is_the_priors_is_named(fitted):
 
 def test_what_looks_unlike_the_target_is_no_better_than_the_prior(fitted):
     found = judge(guided(fitted, learnt=dots(0.0, bright=0.3)), fitted.images, quiet, 300)
-    assert words(found)["looks"] is not Word.GOOD and "image-level site" in found.aspects.parts["looks"].remedy
+    assert words(found)["looks"] is not Word.GOOD and "scene.photo(...)" in found.aspects.parts["looks"].remedy
 
 
 def test_features_that_do_not_say_where_objects_are(fitted, monkeypatch):
