@@ -1,18 +1,22 @@
 """How close layout comes to the target's on Multi-MNIST, learnt with structure from images of another program.
 
     python benchmarks/learn_parameters.py --mnist FOLDER --out FOLDER [--targets 0 1 2] [--preset quick] [--seed 0]
+        [--parameters likelihood meta-sim]
 
 Targets are those of ``learn_multi_mnist.py``: upright digits of t10k in an evenly spaced row. Printed for the prior,
-the learnt structure alone, and structure and parameters: how far digits are from their places in the row and from its
-line, pixels; how far they are turned, degrees; how many are more than five pixels off; and KID from 500 target images
-in EfficientNet-Lite0's features, with an interval, and its floor, another 500 target images. Total variation of the
+the learnt structure alone, the learnt parameters alone (in the prior's structures), and both: how far digits are from
+their places in the row and from its line, pixels; how far they are turned, degrees; how many are more than five pixels
+off; and KID from 500 target images in EfficientNet-Lite0's features, with an interval, and its floor, another 500
+target images. Learnt parameters are shown whether the fit has kept them or not; it says which. Total variation of the
 number of digits and of their classes is that of the structures, before and after their second pass. FOLDER holds the
-runs, ``results.json`` and a picture of each target, ``scenes-K.png``: prior, structure alone, both, target.
+runs, ``results.json`` and a picture of each target and way of learning parameters, ``scenes-K.png`` for likelihood:
+prior, structure alone, both, target.
 """
 
 import argparse
 import json
 import math
+from copy import copy
 from pathlib import Path
 
 import cv2
@@ -24,7 +28,9 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.chunks import CHUNK, draw_chunk
 from probscene.app.files import write_json
+from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
 from probscene.app.fitting.learnt.structure import BEFORE
+from probscene.app.fitting.presets import LIKELIHOOD, META_SIM
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.session import timing
 from probscene.app.loading import renderer_for
@@ -35,7 +41,8 @@ from probscene.policy import Policy
 from probscene.sampling import Scenes
 
 IMAGES, OFF, SIDE = 500, 5.0, 4  # of each side for KID; pixels; pictures along a side of a panel
-SOURCES = ("prior", "structure", "both")
+SOURCES = ("prior", "structure", "parameters", "both")
+SHOWN = ("prior", "structure", "both")
 
 
 def row_errors(scenes: list[Scenes]) -> dict[str, float]:
@@ -80,12 +87,13 @@ def picture(panels: list[Tensor], path: Path) -> None:
     cv2.imwrite(str(path), cv2.resize(whole, None, fx=0.375, fy=0.375, interpolation=cv2.INTER_AREA))
 
 
-def measured(target: int, args: argparse.Namespace) -> dict:
-    """One target's row."""
-    images = args.out / f"target-{target}"
+def measured(target: int, method: str, args: argparse.Namespace) -> dict:
+    """The rows of one target and one way of learning parameters."""
+    images, name = args.out / f"target-{target}", "both" if method == LIKELIHOOD else method
     draw_target(args.mnist, target, images, args.images)
     learn = {"learn": "structure,parameters", "threads": 1, "cache": args.out / "cache", "resume": True}
-    run = fit("multi_mnist", images, args.preset, args.seed, out=args.out / f"both-{target}", **learn)
+    learn |= {"parameters": method, "out": args.out / f"{name}-{target}", "settings": args.set}
+    run = fit("multi_mnist", images, args.preset, args.seed, **learn)
     look, real = EfficientNetLite(), ImageFolder(images, run.model.canvas, run.model.channels)
     of_real = look.embed(torch.stack([real.load(i) for i in range(2 * IMAGES)]))
     first, before = run.new_guide().eval(), run.read_tensors(BEFORE)
@@ -94,20 +102,23 @@ def measured(target: int, args: argparse.Namespace) -> dict:
     row: dict = {
         "target": target,
         "seed": args.seed,
+        "method": method,
+        "kept": run.parameters["kept"],
         "seconds": timing(run),
         "total_variation": distances(run.guide, target),
         "total_variation_before": distances(first, target),
     }
     row["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
-    panels, learnt = [], run.guide.suits
+    panels, tensors = [], run.read_tensors(NAME)
+    suits = learnt_by(run, run.guide, beside(tensors)).suited if tensors else None
     for source in SOURCES:
-        policy = run.model.prior if source == "prior" else run.guide
-        if source != "prior":
-            policy.suits = learnt if source == "both" else None
+        policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
+        policy.suits = suits if source in ("parameters", "both") else None
         scenes, pictures = drawn(run, policy, 1)
         row[source] = row_errors(scenes) | {"kid": said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
-        panels.append(pictures)
-    picture([*panels, torch.stack([real.load(i) for i in range(SIDE**2)])], args.out / f"scenes-{target}.png")
+        panels += [pictures] if source in SHOWN else []
+    file = f"scenes-{target}.png" if method == LIKELIHOOD else f"scenes-{method}-{target}.png"
+    picture([*panels, torch.stack([real.load(i) for i in range(SIDE**2)])], args.out / file)
     return row
 
 
@@ -119,12 +130,15 @@ def main():
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--parameters", nargs="+", default=[LIKELIHOOD, META_SIM], help="ways of learning them")
+    parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
     args = parser.parse_args()
     rows = []
     for target in args.targets:
-        rows.append(measured(target, args))
-        print(json.dumps(rows[-1]), flush=True)
-        write_json(args.out / "results.json", rows)
+        for method in args.parameters:
+            rows.append(measured(target, method, args))
+            print(json.dumps(rows[-1]), flush=True)
+            write_json(args.out / "results.json", rows)
 
 
 if __name__ == "__main__":

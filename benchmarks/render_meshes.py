@@ -20,9 +20,10 @@ import torch
 from opengl_peer import Peer
 
 from probscene.mesh import Mesh, Surface
+from probscene.photo import Photo
 from probscene.renderers.meshes import MeshRenderer
 from probscene.threads import use_threads
-from probscene.world import Camera, Ground, Light, Meshes, Photo, World, resolve_ground, resolve_meshes, resolve_scene
+from probscene.world import Camera, Ground, Light, Meshes, World, resolve_ground, resolve_meshes, resolve_scene
 
 OBJECTS = 30
 EDGES = (-9.0, -3.6, -0.1, 0.1, 3.6, 9.0)

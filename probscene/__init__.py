@@ -54,11 +54,12 @@ _MODULES = {
     "probscene.inference.pretrain": ("pretrain",),
     "probscene.mesh": ("Mesh",),
     "probscene.model": ("Groups", "SceneModel", "scene_model"),
+    "probscene.photo": ("Photo",),
     "probscene.policy": ("Policy",),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
     "probscene.scene": ("SceneGraph",),
     "probscene.structure": ("StructurePrior", "counts", "ranked", "weights"),
-    "probscene.world": ("Camera", "Ground", "Light", "Meshes", "Photo", "World"),
+    "probscene.world": ("Camera", "Ground", "Light", "Meshes", "World"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -91,11 +92,12 @@ if TYPE_CHECKING:
     from .image_array import ImageArray
     from .mesh import Mesh
     from .model import Groups, SceneModel, scene_model
+    from .photo import Photo
     from .policy import Policy
     from .sampling import Scenes, sample, seed_everything
     from .scene import SceneGraph
     from .structure import StructurePrior, counts, ranked, weights
-    from .world import Camera, Ground, Light, Meshes, Photo, World
+    from .world import Camera, Ground, Light, Meshes, World
 
 __all__ = [
     "FeatureNet", "Features", "Camera", "DataError", "Derivation", "Divergence", "Drawing", "Grammar", "GrammarError",

@@ -5,13 +5,14 @@ pixel in row i and column j is (j + 0.5, i + 0.5). Axis letters: N scenes, M nod
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .errors import ModelError
+from .photo import Photo
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +161,7 @@ class Drawing:
         kinds: the grammar's object names.
         layers: what to draw, in painter's order.
         background: RGB in 0..1.
+        photo: what a camera makes of it, every value ``(N,)`` as ``world.resolve_scene`` gives it; nothing where None.
 
     Raises:
         ModelError: a background that is not three finite numbers.
@@ -169,6 +171,7 @@ class Drawing:
     kinds: tuple[str, ...]
     layers: tuple[Layer, ...]
     background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
+    photo: Photo | None = None
 
     def __post_init__(self):
         try:
@@ -186,11 +189,19 @@ class Drawing:
 
     def __getitem__(self, scenes: slice) -> "Drawing":
         """The same drawing of some of the scenes."""
-        layers = tuple(
-            replace(layer, **{k: v[scenes] for k, v in vars(layer).items() if isinstance(v, Tensor)})
-            for layer in self.layers
-        )
-        return replace(self, kind=self.kind[scenes], layers=layers)
+        layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
+        return replace(self, kind=self.kind[scenes], layers=layers, photo=of_scenes(self.photo, scenes))
+
+
+AnyPart = TypeVar("AnyPart")
+
+
+def of_scenes(part: AnyPart, scenes: slice) -> AnyPart:
+    """A dataclass with some of the scenes' rows of all its tensors; what has none is as it is."""
+    if part is None:
+        return part
+    values = {k: v[scenes] for k, v in vars(part).items() if isinstance(v, Tensor)}
+    return replace(cast(Any, part), **values)
 
 
 def resolve(sprites: Sprites, present: Tensor) -> Layer:

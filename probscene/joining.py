@@ -12,7 +12,8 @@ from torch.nn.functional import pad
 
 from .drawing import Drawing, Layer
 from .errors import ModelError
-from .world import Ground, MeshLayer, Part, World
+from .photo import Photo
+from .world import Ground, MeshLayer, Part, World, resolve_scene
 
 AnyLayer = TypeVar("AnyLayer", Layer, MeshLayer)
 
@@ -36,7 +37,7 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
                 f"Expected scenarios with one background, actual {sorted(backgrounds)}; draw it as a layer."
             )
         layers = _layers(kind, [(own, drawing.kind.shape[1], drawing.layers) for own, drawing in drawings])
-        return Drawing(kind, kinds, layers, backgrounds.pop())
+        return Drawing(kind, kinds, layers, backgrounds.pop(), _photo([(own, d.photo) for own, d in drawings]))
     if len(worlds) != len(drawn):
         raise ModelError(
             "Expected scenarios that all draw sprites, or all build worlds, actual both; join those alike."
@@ -77,6 +78,13 @@ def _chosen(parts: list[tuple[Tensor, Part]]) -> Part:
     """Every tensor of a dataclass, scene by scene from the part that owns it."""
     names = [field.name for field in fields(parts[0][1])]
     return type(parts[0][1])(**{name: _rows([(own, getattr(part, name)) for own, part in parts]) for name in names})
+
+
+def _photo(parts: list[tuple[Tensor, Photo | None]]) -> Photo | None:
+    """Scenarios without a photo keep their images as they are among others with one."""
+    if all(photo is None for _, photo in parts):
+        return None
+    return _chosen([(own, resolve_scene(Photo(), len(own)) if photo is None else photo) for own, photo in parts])
 
 
 def _ground(parts: list[tuple[Tensor, Ground | None]]) -> Ground | None:

@@ -17,7 +17,8 @@ from .derivation import Derivation
 from .drawing import Drawing, Layer, Sprites, resolve
 from .errors import ModelError
 from .grammar import Grammar
-from .world import Camera, Ground, Light, Meshes, MeshLayer, Photo, World, resolve_ground, resolve_meshes, resolve_scene
+from .photo import Look, Photo, sample_photo
+from .world import Camera, Ground, Light, Meshes, MeshLayer, World, resolve_ground, resolve_meshes, resolve_scene
 
 Given = TypeVar("Given", Sprites, Meshes)
 Found = TypeVar("Found", Layer, MeshLayer)
@@ -90,13 +91,49 @@ class SceneGraph:
         found = self._resolved(layers, resolve_meshes)
         return World(self.kind, self.grammar.kinds, found, camera, light, ground, photo)
 
-    def draw(self, *layers: Sprites, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drawing:
-        """What to render: layers from the back to the front.
+    def draw(
+        self,
+        *layers: Sprites,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        photo: Photo | None = None,
+    ) -> Drawing:
+        """What to render: layers from the back to the front, and what a camera makes of them.
 
         Raises:
             ModelError: values of a wrong shape, out of range or not finite.
         """
-        return Drawing(self.kind, self.grammar.kinds, self._resolved(layers, resolve), background)
+        photo = None if photo is None else resolve_scene(photo, len(self.kind))
+        return Drawing(self.kind, self.grammar.kinds, self._resolved(layers, resolve), background, photo)
+
+    def photo(
+        self,
+        *,
+        exposure: Look | None = None,
+        contrast: Look | None = None,
+        saturation: Look | None = None,
+        red_gain: Look | None = None,
+        blue_gain: Look | None = None,
+        vignette: Look | None = None,
+        blur: Look | None = None,
+        noise: Look | None = None,
+        jpeg_quality: Look | None = None,
+    ) -> Photo:
+        """What a camera makes of each image, for ``draw(..., photo=...)`` or ``build(..., photo=...)``.
+
+        A range, such as ``blur=(0.0, 2.0)``, or a distribution makes a site with one value a scene, ``photo.blur``
+        and so on, which is learnt like the others; a number is the same in all images, and what is left out keeps the
+        image as it is. Noise adds a site ``photo.seed``, which keeps its prior. What the values mean: ``Photo``.
+
+        Call it outside ``nodes(...)``.
+
+        Raises:
+            ModelError: a range that is none or outside a value's limits; it is called inside ``nodes(...)``.
+        """
+        looks = {
+            "exposure": exposure, "contrast": contrast, "saturation": saturation, "red_gain": red_gain,
+            "blue_gain": blue_gain, "vignette": vignette, "blur": blur, "noise": noise, "jpeg_quality": jpeg_quality,
+        }  # fmt: skip
+        return sample_photo(len(self.kind), looks)
 
     def _resolved(self, layers: Iterable[Given], resolve: Callable[[Given, Tensor], Found]) -> tuple[Found, ...]:
         found = []

@@ -12,8 +12,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from .drawing import of_scenes
 from .errors import ModelError
 from .mesh import Mesh, Surface
+from .photo import Photo, check_photo
 
 KITTI_FOCAL, KITTI_CENTRE, KITTI_CANVAS, KITTI_HEIGHT = 721.5377, (609.5593, 172.854), (375, 1242), 1.65
 
@@ -143,25 +145,6 @@ class Ground:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
-    """What a camera's electronics do; all are numbers or broadcast to ``(N, 1)``. Labels do not change.
-
-    Args:
-        exposure: factor of all light.
-        contrast: about the middle grey, 1 for none.
-        saturation: 0 for grey, 1 for as it is.
-        noise: standard deviation, of 255.
-        seed: of each image's noise, ``(N, 1)`` int64, or 0.
-    """
-
-    exposure: Tensor | float = 1.0
-    contrast: Tensor | float = 1.0
-    saturation: Tensor | float = 1.0
-    noise: Tensor | float = 0.0
-    seed: Tensor | int = 0
-
-
-@dataclass(frozen=True, eq=False)
 class World:
     """A batch of 3D scenes, ready to be rendered: ``SceneGraph.build`` makes it.
 
@@ -187,12 +170,9 @@ class World:
     def __getitem__(self, scenes: slice) -> "World":
         """The same world of some of the scenes."""
 
-        def some(part):
-            return replace(part, **{k: v[scenes] for k, v in vars(part).items() if isinstance(v, Tensor)})
-
-        parts = {name: some(getattr(self, name)) for name in ("camera", "light", "photo")}
-        ground = None if self.ground is None else some(self.ground)
-        return replace(self, kind=self.kind[scenes], layers=tuple(map(some, self.layers)), ground=ground, **parts)
+        parts = {name: of_scenes(getattr(self, name), scenes) for name in ("camera", "light", "photo", "ground")}
+        layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
+        return replace(self, kind=self.kind[scenes], layers=layers, **parts)
 
 
 COLOURS = ("zenith", "horizon")
@@ -231,7 +211,8 @@ def resolve_scene(part: Part, num_scenes: int) -> Part:
     """Every field as one value a scene, ``(N,)`` float32, colours ``(N, 3)``; seeds int64.
 
     Raises:
-        ModelError: a value of another shape, one that is not finite, or a focal length that is not positive.
+        ModelError: a value of another shape, one that is not finite, a focal length that is not positive, or what a
+            photo cannot have.
     """
     values = {}
     for field in fields(part):
@@ -240,12 +221,15 @@ def resolve_scene(part: Part, num_scenes: int) -> Part:
             values[field.name] = _full(name, value, (num_scenes, 3))
         else:
             dtype = torch.int64 if field.name == "seed" else torch.float32
-            values[field.name] = _full(name, value, (num_scenes, 1), dtype).squeeze(1)
+            endless = field.name == "jpeg_quality"
+            values[field.name] = _full(name, value, (num_scenes, 1), dtype, endless=endless).squeeze(1)
     if isinstance(part, Camera) and not (values["focal"] > 0).all():
         worst = float(values["focal"].min())
         raise ModelError(
             f"Expected a positive focal length in pixels, actual {worst:g}; mend Camera.focal of the model."
         )
+    if isinstance(part, Photo):
+        check_photo(values)
     return replace(part, **values)
 
 
@@ -269,13 +253,15 @@ def resolve_ground(ground: Ground, num_scenes: int) -> Ground:
     return replace(ground, edges=edges, surface=surface, offset=offset)
 
 
-def _full(name: str, value, shape: tuple[int, ...], dtype=torch.float32, among: Tensor | None = None) -> Tensor:
+def _full(
+    name: str, value, shape: tuple[int, ...], dtype=torch.float32, among: Tensor | None = None, endless: bool = False
+) -> Tensor:
     value = torch.as_tensor(value, dtype=dtype).detach()
     try:
         value = value.expand(shape)
     except RuntimeError:
         raise ModelError(f"Expected {name} to broadcast to {shape}, actual shape {tuple(value.shape)}.") from None
     checked = value if among is None else value[among]
-    if value.is_floating_point() and not torch.isfinite(checked).all():
+    if value.is_floating_point() and not endless and not torch.isfinite(checked).all():
         raise ModelError(f"Expected finite values in {name}, actual NaN or infinity.")
     return value.contiguous()

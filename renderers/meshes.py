@@ -3,7 +3,7 @@
 A pixel shows what its middle sees: the nearest triangle that faces the camera, the ground, or the sky. Light is added
 and multiplied in sRGB and clipped once, at the end: a face's colour, times the tint if it takes one, times the texture,
 times the light of the sun, where a shadow map lets it through, and of the sky, of which an upright surface gets three
-quarters and one that faces down half; then haze, exposure, saturation and contrast, and noise. Corners' normals are
+quarters and one that faces down half; then haze, and what the world's ``Photo`` says. Corners' normals are
 interpolated as they are, not to unit length. Textures are filtered bilinearly, from a level chosen for their width and
 height apart. The ground's textures lie from x = ``offset`` and y = 0; it is seen from above only. Nothing nearer than
 0.1 m along the camera's z is seen. A sun below the horizon gives no light.
@@ -24,14 +24,15 @@ from probscene.errors import ModelError
 from probscene.world import World
 
 from . import engine
+from .kernels.lanes import LANES
 from .mesh import tables
 from .mesh.atlas import MeshAtlas
 from .mesh.instances import Instances, instances, names
 from .mesh.kernels import draw as kernel
 from .mesh.kernels import shading as shading_kernel
-from .mesh.kernels.lanes import LANES
 from .mesh.kernels.shadows import SPARE
 from .mesh.kernels.vertices import CORNER
+from .photo import PhotoFinish, photo_table, seeds_of
 
 _MAX_CANVAS = 1 << 24
 _SCENES = 64  # of one launch
@@ -60,7 +61,7 @@ class MeshRenderer:
             raise ModelError(f"Expected 1 or 4 samples a pixel, actual {samples}.")
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
         self.samples, self.map_size = samples, min(2048, max(256, 5 * self.canvas[1] // 96 * 16))
-        self._atlas = MeshAtlas()
+        self._atlas, self._finish = MeshAtlas(), PhotoFinish(self.canvas, self.threads)
         self._scratch: dict[str, np.ndarray] = {}
 
     def __call__(self, drawing: Drawing | World) -> RenderBatch:
@@ -141,7 +142,7 @@ class MeshRenderer:
             if name not in self._scratch or self._scratch[name].size < workers * size:
                 self._scratch[name] = _zeros(max(1, workers * size), dtype)
         self._scratch["opened"][:] = 0
-        atlas = self._atlas
+        atlas, photos = self._atlas, photo_table(world.photo, N, self.canvas, exposed=True).ravel()
         buffers = [self._scratch[name] for name in each]
         buffers += [image, instance, semantic, depth, self._scratch["seen"].reshape(-1, LANES)]
         buffers += [_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)]
@@ -149,10 +150,11 @@ class MeshRenderer:
         kernel.render(
             self.samples == 4, workers, N, height, width, max(1, world.kind.shape[1]), strips, self.map_size,
             most_vertices, most_records, np.zeros(1, np.int32), table.first, table.whole, table.real, table.scenes,
-            torch.as_tensor(world.photo.seed).cpu().numpy().astype(np.int64), table.edges, table.strips, table.tiles,
+            photos, seeds_of(world.photo), table.edges, table.strips, table.tiles,
             atlas.positions, atlas.corners, atlas.faces, atlas.textures.table, atlas.textures.texels,
             *buffers,
         )  # fmt: skip
+        self._finish(world.photo, image, N, toned=True)
 
 
 def _zeros(size: int, dtype: type) -> np.ndarray:

@@ -5,6 +5,8 @@ everything is clear. A sprite drawn smaller than it is comes from a box-filtered
 at most one, chosen for x and y apart; one drawn larger keeps edges one pixel wide. Sprites are blended in painter's
 order into 8-bit channels. A node's id is written where its sprite's own alpha is at least one half; a sprite without a
 label erases ids there. At angle 0 and scale 1, with texels on pixels, an opaque sprite's bytes appear unchanged.
+
+A drawing's ``Photo`` then changes the images, and nothing else.
 """
 
 import numpy as np
@@ -16,6 +18,7 @@ from probscene.errors import ModelError
 from probscene.world import World
 
 from . import engine
+from .photo import PhotoFinish
 from .sprite import kernel
 from .sprite.instances import Instances, instances
 from .sprite.sheet import Sheet
@@ -40,7 +43,7 @@ class SpriteRenderer:
 
     def __init__(self, canvas: tuple[int, int], threads: int | None = None):
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
-        self._sheet = Sheet()
+        self._sheet, self._finish = Sheet(), PhotoFinish(self.canvas, self.threads)
 
     def __call__(self, drawing: Drawing | World) -> RenderBatch:
         """Render every scene of a drawing.
@@ -72,6 +75,8 @@ class SpriteRenderer:
                 np.zeros(1, np.int32), first[start : stop + 1].copy(), table.whole, table.real, self._sheet.texels,
                 self._sheet.colours, rgb, rgb.view(np.uint32), ids, ids.view(np.int64), result[start:stop].reshape(-1),
             )  # fmt: skip
+        if drawing.photo is not None:
+            self._finish(drawing.photo, image, scenes, toned=False)
         return _batch(
             drawing,
             table,

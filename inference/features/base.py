@@ -57,8 +57,10 @@ class FeatureNet(Protocol):
         """Features ``(N, D)`` float32, finite, of images ``(N, C, H, W)`` uint8, N >= 0. Renders come with C = 3;
         target images with C = 1 where the model's colour carries nothing, else 3.
 
-        A network may have two more beside it: ``embed_photographs``, which is then called for target images, and
-        ``embed_drawn(examples)``, which is called for renders where their labels are at hand."""
+        A network may have three more beside it: ``embed_photographs``, which is then called for target images,
+        ``embed_drawn(examples)``, which is called for renders where their labels are at hand, and ``cells(images)``,
+        ``(N, classes, h, w)``, how many objects of each of its ``classes`` each cell of the image holds, by which a
+        verdict on layout goes."""
         ...
 
 

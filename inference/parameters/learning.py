@@ -238,8 +238,8 @@ class ParameterLearning:
         kind, parent, *nodes = along_the_widest(self._assembly(), found).values(found, len(images), mean, sd)
         has = having(self.model.grammar, tuple(self.node_sites[i] for i in node.tolist()), kind)
         turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
-        of_nodes, of_nodes_sd = (x.where(has, torch.nan) for x in nodes)
-        return Values(kind, parent, of_nodes, of_nodes_sd, scene_mean, scene_sd, turns)
+        mean, sd = (part.where(has, torch.nan) for part in nodes)
+        return Values(kind, parent, mean, sd, scene_mean, scene_sd, turns)
 
     def _assembly(self) -> Any:
         """What the prior's scenes have in common."""

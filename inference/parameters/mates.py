@@ -1,34 +1,35 @@
-"""Siblings that are alike: cars of one lane, mugs of one shelf.
+"""Siblings that are alike in a site: cars of one lane, mugs of one colour.
 
-Which siblings are alike in the sites before is learnt with everything else. Of a node's mates the network of a
-parameter guide sees how many there are, how many came before, and the value of the last one. Axis letters: N scenes, M
-nodes, S sites of nodes, H units.
+Two nodes are alike in a site where both their u lie in the same half of 0..1, as a program's ``side > 0.5`` divides
+them, or close to one another. Of those alike in each of the sites before, the network of a parameter guide sees a
+node's place among them, how many they are, and the value of the last one before it. Axis letters: N scenes, M nodes, S
+sites of nodes, W ways to be alike, two for each site, H units.
 """
 
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-SCALE, START = 10.0, -2.0  # of the squared difference of u; where its weight starts, before softplus
-FARTHEST = -1e4  # logarithm of the weight of a node that is no sibling
+CLOSE = 0.12  # of u
+LOGITS = 4.0  # a logit of this is 1 for the network
+FEATURES = 6  # of each way
 
 
 class Ties(NamedTuple):
-    """How alike a scene's siblings are.
+    """Who is alike whom.
 
     Attributes:
-        share: ``(N, M, M)`` attention of each node to those before it; rows of zeros where there are none.
-        place: ``(N, M, 3)``, a node's place among its mates, and one over how many they are.
+        place: ``(N, M, 4 W)``, a node's place among those alike, and one over their number; 0 where nothing is known.
+        last: ``(N, M, W)`` int64, the last one before it; -1 for none.
     """
 
-    share: Tensor
     place: Tensor
+    last: Tensor
 
 
 class Mates(nn.Module):
-    """Zeros for every weight of ``read`` give zeros.
+    """From what is known of those alike to H units.
 
     Args:
         sites: S.
@@ -37,47 +38,35 @@ class Mates(nn.Module):
 
     def __init__(self, sites: int, hidden: int):
         super().__init__()
-        self.unlike = nn.Parameter(torch.full((max(1, sites), max(1, sites)), START))
-        self.recent = nn.Parameter(torch.zeros(max(1, sites)))
-        self.read = nn.Linear(5, hidden)
+        self.read = nn.Linear(2 * max(1, sites) * FEATURES, hidden)
 
-    def ties(self, together: Tensor, own: Tensor, s: int) -> Ties:
-        """For site number ``s``.
+    def ties(self, together: Tensor, own: Tensor) -> Ties:
+        """Of nodes of which some sites are known.
 
         Args:
             together: ``(N, M, M)`` bool, who is whose sibling, itself included.
-            own: ``(N, M, S)`` u of the sites before ``s``, NaN where there are none.
+            own: ``(N, M, S)`` u, NaN where they are not known.
         """
-        known = own[..., :s]
-        there = ~known.isnan()
-        known = known.nan_to_num(0.0)
-        apart = (known.unsqueeze(2) - known.unsqueeze(1)).square()
-        apart = torch.where(
-            there.unsqueeze(2) & there.unsqueeze(1), apart, 1.0 * (there.unsqueeze(2) ^ there.unsqueeze(1))
-        )
-        weight = SCALE * F.softplus(self.unlike[s, :s])
-        alike = torch.where(together, -(apart @ weight) if s else torch.zeros_like(together, dtype=own.dtype), FARTHEST)
-        mass = alike.exp()
-        M = together.shape[1]
-        earlier = torch.ones(M, M, dtype=torch.bool).tril(-1)
-        number, before = mass.sum(-1).clamp(min=1e-3), (mass * earlier).sum(-1)
-        score = alike + F.softplus(self.recent[s]) * torch.arange(M)
-        some = (together & earlier).any(-1, keepdim=True)
-        share = torch.where(some, score.masked_fill(~(together & earlier), FARTHEST).softmax(-1), 0.0)
-        return Ties(
-            share,
-            torch.stack([(before + 0.5) / number.clamp(min=1.0), 1 / number.clamp(min=1.0), 1.0 * some[..., 0]], -1),
-        )
+        u = own if own.shape[2] else own.new_full((*own.shape[:2], 1), torch.nan)
+        known = ~u.isnan()
+        one, other = u.unsqueeze(2), u.unsqueeze(1)
+        alike = torch.cat([(one > 0.5) == (other > 0.5), (one - other).abs() < CLOSE], -1)
+        alike = alike & together.unsqueeze(-1) & (known.unsqueeze(2) & known.unsqueeze(1)).repeat(1, 1, 1, 2)
+        M = u.shape[1]
+        earlier = alike & torch.ones(M, M, dtype=torch.bool).tril(-1).unsqueeze(-1)
+        number, known = alike.sum(2).clamp(min=1), known.repeat(1, 1, 2)
+        part = (earlier.sum(2) + 0.5) / number
+        place = torch.stack([2 * part - 1, part.logit() / LOGITS, 1 / number, known.to(part.dtype)], -1)
+        last = torch.arange(M).view(1, 1, M, 1).where(earlier, -1).amax(2)
+        return Ties((place * known.unsqueeze(-1)).flatten(2).to(own.dtype), last)
 
-    def forward(self, place: Tensor, share: Tensor, u: Tensor) -> Tensor:
-        """``(..., H)`` of nodes.
+    def forward(self, place: Tensor, last: Tensor, u: Tensor) -> Tensor:
+        """``(N, M', H)`` of some of the nodes.
 
         Args:
-            place: ``(..., 3)``, see ``Ties``.
-            share: ``(..., J)`` attention to J nodes.
-            u: of site ``s`` of these, ``(..., J)``; NaN where they have none.
+            place, last: of them, ``(N, M', ...)``, see ``Ties``.
+            u: of one site of all nodes so far, ``(N, J)``; NaN where they have none.
         """
-        there = ~u.isnan()
-        mass = (share * there).sum(-1)
-        last = (share * u.nan_to_num(0.0)).sum(-1) / mass.clamp(min=1e-6)
-        return self.read(torch.cat([place, torch.stack([(2 * last - 1) * (mass > 0), mass], -1)], -1))
+        found = u.gather(1, last.clamp(min=0).flatten(1)).view(last.shape)
+        there = (last >= 0) & ~found.isnan()
+        return self.read(torch.cat([place, (2 * found - 1).where(there, 0.0), there.to(u.dtype)], -1))

@@ -168,8 +168,9 @@ class ParameterNet(nn.Module):
         memory = F.pad(states, (0, 0, 1, 0))[:, :-1]
         own = known.where(torch.arange(self.node_sites) < s, torch.nan)
         around = [own, _gathered(known, graph.parent), _gathered(known, graph.before)]
-        ties, at_s = self.mates.ties(graph.together, own, s), known[..., s].unsqueeze(1).expand(-1, known.shape[1], -1)
-        place = self._place(graph, scene, s) + self._siblings(graph, own) + self.mates(ties.place, ties.share, at_s)
+        ties = self.mates.ties(graph.together, own)
+        place = self._place(graph, scene, s) + self._siblings(graph, own)
+        place = place + self.mates(ties.place, ties.last, known[..., s])
         return self._mixture(place, torch.cat([_code(x) for x in around], -1), memory, s)
 
     def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
@@ -183,7 +184,7 @@ class ParameterNet(nn.Module):
         earlier = torch.arange(self.node_sites) < s
         rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
         own = torch.stack(columns, 1)
-        place, ties = self._place(graph, scene, s) + self._siblings(graph, own), self.mates.ties(graph.together, own, s)
+        place, ties = self._place(graph, scene, s) + self._siblings(graph, own), self.mates.ties(graph.together, own)
         memory, found = v.new_zeros(N, self.cell.hidden_size), []
         w: Any = self.cell  # torch names its weights as it makes them
         for m in range(M):
@@ -193,7 +194,7 @@ class ParameterNet(nn.Module):
                 around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
             code = torch.cat([_code(x) for x in around], -1)
             so_far = torch.stack(columns, 1)[..., s]
-            here = place[:, m] + self.mates(ties.place[:, m], ties.share[:, m], so_far)
+            here = place[:, m] + self.mates(ties.place[:, m : m + 1], ties.last[:, m : m + 1], so_far)[:, 0]
             u = self._mixture(here, code, memory, s).icdf(v[:, m])
             found.append(u.where(has[:, m], v[:, m]))
             at_s = torch.arange(self.node_sites) == s

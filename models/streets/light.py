@@ -5,7 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from probscene.world import Camera, Light, Photo
+from probscene.photo import Photo
+from probscene.world import Camera, Light
 
 # Zenith and horizon. A camera that exposes for the road shows a sky that is nearly white.
 CLEAR = ((0.42, 0.62, 0.94), (0.93, 0.97, 1.0))

@@ -5,7 +5,7 @@
     run              the fit, with report.html
     dataset          labelled images of what was learnt
     evaluation.json  how near that is to the truth
-    grid.png         prior, learnt and target side by side
+    grid.png         prior, learnt structure alone, all that was learnt, and target side by side
 
 Each step is left out where it is finished, so the same command goes on after an interruption.
 """
@@ -27,11 +27,12 @@ from .files import make_folder, write_json
 from .fitting import session
 from .fitting.presets import QUICK, Preset
 from .fitting.run import RunFolder
+from .judging.looked import LEARNT, PRIOR, STRUCTURE, policies
 from .labelling.counts import write_counts
 from .loading import load_model
 from .pictures import pixels, side_by_side, write_picture
 from .progress import Display
-from .views import report, tables
+from .views import report, tables, verdict_text
 from .views.preview import scenes
 from .walls.warn import tell
 
@@ -78,11 +79,12 @@ def demo(
     measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))
     for table in tables.distances({"truth": measured["distances"]["truth"]}):
         console.print(table)
-    print(f"\nVerdict without labels: {measured['trust']['verdict']}. {measured['trust']['because']}")
+    print("\nWithout labels:")
+    verdict_text.show_parts(measured["trust"], console)
     spent = sum(session.timing(run).values())
     print(f"\nFitting took {spent:.0f} s and saw only {target}. Where to look:")
     for name, what in (
-        ("grid.png", "scenes of the prior, of what was learnt, and of the target"),
+        ("grid.png", "scenes of the prior, of learnt structure alone, of all that was learnt, and of the target"),
         ("run/report.html", "the report: histograms, learning curves, configuration"),
         ("dataset", f"{num} labelled images: images/, annotations.json (COCO), provenance.jsonl"),
         ("truth.csv", "what the target holds, for judging only"),
@@ -113,9 +115,13 @@ def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:
     judged = judge(run, target, show, evaluation=found)
     write_json(out / "evaluation.json", found.record() | {"trust": judged.record()})
     report.write(run, found, target, judged=judged)
+    sources = policies(run)
+    panels = {"Prior": PRIOR, "Structure alone": STRUCTURE, "Structure and parameters": LEARNT}
+    if STRUCTURE not in sources:
+        panels = {"Prior": PRIOR, "Learnt": LEARNT}
     pictures = {
-        "Prior": pixels(scenes(model, model.prior, SAMPLES, 0).image),
-        "Learnt": pixels(scenes(model, run.guide, SAMPLES, 0).image),
-        "Target": [pixels(target.load(i)[None])[0] for i in range(min(SAMPLES, len(target)))],
+        caption: pixels(scenes(model, sources.get(name, model.prior), SAMPLES, 0).image)
+        for caption, name in panels.items()
     }
+    pictures["Target"] = [pixels(target.load(i)[None])[0] for i in range(min(SAMPLES, len(target)))]
     write_picture(out / "grid.png", side_by_side(pictures))

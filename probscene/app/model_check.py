@@ -85,7 +85,7 @@ def check_program(model: SceneModel, scenes: int, rendered: int) -> Findings:
             return Findings(shorter(model, watch) or [str(error)], [], {})
     faults, warnings = _seen(model, batches)
     faults += shorter(model, watch)
-    warnings += [*longer(model, watch), *lookups(model, watch, drawn[0])]
+    warnings += [*longer(model, watch), *lookups(model, watch, drawn[0]), *_colours(model, drawn[0])]
     return Findings(faults, warnings, {name: _sizes(model.grammar.kind(name), batches) for name in model.classes})
 
 
@@ -191,6 +191,17 @@ def _why_hidden(model: SceneModel, box: Tensor) -> str:
 def _sizes(kind: int, batches: list[tuple[Tensor, RenderBatch]]) -> Tensor:
     box = torch.cat([batch.amodal_box[(batch.kind == kind) & (batch.pixels > 0)] for _, batch in batches])
     return (box[:, 2:] - box[:, :2]).prod(-1).sqrt()
+
+
+def _colours(model: SceneModel, drawn: Scenes) -> list[str]:
+    """Sites of colours in a model whose images are read as grey."""
+    names = [name for name in ("saturation", "red_gain", "blue_gain") if f"photo.{name}" in drawn.parameters]
+    if model.channels != 1 or not names:
+        return []
+    return [
+        f"Images of model {model.name!r} are read as grey (channels=1), in which {', '.join(names)} of "
+        "scene.photo(...) can be told from the exposure in coloured sprites at best; leave them out."
+    ]
 
 
 def _small(model: SceneModel, sizes: dict[str, Tensor]) -> list[str]:

@@ -16,7 +16,6 @@ from .atlas import MeshAtlas
 
 MAX_POSITION = 1e6  # metres
 SHADOW_RANGE, SHADOW_HEIGHTS = 60.0, 36.0  # shadows fall as far as this, metres, and as many heights of the camera
-_GREY = np.array([0.299, 0.587, 0.114])
 
 
 class Sight(NamedTuple):
@@ -131,7 +130,7 @@ def fit(sight: Sight, canvas: tuple[int, int], size: int, low, high, cast_low, c
 def scene_table(world: World, sight: Sight, shadow: tuple[np.ndarray, ...]) -> np.ndarray:
     """``(N, SCENE)`` float64, at least one row; ``shadow`` is what ``fit`` returned."""
     table = np.zeros((max(1, len(world)), tables.SCENE))
-    rows, light, photo = table[: len(world)], world.light, world.photo
+    rows, light = table[: len(world)], world.light
     rows[:, tables.RAY : tables.RAY + 9] = sight.ray.reshape(-1, 9)
     rows[:, tables.EYE : tables.EYE + 3] = sight.eye
     if world.ground is not None:
@@ -142,7 +141,7 @@ def scene_table(world: World, sight: Sight, shadow: tuple[np.ndarray, ...]) -> n
         world.camera, "focal", "centre_x", "centre_y"
     )
     lights[:, tables.LENS] = 1 / focal
-    exposure, contrast, saturation, noise = numbers(photo, "exposure", "contrast", "saturation", "noise")
+    (exposure,) = numbers(world.photo, "exposure")
     sun, ambient, haze, zenith, horizon = numbers(light, "sun", "ambient", "haze", "zenith", "horizon")
     rows[:, tables.SUN_UP] = sight.sun[:, 2, 2]
     lights[:, tables.SUN] = np.where(sight.sun[:, 2, 2] > 0, sun, 0) * exposure
@@ -158,12 +157,6 @@ def scene_table(world: World, sight: Sight, shadow: tuple[np.ndarray, ...]) -> n
     on_map[:, :2, 1:] *= per_metre[..., None]
     on_map[:, :2, 0] = -first * per_metre
     lights[:, tables.ON_MAP : tables.ON_MAP + 12] = on_map.reshape(-1, 12)
-    grey = (1 - saturation)[:, None, None] * _GREY
-    matrix = contrast[:, None, None] * (saturation[:, None, None] * np.eye(3) + grey)
-    lights[:, tables.MATRIX : tables.MATRIX + 9] = matrix.reshape(-1, 9)
-    lights[:, tables.BIAS] = 0.5 * (1 - contrast)
-    lights[:, tables.DEVELOPED] = (contrast != 1) | (saturation != 1)
-    lights[:, tables.NOISE] = noise / 255
     return table
 
 

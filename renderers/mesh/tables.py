@@ -20,8 +20,7 @@ RAY, EYE, GROUNDED, OFFSET, SUN_UP, TEXEL, LIGHT = 0, 9, 12, 13, 14, 15, 16
 # Light is as the image shows it, exposure included. MORE: the zenith's colour less the horizon's; LENS: one over the
 # focal length and the principal point; ON_MAP: column, row and metres towards the sun on the shadow map, each of the
 # eye, and of the ray like RAY; CLIMB: z of RAY.
-SUN, AMBIENT, HAZE, SHADOWED, HORIZON, MORE, LENS, ON_MAP, CLIMB = 0, 1, 2, 3, 4, 7, 10, 13, 25
-NOISE, DEVELOPED, MATRIX, BIAS, LIGHTS = 28, 29, 30, 39, 40
+SUN, AMBIENT, HAZE, SHADOWED, HORIZON, MORE, LENS, ON_MAP, CLIMB, LIGHTS = 0, 1, 2, 3, 4, 7, 10, 13, 25, 28
 SCENE = LIGHT + LIGHTS
 
 # One row a node, int32 and float64: extent and pixels of the visible mask, pixels of the silhouette in the image;

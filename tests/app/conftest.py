@@ -32,7 +32,7 @@ SHORT = {
     "parameters.round_reader_steps": 2,
     "parameters.round_steps": 2,
 }
-SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache"]
+SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache", "--no-verdict"]
 SETTINGS += [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
 
 
@@ -42,6 +42,14 @@ def _own_cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("cache")
         patch.setattr("probscene.app.fitting.cache.cache_folder", lambda: folder)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _few_images_are_looked_at():
+    """By a verdict on layout and looks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("probscene.app.judging.looked.IMAGES", 60)
         yield
 
 

@@ -466,7 +466,7 @@ def test_another_target_is_refused_on_resuming(call, discs, target, tmp_path, mo
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(fit, "_learn", interrupt)
+        patch.setattr(fit, "learn_structure", interrupt)
         call("fit", discs.file, "--target", folder, "--out", out, *discs.settings)
     (folder / "000000.png").unlink()
     check_fault(call("fit", "--resume", "--out", out), 2, "as they were when the run began")

@@ -12,6 +12,7 @@ from probscene.app.fitting import fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
+from probscene.app.judging import looked
 from probscene.errors import DataError, ModelError
 
 SHORT = override(
@@ -28,6 +29,7 @@ def contents(folder: Path) -> dict[Path, tuple[bytes, int]]:
 
 def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     out = tmp_path / "demo"
+    monkeypatch.setattr(looked, "IMAGES", 40)
 
     def go():
         demo(out, 0, str(discs.file), SHORT, images=40, num=5, threads=1)
@@ -35,7 +37,7 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    for where, name in ((fit, "_learn"), (module, "generate"), (module, "evaluate")):
+    for where, name in ((fit, "learn_structure"), (module, "generate"), (module, "evaluate")):
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(where, name, interrupt)
             go()
@@ -53,6 +55,9 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     truth = json.loads((out / "evaluation.json").read_text())["distances"]["truth"]
     assert f"{truth['learnt']['number']:.3f}" in said and str(out / "grid.png") in said
+    judged = json.loads((out / "evaluation.json").read_text())["trust"]
+    assert f"Verdict: {judged['verdict']}." in said and set(judged["parts"]) == {"structure", "layout", "looks"}
+    assert all(name in said for name in ("Structure, layout and looks", "layout", "looks"))
     before = contents(out)
     go()
     assert contents(out) == before

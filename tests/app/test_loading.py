@@ -7,7 +7,8 @@ from probscene.app.loading import renderer_for
 from probscene.drawing import Drawing, Sprites, resolve
 from probscene.mesh import Mesh
 from probscene.models.multi_mnist import MODEL
-from probscene.world import Camera, Light, Meshes, Photo, World, resolve_meshes, resolve_scene
+from probscene.photo import Photo
+from probscene.world import Camera, Light, Meshes, World, resolve_meshes, resolve_scene
 
 ONE = torch.ones(1, 1, dtype=torch.bool)
 KIND = torch.zeros(1, 1, dtype=torch.int64)

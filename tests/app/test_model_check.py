@@ -237,3 +237,20 @@ def test_it_leaves_no_trace(discs):
 @pytest.mark.parametrize("name", ["multi_mnist", "aerial2d"])
 def test_built_in_models_have_nothing_to_mend(name):
     assert str(check_model(load_model(name), 64, 16)).endswith("Nothing to mend.")
+
+
+@pytest.mark.parametrize(("channels", "told"), [(1, True), (3, False)])
+def test_colours_of_photos_that_are_read_as_grey(channels, told):
+    grammar = Grammar("Scene -> Discs\nDiscs -> disc Discs | ε")
+    prior = StructurePrior(grammar, Discs=counts(0, 1, 1))
+
+    @scene_model(grammar, prior, canvas=(64, 64), max_steps=8, classes=("disc",), channels=channels)
+    def photographed(scene):
+        photo = scene.photo(exposure=(0.5, 1.0), saturation=(0.5, 1.5), blue_gain=(0.9, 1.1))
+        with scene.nodes("disc"):
+            x = pyro.sample("disc.x", dist.Uniform(16.0, 48.0))
+        return scene.draw(Sprites.disc("disc", x, 32.0, radius=10.0), photo=photo)
+
+    report = check_model(photographed, 64, 16)
+    found = [text for text in report.warnings if "read as grey (channels=1), in which saturation, blue_gain" in text]
+    assert not report.faults and len(found) == told

@@ -10,9 +10,10 @@ from probscene.derive import derive
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.mesh import Mesh, Surface
+from probscene.photo import Photo
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts
-from probscene.world import KITTI_FOCAL, Camera, Ground, Light, Meshes, Photo
+from probscene.world import KITTI_FOCAL, Camera, Ground, Light, Meshes
 
 LOTS = Grammar("Scene -> Lots\nLots -> lot(Cars) Lots | ε\nCars -> car Cars | ε")
 PRIOR = StructurePrior(LOTS, Lots=counts(0, 0, 1), Cars=counts(0, 1, 1))

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from probscene.mesh import Mesh, Surface
-from probscene.world import Camera, Ground, Light, Meshes, Photo, World, resolve_ground, resolve_meshes, resolve_scene
+from probscene.photo import Photo
+from probscene.world import Camera, Ground, Light, Meshes, World, resolve_ground, resolve_meshes, resolve_scene
 
 QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 

@@ -7,9 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probscene.mesh import Surface
+from probscene.photo import Photo
 from probscene.renderers.mesh.texture_atlas import TextureAtlas
 from probscene.renderers.meshes import MeshRenderer
-from probscene.world import Camera, Ground, Light, Meshes, Photo
+from probscene.world import Camera, Ground, Light, Meshes
 
 CANVAS = (188, 300)
 RENDERER = MeshRenderer(CANVAS, threads=1)

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from reference.meshes import MeshReference
 
 from probscene.errors import ModelError
+from probscene.photo import Photo
 from probscene.renderers import meshes as meshes_module
 from probscene.renderers.meshes import MeshRenderer
-from probscene.world import KITTI_CANVAS, Camera, Light, Meshes, Photo, resolve_scene
+from probscene.world import KITTI_CANVAS, Camera, Light, Meshes, resolve_scene
 
 CANVAS = (40, 66)
 RENDERER, SMOOTH = (MeshRenderer(CANVAS, threads=1, samples=samples) for samples in (1, 4))
@@ -54,6 +55,8 @@ def random_world(shapes, seed, sun=True, lying=True):
         uniform(-3, 3, number, 1), uniform(0.3, 1.4, number, 1), 0.6 if sun else 0.0, haze=uniform(0, 0.03, number, 1)
     )
     photo = Photo(*(uniform(0.7, 1.3, number, 1) for _ in range(3)), noise=uniform(0, 9, number, 1), seed=seed % 1000)
+    gains = torch.from_numpy(np.random.default_rng(seed).uniform(0.8, 1.2, (2, number, 1)))
+    photo = replace(photo, red_gain=gains[0], blue_gain=gains[1], vignette=1.5 * (1.2 - gains[0]))
     layers = [
         layer("car", nodes, present=some(nodes)),
         layer("car", nodes, present=some(nodes) & some(nodes), labelled=bool(generator.integers(0, 2))),

@@ -41,6 +41,7 @@ class CountNet(nn.Module):
 
     Attributes:
         unit: objects that 1 in a feature stands for.
+        classes: what ``cells`` tells apart.
     """
 
     unit = 1.0
@@ -64,7 +65,7 @@ class CountNet(nn.Module):
         if groups is not None:
             each = (f"{name} {number + 1}" for number in range(groups.max_groups) for name in self.objects)
             self.names = (groups.kind, *each)
-        self.channels, self.canvas = channels, canvas
+        self.channels, self.canvas, self.classes = channels, canvas, classes
         reduction = min(8, 2 ** max(0, round(math.log2(max(canvas) / 128))))
         self.register_buffer("reduction", torch.tensor(reduction))
         a, b, c = width
@@ -131,6 +132,19 @@ class CountNet(nn.Module):
             x = self.enter(some).contiguous(memory_format=torch.channels_last)
             out.append(self._read(self._fused(x)))
         return toward_whole(torch.cat(out)) if out else torch.zeros(0, len(self.names))
+
+    @torch.no_grad()
+    def cells(self, images: Tensor) -> Tensor:
+        """How many objects of each class each cell is expected to hold, ``(N, C, h, w)``, of ``(N, 1 or 3, H, W)``
+        uint8 images, in the order of ``classes``; of a group, what part of an ordinary one."""
+        number, out = 1 + len(self.objects), []
+        for some in images.split(64):
+            logits = self(self.enter(some))
+            found = dict(zip(self.objects, logits[:, :number].softmax(1)[:, 1:].unbind(1), strict=True))
+            if self.groups is not None:
+                found[self.groups.kind] = logits[:, number].sigmoid() / self.group_cells
+            out.append(torch.stack([found[name] for name in self.classes], 1))
+        return torch.cat(out)
 
     def _read(self, logits: Tensor) -> Tensor:
         number = 1 + len(self.objects)

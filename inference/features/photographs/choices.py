@@ -70,8 +70,9 @@ class PretrainedCountFeatures(Features):
     def settings(self, preset: Any) -> dict[str, Any]:
         """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
         each structure is drawn once. Photographs' counts are noisy, and few: the prior of a preset that has such a
-        weight holds them more."""
+        weight holds them more. Parameters are learnt where that is asked for."""
         return {
+            "learn": "structure",
             "pairs": 1000,
             "batches": 40,
             "num_scenes": 250,

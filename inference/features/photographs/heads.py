@@ -19,6 +19,7 @@ import math
 from typing import cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..base import Examples
@@ -222,6 +223,22 @@ class PretrainedCountNet(nn.Module):
                     counts[:, which] = read_each(probability[:, :, within, which].mean(0), rules)
             parts.append(by_steps(counts, self.steps) if photographs else counts)
         return torch.cat(parts)
+
+    @torch.no_grad()
+    def cells(self, images: Tensor) -> Tensor:
+        """How many objects of each class each place is expected to hold, ``(N, C, h, w)`` at the finest stride, of
+        ``(N, 1 or 3, H, W)`` uint8 images, in the order of ``classes``."""
+        finest, out = min(kind.stride for kind in KINDS), []
+        for some in images.split(AT_ONCE):
+            found = torch.zeros(len(some), len(self.classes), *self.places(finest))
+            for kind, probability in zip(KINDS, self.by_head(self.look(some)), strict=True):
+                whole = probability.mean(0) * (finest / kind.stride) ** 2
+                for within, s in enumerate(kind.scopes):
+                    which = self.scope == s
+                    if which.any():
+                        found[:, which] = F.interpolate(whole[:, within, which], found.shape[2:])
+            out.append(found)
+        return torch.cat(out)
 
     def embed_drawn(self, drawn: Examples) -> Tensor:
         """``(N, D)`` features of renders by their labels."""

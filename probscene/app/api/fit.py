@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
+from probscene.errors import ProbsceneError
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features
 from probscene.model import SceneModel
@@ -17,7 +18,7 @@ from ..arguments import checked_seed
 from ..fitting import session
 from ..fitting.overrides import override
 from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
-from ..fitting.presets import FOR_PHOTOGRAPHS, FOR_RENDERS, Preset
+from ..fitting.presets import BOTH, FOR_PHOTOGRAPHS, FOR_RENDERS, STRUCTURE, Preset
 from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
 from ..loading import load_model
@@ -38,6 +39,7 @@ def fit(
     renderer: Any = None,
     out: Path | str | None = None,
     learn: str | None = None,
+    parameters: str | None = None,
     settings: Mapping[str, Any] | Sequence[str] = (),
     skip_bad: bool = False,
     threads: int | None = None,
@@ -66,6 +68,8 @@ def fit(
         out: the folder of the run; a temporary one where None, which ``Run.save`` copies.
         learn: ``"structure"``, or ``"structure,parameters"``, where things stand and how they look as well; the
             preset's where None.
+        parameters: how the latter are learnt: ``"likelihood"`` of what is read in the images, or ``"meta-sim"``, the
+            way of that paper, a baseline; the preset's where None.
         settings: other values of the preset's fields, ``{"batches": 20, "count.steps": 300}``.
         skip_bad: leave out files that do not decode.
         threads: of torch; all cores where None. Another number rounds differently.
@@ -81,7 +85,7 @@ def fit(
         ProbsceneError: an input is at fault; the message says which and how to mend it. What was finished of the run
             stays, and ``resume=True`` goes on with it.
     """
-    settings = with_learn(settings, learn)
+    settings = with_learn(settings, learn, parameters)
     chosen, parts = chosen_preset(preset, features, divergence, guide, settings)
     other = preset_for_photographs(preset, features, divergence, guide, settings)
     if renderer is not None:
@@ -158,10 +162,23 @@ def chosen_preset(
     return override(chosen, with_learn(settings, None)), own
 
 
-def with_learn(settings: Mapping[str, Any] | Sequence[str], learn: str | None) -> list[str]:
-    """Settings as words ``key=value``, and what is to be learnt among them."""
+def with_learn(
+    settings: Mapping[str, Any] | Sequence[str], learn: str | None, parameters: str | None = None
+) -> list[str]:
+    """Settings as words ``key=value``, and what is to be learnt among them, and how; who says how parameters are learnt
+    means that they are.
+
+    Raises:
+        ProbsceneError: only structure is to be learnt, and yet it is said how parameters are.
+    """
+    if parameters is not None and learn == STRUCTURE:
+        raise ProbsceneError(
+            f"Expected learn={BOTH} where parameters={parameters} says how, actual learn={STRUCTURE}; leave one out."
+        )
+    learn = BOTH if learn is None and parameters is not None else learn
     words = [f"{key}={_word(value)}" for key, value in settings.items()] if isinstance(settings, Mapping) else settings
-    return [*words, *([] if learn is None else [f"learn={learn}"])]
+    more = {"learn": learn, "parameter_method": parameters}
+    return [*words, *(f"{key}={word}" for key, word in more.items() if word is not None)]
 
 
 def preset_for_photographs(

@@ -38,6 +38,9 @@ def fit(
         str | None,
         typer.Option(metavar="WHAT", help="structure, or structure,parameters: where things stand and how they look."),
     ] = None,
+    parameters: Annotated[
+        str | None, typer.Option(metavar="NAME", help="How the latter are learnt: likelihood, or meta-sim, a baseline.")
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
     ] = None,
@@ -56,18 +59,24 @@ def fit(
     cache: Cache = None,
     no_cache: NoCache = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
+    no_verdict: Annotated[bool, typer.Option("--no-verdict", help="Do not judge the fit at its end.")] = False,
 ) -> None:
-    """Learn which structures occur in a folder of unlabelled images."""
+    """Learn which structures occur in a folder of unlabelled images, and say how near that came."""
+    from rich.console import Console
+
     from ..api.fit import chosen_preset, preset_for_photographs, with_learn
+    from ..evaluation.judge import AFTER_A_FIT, judge
     from ..fitting import session
+    from ..fitting.fit import open_target
     from ..loading import split_reference
     from ..progress import Display
+    from ..views.verdict_text import show_parts
     from ..walls.warn import tell
 
     if seed is not None:
         checked_seed(seed)
     name = str(preset or PresetName.default)
-    settings = with_learn(settings or [], learn)
+    settings = with_learn(settings or [], learn, parameters)
     chosen, parts = chosen_preset(name, features, objective, guide, settings)
     other = preset_for_photographs(name, features, objective, guide, settings)
     if scenarios is not None:
@@ -76,6 +85,7 @@ def fit(
         if split_reference(model)[1]:
             raise ProbsceneError(f"Expected scenarios once, actual {model} and {scenarios}; leave out --scenarios.")
         model = f"{model}:{scenarios}"
+    judged = None
     with Display() as show:
         if resume:
             given = chosen if preset or objective or guide or features or settings else None
@@ -104,6 +114,10 @@ def fit(
         if not run.is_finished:
             session.carry_out(run, images, show, cache, not no_cache)
             tell(run, show)
+            if not no_verdict:
+                judged = judge(run, images or open_target(run, show), show, AFTER_A_FIT)
+    if judged is not None:
+        show_parts(judged.record(), Console(highlight=False))
     print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")
 
 

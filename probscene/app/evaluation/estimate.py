@@ -53,6 +53,11 @@ def class_counts(model: SceneModel, names: tuple[str, ...], features: Tensor) ->
     return torch.stack(found, 1) if found else None
 
 
+def counted_classes(model: SceneModel, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The classes that features of these names count, the columns of ``class_counts``."""
+    return tuple(name for name in model.classes if name in names or _numbered(names, name))
+
+
 def _numbered(names: tuple[str, ...], name: str) -> list[str]:
     return [each for each in names if re.fullmatch(rf"{re.escape(name)} \d+", each)]
 

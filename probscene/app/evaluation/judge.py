@@ -1,8 +1,9 @@
 """Can a run be trusted? Its scenes, the prior's and the target's images through its own network, judged without labels.
 
-Scenes are drawn and looked at as the fit has looked at them. For another domain the images' looks are asked, by
-EfficientNet-Lite: counts of a strange image may be quite ordinary. They are not asked where the features were suited to
-the target's images and say what can be read in them: those are another domain, and were read as such.
+Structure is judged by scenes that are drawn and looked at as the fit has looked at them, layout and looks by images as
+``generate`` writes them (``judging.looked``). For another domain the looks are asked, by EfficientNet-Lite: counts of a
+strange image may be quite ordinary. They are not asked where the features were suited to the target's images and say
+what can be read in them: those are another domain, and were read as such.
 
 Axis letters: N scenes, L images, D features.
 """
@@ -29,12 +30,14 @@ from ..fitting.learnt.outcome import compared
 from ..fitting.observer import Observer
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
+from ..judging import looked
+from ..judging.aspects import Aspects, aspects
 from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement
 
 SCENES = 1000  # of the guide, and as many of the prior
-LOOKS = 32  # images of each source that are compared by their looks, twice as many of the target's
+AFTER_A_FIT = 256  # where they are judged at once
 SHOWN = 8  # images in each picture
 THUMB = 128  # pixels
 
@@ -44,14 +47,15 @@ class Judged:
     """A verdict and what it was made from.
 
     Attributes:
-        trust: the verdict and its figures; None where there is none.
+        trust: the verdict on structure and its figures; None where there is none.
         absent: why there is none.
         real_unmatched: the real images farthest from any generated scene, indices of the target's images.
         generated_unmatched: the generated scenes farthest from any real image, ``(H, W, 3)``.
         names: the files of ``real_unmatched``.
         agreement: with the labels, where there are such.
-        usable: which classes can be used, in a sentence, where the features say so.
         walls: what the model is too narrow for, one sentence, where that is known.
+        usable: which classes can be read, in a sentence, where the features say so.
+        aspects: structure, layout and looks; None where there is no verdict.
     """
 
     trust: Trust | None
@@ -62,15 +66,16 @@ class Judged:
     agreement: Agreement | None = None
     walls: str = ""
     usable: str = ""
+    aspects: Aspects | None = None
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
-        if self.trust is None:
+        if self.trust is None or self.aspects is None:
             return {"verdict": None, "because": self.absent}
         more: dict[str, Any] = {"unlike_images": list(self.names)} | ({"usable": self.usable} if self.usable else {})
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
-        return self.trust.record() | more
+        return self.trust.record() | self.aspects.record() | more
 
 
 def judge(
@@ -101,9 +106,9 @@ def judge(
         return Judged(
             None, f"Expected at least {NEEDED} real images for a verdict, actual {len(target)} in {target.path}."
         )
-    preset, model, net, looks = run.preset, run.model, own_net(run), EfficientNetLite()
+    preset, model, net = run.preset, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)
-    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target)
+    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
 
     def each(images: int) -> None:
         nonlocal done
@@ -111,13 +116,12 @@ def judge(
         progress("judging", done, total, "")
 
     each(0)
-    eyes = [_Eyes(net, None if run.readings else looks, each, keep) for keep in (True, False)]
-    draws = preset.draws_per_structure
-    scenes = [_features(run, policy, eye, draws, num, seed) for policy, eye in zip(policies, eyes, strict=True)]
+    eyes = [_Eyes(net, each, keep) for keep in (True, False)]
+    draws = [1 if policy.suits else preset.draws_per_structure for policy in policies]
+    scenes = [_features(run, *each_of, num, seed) for each_of in zip(policies, eyes, draws, strict=True)]
     real = _real(run, target, net, each)
-    with threads(run.record["threads"]):
-        spread = np.linspace(0, len(target) - 1, min(2 * LOOKS, len(target))).astype(int)
-        seen = looks.embed(torch.stack([target.load(i) for i in spread]))
+    seen = looked.look(run, target, net, EfficientNetLite(), each, looked.IMAGES, seed)
+    rendered = np.concatenate([seen[name].looks.features for name in (looked.LEARNT, looked.PRIOR)])
     which = compared(net)
     which = torch.ones(real.shape[1], dtype=torch.bool) if which is None else which
     try:
@@ -127,7 +131,7 @@ def judge(
             scenes[1][:, which].numpy(),
             tuple(name for name, some in zip(net.names, which.tolist(), strict=True) if some),
             resolution=run.features.resolution,
-            looks=None if run.readings else (seen.numpy(), torch.cat([x for eye in eyes for x in eye.looks]).numpy()),
+            looks=None if run.readings else (seen[looked.TARGET].looks.features, rendered),
             seed=seed,
             pretrained=run.features.pretrained,
         )
@@ -140,7 +144,9 @@ def judge(
     if evaluation is not None and "truth" in evaluation.sources:
         by_labels = agreement(evaluation.sources["learnt"], evaluation.sources["truth"], evaluation.classes)
     walls = "" if evaluation is None else evaluation.walls
-    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls, usable(run))
+    features = {looked.LEARNT: scenes[0], looked.PRIOR: scenes[1], looked.TARGET: real}
+    parts = aspects(run, found, features, seen, seed)
+    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls, usable(run), parts)
 
 
 def usable(run: RunFolder) -> str:
@@ -156,11 +162,11 @@ def usable(run: RunFolder) -> str:
 
 
 class _Eyes:
-    """A run's network that keeps small pictures of what it was shown, and the looks of the first few."""
+    """A run's network that keeps small pictures of what it was shown."""
 
-    def __init__(self, net: FeatureNet, appearance: FeatureNet | None, each, keep: bool):
-        self.net, self.appearance, self.each, self.keep = net, appearance, each, keep
-        self.names, self.thumbs, self.looks, self.looked = net.names, [], [], 0
+    def __init__(self, net: FeatureNet, each, keep: bool):
+        self.net, self.each, self.keep = net, each, keep
+        self.names, self.thumbs = net.names, []
         if hasattr(net, "embed_drawn"):
             self.embed_drawn = self._embed_drawn
 
@@ -175,10 +181,6 @@ class _Eyes:
     def _look(self, images: Tensor) -> None:
         if self.keep:
             self.thumbs += [shrunk(image, THUMB).copy() for image in pixels(images)]
-        some = images[: max(0, LOOKS - self.looked)]
-        if len(some) and self.appearance is not None:
-            self.looks.append(self.appearance.embed(some))
-            self.looked += len(some)
         self.each(len(images))
 
 

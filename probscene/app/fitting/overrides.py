@@ -10,7 +10,7 @@ from probscene.inference.guides.lstm import GUIDES
 from probscene.inference.objective import BASELINES
 
 from .parts import is_file_part, lasting_word
-from .presets import BOTH, OBJECTIVES, STRUCTURE, TRAINED, Preset
+from .presets import BOTH, LIKELIHOOD, META_SIM, OBJECTIVES, STRUCTURE, TRAINED, Preset
 
 CHOICES = {
     "features": TRAINED,
@@ -18,9 +18,10 @@ CHOICES = {
     "baseline": BASELINES,
     "guide": GUIDES,
     "learn": (STRUCTURE, BOTH),
+    "parameter_method": (LIKELIHOOD, META_SIM),
 }
-LEAST = {"num_scenes": 2}
-ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate")
+LEAST = {"num_scenes": 2, "scenes": 2, "batches_again": 0, "rounds": 0}
+ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate", "difference")
 
 
 def override(preset: Preset, settings: list[str]) -> Preset:

@@ -13,6 +13,7 @@ from probscene.inference.features.photographs.choices import COUNT_ON_PRETRAINED
 from probscene.inference.features.presence import PresenceFeatures
 from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.guides.lstm import GUIDES
+from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.schedule import ParameterSchedule
 
 from .parts import CheckedDivergence, as_divergence, as_features, is_file_part, load_part
@@ -21,6 +22,7 @@ FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
 TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, "presence")  # on the prior's renders
 _RENAMED = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
 STRUCTURE, BOTH = "structure", "structure,parameters"
+LIKELIHOOD, META_SIM = "likelihood", "meta-sim"  # by which parameters are learnt
 OBJECTIVES = ("kde", "js", "witness", "mmd")
 
 
@@ -54,7 +56,8 @@ class Preset:
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
         prior_if_worse: keep the prior where what was learnt is farther from the target, beyond chance.
         learn: ``"structure"``, or ``"structure,parameters"``, where things stand and how they look as well.
-        parameters: the schedule of the latter.
+        parameter_method: of the latter: ``"likelihood"`` of what is read in the target, or Meta-Sim's way, a baseline.
+        parameters, meta_sim: the schedules of both.
         batches_again: of structure's second pass, whose scenes have learnt parameters; none where 0.
     """
 
@@ -93,7 +96,9 @@ class Preset:
     index: bool = True
     prior_if_worse: bool = True
     learn: str = STRUCTURE
+    parameter_method: str = LIKELIHOOD
     parameters: ParameterSchedule = field(default_factory=ParameterSchedule)
+    meta_sim: MetaSimSchedule = field(default_factory=MetaSimSchedule)
     batches_again: int = 20
 
     @staticmethod
@@ -104,6 +109,8 @@ class Preset:
         nested: dict[str, Any] = {"count": CountSchedule(**record["count"])}
         if "parameters" in record:
             nested["parameters"] = ParameterSchedule(**record["parameters"])
+        if "meta_sim" in record:
+            nested["meta_sim"] = MetaSimSchedule(**record["meta_sim"])
         return Preset(**{**whole, **nested})
 
     def with_objective(self, objective: str) -> "Preset":

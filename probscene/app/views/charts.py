@@ -24,6 +24,8 @@ from .tables import nested_counts
 INK, FAINT = "#010203", "#010204"
 SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
 VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
+READ = {"prior": "prior", "learnt": "learnt", "target": "truth"}  # in what a site is read, and its colour
+TALLEST = 6.0  # of a histogram over u, times the prior's density
 SMALL = 1e-3  # a share that would be no pixel high
 WIDE, SMALLER = (9.6, 2.9), (5.6, 2.5)  # inches
 STYLE: dict[Any, Any] = {
@@ -76,6 +78,25 @@ def nested(evaluation: Evaluation) -> list[str]:
             share = "share of images" if what.endswith("per image") else "share"
             charts.append(_counts(each, what, share, what, SMALLER))
     return charts
+
+
+def site(name: str, read: dict[str, list[float]]) -> str:
+    """What is read of a site in renders of the prior, in learnt ones and in the target: three histograms over u, 0 to
+    1, of quantiles whose bins hold equal shares. A flat one is the prior's, were it read without error."""
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": f"site {name}", "font.size": 8}):
+        figure, axes = _figure(2.6, 0.95)
+        for row, (source, colour) in enumerate(READ.items()):
+            edges = np.asarray(read[source], float)
+            width = np.maximum(np.diff(edges), 1e-3)
+            height = np.minimum(1 / (len(width) * width), TALLEST) / TALLEST
+            axes.bar(edges[:-1], 0.9 * height, width, len(READ) - 1 - row, align="edge", color=SOURCES[colour])
+        axes.set_xlim(0, 1)
+        axes.set_ylim(0, len(READ))
+        axes.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
+        axes.set_yticks([])
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(length=0)
+        return _svg(figure)
 
 
 def curves(log: list[dict]) -> list[str]:

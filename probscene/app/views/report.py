@@ -9,6 +9,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import torch
 from PIL import Image
 
 from probscene.dataset import Images
@@ -22,12 +23,23 @@ from ..files import make_folder, write_text
 from ..fitting import session
 from ..fitting.fit import open_target
 from ..fitting.run import RunFolder
+from ..judging.looked import LEARNT, PRIOR, STRUCTURE, policies
 from ..pictures import Pixels, grid, pixels, shrunk
 from ..progress import STAGES, Display
 from . import charts, tables, verdict_text
 from .preview import scenes
 
-SAMPLES = 16  # images a grid
+SAMPLES = 8  # images a row
+SITES = (
+    "Skill is the share of a site's variance that is read in renders. A site's value is given as its place in the "
+    "prior, 0 to 1. Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt "
+    "from; the floor is that of two halves of it."
+)
+READ = {
+    "prior": "read in renders with the prior's parameters",
+    "learnt": "with learnt parameters",
+    "truth": "in the target",
+}
 LEGEND = {
     "prior": "prior",
     "learnt": "learnt",
@@ -102,10 +114,8 @@ def write(
             trust=_trust(judged, images),
             headline=_headline(evaluation),
             samples=_samples(run, images, absent),
-            legend="".join(
-                f'<span><i style="background: var(--{name})"></i>{html.escape(LEGEND[name])}</span>'
-                for name in evaluation.sources
-            ),
+            sites=_sites(run),
+            legend=_legend({name: LEGEND[name] for name in evaluation.sources}),
             numbers=charts.numbers(evaluation),
             classes=charts.classes(evaluation),
             nested=_nested(evaluation),
@@ -148,21 +158,71 @@ def _headline(evaluation: Evaluation) -> str:
 
 
 def _samples(run: RunFolder, images: Images | None, absent: str) -> str:
-    model, parts = run.model, []
+    """A row of images of each source."""
+    found = policies(run)
+    order = [name for name in (PRIOR, STRUCTURE, LEARNT) if name in found]
+    rows = {name: pixels(scenes(run.model, found[name], SAMPLES, 0).image) for name in order}
+    parts = [_picture(pictures, said(run, name), SAMPLES) for name, pictures in rows.items()]
     if images is None:
-        parts.append(f"<p>{html.escape(absent or 'The target images were not read.')}</p>")
-    else:
-        step = max(1, len(images) // SAMPLES)
-        some = [images.load(i) for i in range(0, len(images), step)][:SAMPLES]
-        parts.append(_picture([pixels(image[None])[0] for image in some], "Target: some of the images"))
-    for policy, caption in ((model.prior, "Prior: before learning"), (run.guide, "Learnt: structures of the target")):
-        parts.append(_picture(pixels(scenes(model, policy, SAMPLES, 0).image), caption))
-    return "".join(parts)
+        return "".join([*parts, f"<p>{html.escape(absent or 'The target images were not read.')}</p>"])
+    spread = torch.linspace(0, len(images) - 1, min(SAMPLES, len(images))).long().tolist()
+    some = [pixels(images.load(i)[None])[0] for i in spread]
+    return "".join([*parts, _picture(some, "Target: some of the images", SAMPLES)])
 
 
-def _picture(images: list[Pixels], caption: str) -> str:
+def said(run: RunFolder, source: str) -> str:
+    """What a source of scenes is, in words."""
+    if source == LEARNT and STRUCTURE in policies(run):
+        return "Structure and parameters: all that was learnt"
+    return {
+        PRIOR: "Prior: before learning",
+        STRUCTURE: "Structure alone: learnt structure, the prior's parameters",
+        LEARNT: "Learnt: structure; parameters keep the prior",
+    }[source]
+
+
+def _sites(run: RunFolder) -> str:
+    """A table of the program's sites: whether each can be read, and what is read."""
+    record = run.parameters
+    if not record:
+        return "<p>Parameters were not learnt: where things stand and how they look keeps the prior.</p>"
+    rows = []
+    for site in record["sites"]:
+        read = site.get("read")
+        if site["learnt"]:
+            what = "learnt" if record["kept"] == "learnt" else "learnt, and not kept"
+        else:
+            what = f"keeps the prior: {site['because']}"
+        chart = f'<div class="site">{charts.site(site["name"], read)}</div>' if read else "–"
+        distances = [_figure(read["distance"][key]) for key in ("prior", "learnt", "floor")] if read else ["–"] * 3
+        cells = [site["name"], ", ".join(site["kinds"]), _figure(site["skill"]), what, *distances]
+        rows.append("".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + f"<td>{chart}</td>")
+    head = ("site", "of", "skill", "", "prior", "this fit", "floor", "read in renders and target, 0 to 1")
+    first = "".join(f"<th>{name}</th>" for name in head)
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    learnt = any(site["learnt"] for site in record["sites"])
+    kept = _not_kept(record) if learnt and record["kept"] != "learnt" else ""
+    return (
+        f'{kept}<p class="legend">{_legend(READ)}</p><div class="chart"><table><tr>{first}</tr>{body}</table></div>'
+        f'<p class="soft">{SITES}</p>'
+    )
+
+
+def _not_kept(record: dict[str, Any]) -> str:
+    figures = f"{record['learnt']:.2f} against {record['prior']:.2f} in energy distance"
+    return f"<p>All sites keep the prior: learnt scenes are farther from held-out images, {figures}.</p>"
+
+
+def _legend(words: dict[str, str]) -> str:
+    """Colours by the page's names."""
+    return "".join(
+        f'<span><i style="background: var(--{name})"></i>{html.escape(text)}</span>' for name, text in words.items()
+    )
+
+
+def _picture(images: list[Pixels], caption: str, columns: int | None = None) -> str:
     data = io.BytesIO()
-    Image.fromarray(grid([shrunk(image, 128) for image in images])).save(data, "PNG", optimize=True)
+    Image.fromarray(grid([shrunk(image, 128) for image in images], columns)).save(data, "PNG", optimize=True)
     source = base64.b64encode(data.getvalue()).decode("ascii")
     caption = html.escape(caption)
     return (

@@ -1,6 +1,8 @@
 """A verdict in a terminal and in the report."""
 
 import html
+from collections.abc import Iterable
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -10,22 +12,28 @@ from probscene.inference.judging.two_sample import Apart
 from probscene.inference.judging.verdict import Gap
 
 from ..evaluation.judge import Judged
+from ..judging.aspects import ABSENT
+from ..judging.looked import LEARNT, PRIOR, STRUCTURE
 
-Row = tuple[str, str, str]
 HEAD = ("", "this fit", "the floor")
 FLOOR = "The floor is what chance alone leaves between two halves of the real images."
+PARTS = ("", "verdict", "this fit", "structure alone", "prior", "the floor")
+DISTANCES = (LEARNT, STRUCTURE, PRIOR, "floor")
+OVERALL = (
+    "Energy distances from the target: of the run's features, of where objects stand in images with as many of them, "
+    f"and of EfficientNet's features. The whole is as good as its worst part. {FLOOR}"
+)
 
 
 def show(judged: Judged, console: Console) -> None:
-    """Print the verdict, why, what to do, what the labels say, and the figures."""
+    """Print the verdict, why, what to do, its parts, what the labels say, and the figures of structure."""
+    record = judged.record()
+    show_parts(record, console)
     if judged.trust is None:
-        console.print(f"No verdict. {judged.absent}", soft_wrap=True)
-        console.print()
         return
-    console.print(f"Verdict: {judged.trust.verdict}.", style="bold", soft_wrap=True)
     for text in _sentences(judged):
         console.print(text, soft_wrap=True)
-    table = Table(title="Can this fit be trusted? Without labels", title_justify="left", title_style="bold")
+    table = Table(title="Can this structure be trusted? Without labels", title_justify="left", title_style="bold")
     for name in HEAD:
         table.add_column(name, justify="right" if name else "left")
     for row in rows(judged.trust):
@@ -38,23 +46,89 @@ def show(judged: Judged, console: Console) -> None:
     console.print()
 
 
+def show_parts(record: dict[str, Any], console: Console) -> None:
+    """Print the verdict and its parts, of what ``Judged.record`` gives, as it was kept."""
+    if record["verdict"] is None:
+        console.print(f"No verdict. {record['because']}", soft_wrap=True)
+        console.print()
+        return
+    console.print(f"Verdict: {record['verdict']}.", style="bold", soft_wrap=True)
+    for text in (record["because"], record["remedy"]):
+        console.print(text, soft_wrap=True)
+    if "parts" not in record:  # of a run of before
+        return
+    table = Table(title="Structure, layout and looks", title_justify="left", title_style="bold")
+    for i, name in enumerate(PARTS):
+        table.add_column(name, justify="left" if i < 2 else "right", no_wrap=i != 1)
+    for row in parts(record):
+        table.add_row(*row)
+    console.print()
+    console.print(table)
+    console.print(OVERALL, style="dim", soft_wrap=True)
+    for text in (*what_to_do(record), *by_class(record), *sites(record)):
+        console.print(text, soft_wrap=True)
+
+
 def section(judged: Judged, real: str, generated: str) -> str:
     """HTML for the report; ``real`` and ``generated`` are its pictures."""
-    if judged.trust is None:
+    record = judged.record()
+    if judged.trust is None or record["verdict"] is None:
         return f"<p>No verdict. {html.escape(judged.absent)}</p>"
-    found = judged.trust
-    head = "".join(f"<th>{name}</th>" for name in HEAD)
-    body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows(found))
-    text = "".join(f"<p>{html.escape(text)}</p>" for text in _sentences(judged))
+    said = (record["because"], record["remedy"])
+    more = (*what_to_do(record), *by_class(record), *sites(record), *_sentences(judged))
     return (
-        f'<div class="card">Verdict<b>{html.escape(str(found.verdict))}</b></div>{text}'
-        f'<div class="row two">{real}{generated}</div>'
-        f'<div class="chart"><table><tr>{head}</tr>{body}</table></div><p class="soft">{FLOOR}</p>'
+        f'<div class="card">Verdict<b>{html.escape(record["verdict"])}</b></div>{_paragraphs(said)}'
+        f'{_table(PARTS, parts(record))}<p class="soft">{OVERALL}</p>{_paragraphs(more)}'
+        f'<div class="row two">{real}{generated}</div><h3>Structure</h3>{_table(HEAD, rows(judged.trust))}'
     )
 
 
-def rows(found: Trust) -> list[Row]:
-    """The figures: what, of this fit, and the floor."""
+def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:
+    """A row for each part: what, its verdict, and distances from the target."""
+    found = []
+    for name, part in record["parts"].items():
+        distances = part.get("distances", {})
+        each = (f"{distances[key]:.3g}" if key in distances else "-" for key in DISTANCES[:-1])
+        floor = f"up to {distances['floor']:.3g}" if distances else "-"
+        found.append((name, part["verdict"], *each, floor))
+    return found
+
+
+def what_to_do(record: dict[str, Any]) -> list[str]:
+    """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said."""
+    return [
+        f"{name.capitalize()}: {part['because']} {part['remedy'].removeprefix(record['remedy']).strip()}".strip()
+        for name, part in record["parts"].items()
+        if part["word"] != "good" and part["because"] != record["because"]
+    ]
+
+
+def by_class(record: dict[str, Any]) -> list[str]:
+    """For which classes counts and layout can be used, a sentence each; none for models of one class."""
+    classes, said = record["classes"], []
+    if len(classes) < 2:
+        return []
+    for what in ("counts", "layout"):
+        words: dict[str, list[str]] = {}
+        for name, each in classes.items():
+            words.setdefault(each[what], []).append(name)
+        if set(words) != {ABSENT}:
+            each = "; ".join(f"{word} for {', '.join(names)}" for word, names in words.items())
+            said.append(f"{what.capitalize()} by class: {each}.")
+    return said
+
+
+def sites(record: dict[str, Any]) -> list[str]:
+    """The sites that keep the prior, and why."""
+    whys: dict[str, list[str]] = {}
+    for name, because in record["sites_not_learnt"].items():
+        whys.setdefault(because, []).append(name)
+    each = "; ".join(f"{', '.join(names)}, as {because}" for because, names in whys.items())
+    return [f"Sites that keep the prior: {each}."] if each else []
+
+
+def rows(found: Trust) -> list[tuple[str, ...]]:
+    """The figures of structure: what, of this fit, and the floor."""
     x = found.figures
     lost = x.modes.lost
     shares = f"{int(lost.sum())} of {len(lost)}, {_percent(float(x.modes.real[lost].sum()))} of real"
@@ -80,12 +154,21 @@ def rows(found: Trust) -> list[Row]:
 
 
 def _sentences(judged: Judged) -> list[str]:
-    found = judged.trust
-    if found is None:
-        return [judged.absent]
-    out = [found.because, found.remedy, *([judged.usable] if judged.usable else [])]
-    out += [] if judged.agreement is None else [judged.agreement.sentence(found.verdict)]
-    return [*out, judged.walls] if judged.walls else out
+    """What else is known: which classes can be read, what labels say, what the model is too narrow for."""
+    found = [judged.usable] if judged.usable else []
+    if judged.agreement is not None and judged.trust is not None:
+        found.append(judged.agreement.sentence(judged.trust.verdict))
+    return [*found, judged.walls] if judged.walls else found
+
+
+def _paragraphs(texts: Iterable[str]) -> str:
+    return "".join(f"<p>{html.escape(text)}</p>" for text in texts)
+
+
+def _table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
+    first = "".join(f"<th>{name}</th>" for name in head)
+    rest = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in body)
+    return f'<div class="chart"><table><tr>{first}</tr>{rest}</table></div>'
 
 
 def _apart(found: Apart, unit: float | None = None) -> tuple[str, str]:

@@ -5,13 +5,14 @@ row gets the ground and is labelled, shaded and cleared for the next scene.
 """
 
 from ...engine import ti
+from ...kernels.lanes import LANES, floats, whole_lanes, words
+from ...kernels.tone import NOISE, TONED, develop, tone_of
 from .. import tables
 from . import shading
 from .geometry import draw_instance, lay_ground, unstamp
-from .lanes import LANES, Samples, floats, whole_lanes, words
-from .photo import develop
 from .raster import lay_row, strip_row
 from .rows import add_colours, add_samples, clear, compare, label, read_ground, read_pixels, repeat_last, take_colours
+from .samples import Samples
 from .shading import shade
 from .shadows import SPARE, cast_shadow, open_tiles
 
@@ -35,6 +36,7 @@ def render(
     whole: ti.types.ndarray(ti.i64, 1),
     real: ti.types.ndarray(ti.f64, 1),
     scene_table: ti.types.ndarray(ti.f64, 1),
+    photos: ti.types.ndarray(ti.f64, 1),
     seeds: ti.types.ndarray(ti.i64, 1),
     edges: ti.types.ndarray(ti.f64, 1),
     strip: ti.types.ndarray(ti.i32, 1),
@@ -120,7 +122,7 @@ def render(
                             cast_shadow(
                                 k, map_size, map_base, corner_base, whole, real, positions, triangles, shadow, corners
                             )
-                light = shading.lights(scene, scene_table)
+                light, photo = shading.lights(scene, scene_table), tone_of(scene, photos)
                 for row in range(height):
                     pixel, line_at = row * width, base + row * width
                     out, fine_at = scene * pixels + pixel, seen_base + room + i32(4) * pixel
@@ -164,6 +166,9 @@ def render(
                                 light, map_size, map_base, scene + 1, record_base, mark_base, records, marks, textures,
                                 texels, shadow, opened, some,
                             )  # fmt: skip
-                        develop(pixel + column, out + column, count, light, seeds[scene], some, image, image_words)
+                        develop(
+                            column, row, pixel + column, out + column, count, photo[TONED], photo[NOISE], photo,
+                            seeds[scene], some, image, image_words,
+                        )  # fmt: skip
                         column += count
                 scene = ti.atomic_add(queue[0], i32(1))

@@ -7,9 +7,10 @@ clipping, only outlines do.
 """
 
 from ...engine import ti
+from ...kernels.lanes import high, low
 from .. import atlas, tables
 from . import shading
-from .raster import fill, high, low, up
+from .raster import fill, up
 from .vertices import CORNER, transform, vertex
 
 STEEPEST = 1.0  # metres; see record_triangle

@@ -6,24 +6,12 @@ The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above 
 """
 
 from ...engine import ti
+from ...kernels.lanes import high, low, whole_lanes
 from .. import tables
-from .lanes import whole_lanes
 
 LEAST = 1e-9  # of 1/z, which rounding may not take to 0 or below
 
 i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
-
-
-@ti.func
-def low(a, b):
-    """The lesser; ti.min takes several instructions, for the sake of NaN."""
-    return ti.select(a < b, a, b)
-
-
-@ti.func
-def high(a, b):
-    """The greater."""
-    return ti.select(a > b, a, b)
 
 
 @ti.func

@@ -1,10 +1,10 @@
 """A row of the image: from the visibility buffer into samples, and from there to ids, classes and depth."""
 
 from ...engine import ti
+from ...kernels.lanes import LANES, SHIFT, floats, high, whole, words
 from .. import tables
 from . import shading
-from .lanes import LANES, SHIFT, floats, whole, words
-from .raster import LEAST, high
+from .raster import LEAST
 from .shading import nearness, record_of
 
 i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32

@@ -5,10 +5,9 @@ the sky's: all of it if it faces upward, three quarters if upright, half if it f
 """
 
 from ...engine import ti
+from ...kernels.lanes import LANES, floats, high
 from ..tables import AMBIENT, CLIMB, HAZE, HORIZON, LENS, LIGHT, LIGHTS, MORE, SCENE, SHADOWED, SUN
 from ..texture_atlas import COLUMNS, HEIGHT, WIDTH
-from .lanes import LANES, floats
-from .raster import high
 from .shadows import sunlit
 from .textures import texture_samples
 

@@ -4,10 +4,10 @@ The map is cleared, written and read in tiles of 16 x 16, and only those that so
 """
 
 from ...engine import ti
+from ...kernels.lanes import LANES, floats, high, low, whole, whole_lanes
 from .. import tables
 from ..tables import ON_MAP
-from .lanes import LANES, floats, whole, whole_lanes
-from .raster import by_height, columns, high, low, up
+from .raster import by_height, columns, up
 from .vertices import CORNER, transform, vertex
 
 NOTHING = -1e30

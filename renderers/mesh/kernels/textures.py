@@ -1,9 +1,8 @@
 """Where textures are read, at which of their levels, and the bilinear samples of them."""
 
 from ...engine import ti
+from ...kernels.lanes import LANES, high, low, natural, whole
 from ..texture_atlas import AT, LEVELS
-from .lanes import LANES, natural, whole
-from .raster import high, low
 
 i32, u32, f32 = ti.i32, ti.u32, ti.f32
 PAIR = 0x00FF00FF  # red and blue of a texel

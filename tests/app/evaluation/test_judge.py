@@ -1,6 +1,8 @@
 """The verdict on real renders: right where one knows it, held against labels, shown by both commands."""
 
+import functools
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +20,7 @@ from probscene.app.labelling.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
+from probscene.inference.features import pretrained
 from probscene.inference.judging.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
 
@@ -29,9 +32,9 @@ def quiet(*_):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def fewer_looks():
+def fewer_and_smaller_looks():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verdict, "LOOKS", 12)
+        patch.setattr(pretrained, "EfficientNetLite", functools.partial(pretrained.EfficientNetLite, 96))
         yield
 
 
@@ -72,7 +75,7 @@ def seeing(call, drawn, discs, tmp_path_factory):
     out = tmp_path_factory.mktemp("seeing") / "run"
     settings = [word.replace("count.steps=48", "count.steps=300") for word in discs.settings]
     done = call("fit", discs.file, "--target", drawn.target.path, "--out", out, *settings)
-    assert done.code == 0, done.err
+    assert done.code == 0 and "Verdict" not in done.out, done.err
     return out
 
 
@@ -108,7 +111,8 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
     assert all(picture.shape == (64, 64, 3) for picture in found.generated_unmatched)
     assert not found.trust.pretrained
     record = json.loads(json.dumps(found.record(), allow_nan=False))
-    assert record["verdict"] == str(expected) and "labels" not in record
+    assert record["verdict"] == record["parts"]["structure"]["verdict"] == str(expected) and "labels" not in record
+    assert (record["overall"] == "good") is (record["parts"]["structure"]["word"] == "good")
     assert set(record["single_features"]) == {"red", "blue", "total"}
 
 
@@ -166,6 +170,17 @@ def test_both_commands_say_it(call, seeing, drawn, tmp_path):
     assert done.code == 0, done.err
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Can this fit be trusted?" in page and "Target images least like any generated scene: 000" in page
+
+
+def test_a_fit_ends_with_its_verdict(call, drawn, discs, tmp_path):
+    words = [word for word in discs.settings if word != "--no-verdict"]
+    done = call("fit", discs.file, "--target", drawn.target.path, "--out", tmp_path / "run", *words)
+    assert done.code == 0, done.err
+    assert re.match(r"Verdict: [\w ]+\.\n", done.out) and "\nLearnt." in done.out
+    for part in ("structure", "layout", "looks"):
+        assert re.search(rf"│ {part} +│", done.out)
+    again = call("fit", "--resume", "--out", tmp_path / "run")
+    assert again.code == 0 and "Verdict" not in again.out  # it was finished
 
 
 def test_too_few_images_have_no_verdict_and_are_still_compared(call, seeing, drawn, tmp_path):

@@ -81,7 +81,8 @@ def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
     assert done.code == 0, done.err
     found = json.loads((tmp_path / "e.json").read_text())
     judged = judge(run, ImageFolder(target.images, run.model.canvas, run.model.channels), lambda *_: None, 40).trust
-    assert judged.pretrained and found["trust"]["remedy"] == judged.remedy  # not to take what it has
+    structure = found["trust"]["parts"]["structure"]
+    assert judged.pretrained and structure["remedy"] == judged.remedy  # not to take what it has
     assert "estimate" not in found["sources"] and "truth" in found["sources"]  # a direction is no count
     assert call("report", run.path, "--num", 200, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
 

@@ -63,10 +63,10 @@ def test_the_page_needs_nothing_else(text):
 
 def test_the_page_shows_target_prior_and_learnt(text):
     pictures = re.findall(r'<img alt="([^"]+)" src="data:image/png;base64,([^"]+)"', text)
-    assert [caption.split(":")[0] for caption, _ in pictures] == ["Target", "Prior", "Learnt"]
+    assert [caption.split(":")[0] for caption, _ in pictures] == ["Prior", "Learnt", "Target"]
     for _, data in pictures:
         with Image.open(io.BytesIO(base64.b64decode(data, validate=True))) as picture:
-            assert picture.size == (4 * 66 + 2, 4 * 66 + 2)
+            assert picture.size == (8 * 66 + 2, 66 + 2)
             assert len(picture.convert("RGB").getcolors(1 << 16)) > 10
 
 
@@ -89,6 +89,49 @@ def test_the_page_shows_figures_curves_grammar_time_and_configuration(text, fitt
         assert f"<td>{key}</td>" in text
     assert f"<td>{html.escape(run.record['target'])}</td>" in text and f"version {run.record['version']}" in words
     assert len(re.findall(r"<b>\d\.\d{3} → \d\.\d{3}</b>", text)) == 4
+
+
+def with_sites(fitted, folder, kept="learnt") -> RunFolder:
+    """A copy of a run with what is read of two sites, and with one that cannot be read."""
+    shutil.copytree(fitted, folder)
+    flat = [i / 20 for i in range(21)]
+    read = {"prior": flat, "learnt": [0.4 + x / 5 for x in flat], "target": [0.5] * 21}
+    read["distance"] = {"prior": 0.25, "learnt": 0.125, "floor": 0.02}
+    site = {"kinds": ["red", "blue"], "learnt": True, "skill": 0.9, "because": "", "read": read}
+    unread = {"kinds": ["red"], "learnt": False, "skill": None, "because": "it cannot be read in <renders>"}
+    sites = [site | {"name": "x"}, site | {"name": "y"}, unread | {"name": "light"}]
+    record = {"kept": kept, "sites": sites, "learnt": 0.5, "prior": 0.25}
+    (folder / "parameters.json").write_text(json.dumps(record))
+    return RunFolder.at(folder)
+
+
+@pytest.mark.parametrize("kept", ["learnt", "prior"])
+def test_the_page_shows_every_site_and_what_is_read_of_it(kept, fitted, tmp_path):
+    run = with_sites(fitted, tmp_path / "run", kept)
+    made = report(run, Display(), num=100, judged_by=0).read_text(encoding="utf-8")
+    page = Page(made)
+    section = page.text[page.text.index("Where things stand") : page.text.index("Histograms")]
+    assert made.count('<div class="site"><svg') == 2
+    for what in ("0.900", "0.250", "0.125", "0.020", "red, blue", "keeps the prior: it cannot be read in <renders>"):
+        assert what in section, what
+    assert ("All sites keep the prior" in section) is (kept == "prior")
+    assert ("learnt, and not kept" in section) is (kept == "prior")
+
+
+def test_the_page_of_a_run_without_parameters_says_so(fitted, tmp_path):
+    shutil.copytree(fitted, tmp_path / "run")
+    (tmp_path / "run" / "parameters.json").unlink()
+    made = report(RunFolder.at(tmp_path / "run"), Display(), num=100, judged_by=0).read_text(encoding="utf-8")
+    assert "Parameters were not learnt" in made
+
+
+def test_the_page_shows_structure_alone_beside_all_that_was_learnt(fitted, tmp_path):
+    shutil.copytree(fitted, tmp_path / "run")
+    run = RunFolder.at(tmp_path / "run")
+    run.guide.suits = lambda model: model
+    made = report(run, Display(), num=100, judged_by=0).read_text(encoding="utf-8")
+    captions = [caption.split(":")[0] for caption in re.findall(r'<img alt="([^"]+)"', made)]
+    assert captions == ["Prior", "Structure alone", "Structure and parameters", "Target"]
 
 
 def test_colours_are_the_pages_own(text):

@@ -10,6 +10,7 @@ from probscene.inference.features.counting.batches import FEWEST, FULL, CountBat
 from probscene.inference.features.counting.net import STRIDE, CountNet, toward_whole
 from probscene.inference.features.counting.training import CountTraining, count_loss
 from probscene.inference.features.presence import PresenceNet, PresenceTraining
+from probscene.model import Groups
 
 
 @given(st.sampled_from([1, 2, 4, 8]), st.integers(9, 40), st.integers(9, 40), st.integers(0, 2**31))
@@ -161,3 +162,23 @@ def test_a_step_takes_no_more_pixels_of_large_images(height, width, images):
     assert 1 <= taken <= images
     assert taken == images or area > FULL
     assert taken <= FEWEST or taken * area <= images * FULL + area / 2
+
+
+@pytest.mark.parametrize("groups", [None, Groups("row", max_groups=2)])
+def test_cells_hold_what_is_counted(groups):
+    torch.manual_seed(0)
+    net = CountNet(("a", "row", "b"), 3, (64, 96), (4, 8, 8), groups=groups).eval()
+    with torch.no_grad():
+        torch.nn.init.normal_(net.body[-1].weight, std=0.5)
+    images = torch.randint(0, 256, (70, 3, 64, 96), dtype=torch.uint8)
+    cells = net.cells(images)
+    assert cells.shape[:2] == (70, 3) and (cells >= 0).all() and net.classes == ("a", "row", "b")
+    torch.testing.assert_close(net.cells(images[3:4]), cells[3:4])
+    sums = cells.sum((2, 3))
+    if groups is None:
+        torch.testing.assert_close(toward_whole(sums), net.embed(images)[:, :3], atol=1e-3, rtol=1e-3)
+    else:
+        with torch.no_grad():
+            counts = net._read(net(net.enter(images))).clamp(min=0)
+        of_a = counts[:, [i for i, name in enumerate(net.names) if name.startswith("a ")]].sum(1)
+        torch.testing.assert_close(sums[:, 0], of_a, atol=1e-3, rtol=1e-3)

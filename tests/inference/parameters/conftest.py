@@ -100,3 +100,21 @@ def rooms(trays):
 def model(request):
     """A model of one grammar, and one of several scenarios."""
     return request.getfixturevalue(request.param)
+
+
+DISCS = Grammar("Scene -> Discs\nDiscs -> disc Discs | ε")
+DISCS_PRIOR = StructurePrior(DISCS, Discs=counts(0, 1, 1, 1))
+
+
+@pytest.fixture(scope="session")
+def smeared():
+    """Discs in photos of other light, focus and grain."""
+
+    @scene_model(DISCS, DISCS_PRIOR, canvas=(64, 64), max_steps=8, classes=("disc",))
+    def smeared(scene):
+        photo = scene.photo(exposure=(0.5, 1.5), blur=(0.0, 3.0), noise=(0.0, 12.0))
+        with scene.nodes("disc"):
+            x = pyro.sample("disc.x", dist.Uniform(8.0, 56.0))
+        return scene.draw(Sprites.disc("disc", x, 32.0, radius=6.0), background=(0.3, 0.3, 0.3), photo=photo)
+
+    return smeared

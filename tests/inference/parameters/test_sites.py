@@ -108,3 +108,13 @@ def test_quantiles_are_nan_where_a_node_has_no_such_site(model):
         assert torch.equal(~found[site.name].isnan(), has[..., s]), site.name
     assert not of_scenes(found["floor.turn"]).isnan().any() and of_scenes(found["floor.turn"]).shape == (50, 1)
     assert of_scenes(torch.full((2, 3), torch.nan)).isnan().all()
+
+
+def test_a_photos_sites_are_the_scenes_own(smeared):
+    found = {site.name: site for site in find_sites(smeared)}
+    assert set(found) == {"photo.exposure", "photo.blur", "photo.noise", "photo.seed", "disc.x"}
+    for name in ("photo.exposure", "photo.blur", "photo.noise"):
+        assert found[name] == Site(name, ()) and found[name].of_scene
+    assert found["photo.seed"].keeps == "the program says so"
+    u = quantiles_of(smeared, sample(smeared, smeared.prior, 400))["photo.blur"]
+    assert u.shape == (400, 1) and abs(float(u.mean()) - 0.5) < 0.05

@@ -12,7 +12,8 @@ import torch
 from probscene.batch import RenderBatch, Space
 from probscene.world import World
 
-from .rays import meet, noise, sample
+from .photo import photographed
+from .rays import meet, sample
 from .scenes import SceneReference
 
 
@@ -41,7 +42,7 @@ class MeshReference:
             semantic[n] = scene.kinds(hits, u, v).reshape(height, width)
             depth[n] = hits.depth.reshape(height, width)
             if self.colours:
-                image[n] = self._image(scene, u, v).reshape(height, width, 3)
+                image[n] = self._image(scene, u, v)
             for m in range(M):
                 if m not in scene.boxes:
                     continue
@@ -66,7 +67,8 @@ class MeshReference:
 
     def _image(self, scene: "_Scene", u, v) -> np.ndarray:
         shifts = [(0.0, 0.0)] if self.samples == 1 else [(a, b) for a in (-0.25, 0.25) for b in (-0.25, 0.25)]
-        return scene.develop(np.mean([scene.colours(u + a, v + b) for a, b in shifts], 0))
+        colours = np.mean([scene.colours(u + a, v + b) for a, b in shifts], 0).reshape(*self.canvas, 3)
+        return photographed(colours, scene.world.photo, 0).image
 
 
 class _Scene(SceneReference):
@@ -126,13 +128,3 @@ class _Scene(SceneReference):
             t, shares = meet(points, np.broadcast_to(self.sun, points.shape), triangle.corners)
             dark |= (t > 1e-3) & (shares >= 0).all(1)
         return dark
-
-    def develop(self, colour) -> np.ndarray:
-        """Bytes of ``(P, 3)`` colours."""
-        photo = {k: float(x[0]) for k, x in vars(self.world.photo).items() if k != "seed"}
-        colour = colour * photo["exposure"]
-        grey = (colour @ [0.299, 0.587, 0.114])[:, None]
-        colour = grey + (colour - grey) * photo["saturation"]
-        colour = 0.5 + (colour - 0.5) * photo["contrast"]
-        colour = colour * 255 + photo["noise"] * noise(int(self.world.photo.seed[0]), len(colour))
-        return np.clip(np.floor(colour + 0.5), 0, 255).astype(np.uint8)

@@ -13,6 +13,7 @@ from torch import Tensor
 from probscene.inference.guides.base import Guide
 from probscene.inference.judging.farther import farther
 from probscene.inference.parameters.learning import ParameterLearning
+from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
@@ -39,7 +40,7 @@ class Judged(NamedTuple):
     sites: dict[str, dict[str, Any]]
 
 
-def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Tensor) -> Judged:
+def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSimLearning, held: Tensor) -> Judged:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features."""
     if learning.guide is None:
         return Judged({"kept": "prior"}, {})
@@ -52,6 +53,9 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Te
     seen = {name: look(some).double().numpy() for name, some in images.items()}
     apart = farther(seen["learnt"], seen["prior"], seen["target"])
     kept = "learnt" if apart.one < apart.other else "prior"
+    distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
+    if isinstance(learning, MetaSimLearning):  # which reads nothing
+        return Judged(distances, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
     readings = {name: learning.readings(some) for name, some in images.items()}
     halves = [learning.readings(held[i::2]) for i in (0, 1)]
@@ -62,7 +66,7 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Te
             name: _distance(readings[name][site.name], readings["target"][site.name]) for name in ("prior", "learnt")
         }
         sites[site.name] = each | {"distance": away | {"floor": _distance(*(half[site.name] for half in halves))}}
-    return Judged({"kept": kept, "learnt": apart.one, "prior": apart.other}, sites)
+    return Judged(distances, sites)
 
 
 def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> Tensor:

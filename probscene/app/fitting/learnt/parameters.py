@@ -15,17 +15,22 @@ from probscene.inference.features.base import FeatureNet
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
+from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
+from probscene.inference.parameters.meta_sim.transform import ParameterTransform
 from probscene.inference.parameters.reading.eyes import Eye
 from probscene.inference.parameters.sites import Site
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
+from probscene.scenarios import JointGrammar
 
 from ...progress import Progress
 from ..observer import Observer
 from ..parts import inner
+from ..presets import META_SIM
 from ..storage import Keeper
 from .judged import judged
+from .meta_sim import meta_sim_learning, sites_record
 
 if TYPE_CHECKING:
     from ..run import RunFolder
@@ -56,24 +61,28 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     seed_everything(batch_seed(run.record["seed"], 5))
-    eye = Eye.of(inner(net))
-    if eye is None:
-        who = f"{run.features.name} features are"
+    eye, by_reading = Eye.of(inner(net)), run.preset.parameter_method != META_SIM
+    joint = not by_reading and isinstance(run.model.grammar, JointGrammar)
+    if joint or (by_reading and eye is None):
+        who = "models of several scenarios are" if joint else f"{run.features.name} features are"
         say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
         return
     kept = run.read_tensors(NAME)
     if kept is None:
         target = images()
         held = torch.arange(len(target)) % HELD == HELD - 1
-        learning = ParameterLearning(
-            run.model,
-            guide,
-            eye,
-            observer.labelled,
-            lambda: _some(target, ~held, run.preset.parameters.images),
-            run.preset.parameters,
-            batch_seed(run.record["seed"], 5),
-        )
+        if by_reading and eye is not None:
+            learning = ParameterLearning(
+                run.model,
+                guide,
+                eye,
+                observer.labelled,
+                lambda: _some(target, ~held, run.preset.parameters.images),
+                run.preset.parameters,
+                batch_seed(run.record["seed"], 5),
+            )
+        else:
+            learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
         keep = Keeper(run, NAME, learning)
 
         def each(training: Training, line: dict[str, float]) -> None:
@@ -103,14 +112,26 @@ def apart(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tens
 
 def with_parameters(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> Policy:
     """A policy whose scenes have the run's learnt parameters, in place; as it is where none are kept."""
-    record = run.parameters
-    if not tensors or record.get("kept") != "learnt":
-        return policy
-    sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in record["sites"] if site["learnt"])
-    guide = ParameterGuide(run.model, sites, policy)
-    guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
-    policy.suits = guide.eval().suited
+    if tensors and run.parameters.get("kept") == "learnt":
+        policy.suits = learnt_by(run, policy, tensors).suited
     return policy
+
+
+def learnt_by(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> ParameterGuide | ParameterTransform:
+    """What a run has learnt of parameters, whether it is kept or not.
+
+    Args:
+        policy: of the structures.
+        tensors: see ``beside``.
+    """
+    record, schedule = run.parameters, run.preset.meta_sim
+    sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in record["sites"] if site["learnt"])
+    if record.get("method") == META_SIM:
+        guide = ParameterTransform(run.model, sites, policy, schedule.hidden, schedule.rounds)
+    else:
+        guide = ParameterGuide(run.model, sites, policy)
+    guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
+    return guide.eval()
 
 
 def _some(images: Images, which: Tensor, most: int) -> Tensor:
@@ -120,8 +141,13 @@ def _some(images: Images, which: Tensor, most: int) -> Tensor:
     return torch.stack([images.load(row) for row in rows.tolist()])
 
 
-def _record(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Tensor) -> dict[str, Any]:
+def _record(
+    run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSimLearning, held: Tensor
+) -> dict[str, Any]:
     """For JSON."""
+    method = {"method": run.preset.parameter_method}
+    if isinstance(learning, MetaSimLearning):
+        return method | {"sites": sites_record(learning), **judged(run, guide, learning, held).distances}
     assert learning.skill is not None
     shares = learning.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
@@ -132,16 +158,17 @@ def _record(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: T
         known, because = share if share == share else None, learning.why_not(site)
         about = {"name": site.name, "kinds": site.kinds, "learnt": is_learnt, "skill": known, "because": because}
         sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
-    return {"sites": sites, **found.distances}
+    return method | {"sites": sites, **found.distances}
 
 
 def _said(record: dict[str, Any]) -> str:
-    sites = record["sites"]
-    learnt = ", ".join(f"{site['name']} ({site['skill']:.2f})" for site in sites if site["learnt"])
+    sites, read = record["sites"], record.get("method") != META_SIM
+    named = [site["name"] + (f" ({site['skill']:.2f})" if read else "") for site in sites if site["learnt"]]
     others = ", ".join(site["name"] for site in sites if not site["learnt"])
-    if not learnt:
-        return "No site can be read in renders, so where things stand and how they look keeps the prior."
-    said = f"Sites that are learnt, with the share of their variance that is read: {learnt}."
+    if not named:
+        why = "read in renders" if read else "moved"
+        return f"No site can be {why}, so where things stand and how they look keeps the prior."
+    said = f"Sites that are learnt{', with the share of their variance that is read' * read}: {', '.join(named)}."
     said += f" Keeping the prior: {others}." if others else ""
     if record["kept"] != "learnt":
         said += (

@@ -238,3 +238,13 @@ def test_the_relative_loss_weighs_errors_by_their_counts():
     logits = (guess * 40).requires_grad_()
     entropy = F.cross_entropy(logits, target, reduction="sum")
     assert (relative_count_loss(logits, target) - entropy).item() == pytest.approx(1 / 4, rel=1e-4)
+
+
+def test_cells_hold_the_sum_of_probabilities(dots):
+    net, images = untrained(dots), torch.randint(0, 256, (3, 3, *dots.canvas), dtype=torch.uint8)
+    C = torch.arange(len(dots.classes))
+    net.scope.copy_((C + 1) % len(SCOPES))
+    by_sum = net.readings(net.look(images))[0][:, net.scope, 0, C]
+    cells = net.cells(images)
+    assert cells.shape == (3, len(C), *net.places(min(STRIDES))) and net.classes == dots.classes
+    torch.testing.assert_close(cells.sum((2, 3)), by_sum, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,1 @@
+"""Meta-Sim's way of learning parameters, a baseline."""

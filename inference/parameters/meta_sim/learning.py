@@ -1,0 +1,119 @@
+"""Parameters by distribution matching, Meta-Sim's way [1].
+
+Scenes are drawn from the structure's policy and the prior's parameters. A graph network moves their parameters. The
+loss is the MMD of features of their images from those of the target's, and its gradient goes through the renderer by
+finite differences (``differences``). All continuous sites of nodes that have a class and of the scene are moved: unlike
+``ParameterLearning``, nothing says which of them images show. Axis letters: L images, D features.
+
+References:
+    [1] Kar et al., *Meta-Sim: Learning to Generate Synthetic Datasets*, ICCV 2019, section 3.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import seed_everything
+
+from ...training import Report, batch_seed, check_finite, restore_training, training_state
+from ..sites import Site, find_sites
+from .differences import Differences, Drawn, Embed
+from .discrepancy import Discrepancy
+from .schedule import MetaSimSchedule
+from .transform import ParameterTransform
+
+LARGEST = 1.0  # norm of a step's gradient
+
+
+class MetaSimLearning:
+    """A ``Training`` of a ``ParameterTransform``.
+
+    Args:
+        model: the scene model.
+        structure: the policy of the structures.
+        embed: renders scenes and gives their features ``(N, D)``.
+        real: the target's features ``(L, D)``.
+        schedule: how long.
+        seed: of everything random.
+
+    Attributes:
+        unit, total, done: see ``Training``.
+        sites: of the model.
+        learnt: those that are moved, in the order of the program.
+        guide: what is learnt; None where there is no site to move.
+    """
+
+    unit = "steps"
+
+    def __init__(
+        self,
+        model: SceneModel,
+        structure: Policy,
+        embed: Embed,
+        real: Tensor,
+        schedule: MetaSimSchedule,
+        seed: int = 0,
+    ):
+        self.model, self.structure, self.schedule, self.seed = model, structure, schedule, seed
+        seed_everything(batch_seed(seed, 0))
+        self.sites = find_sites(model)
+        self.learnt: tuple[Site, ...] = tuple(site for site in self.sites if not site.keeps)
+        self.differences = Differences(model, self.learnt, embed, schedule.difference, schedule.values)
+        self.discrepancy = Discrepancy(real)
+        self.guide: ParameterTransform | None = None
+        self.total, self.done = 0, 0
+        if self.learnt:
+            self.guide = ParameterTransform(model, self.learnt, structure, schedule.hidden, schedule.rounds)
+            self.optimiser = torch.optim.Adam(self.guide.net.parameters(), lr=schedule.rate)
+            self.total = schedule.steps
+
+    def run(self, each: Report | None = None) -> None:
+        """Take the steps that are left; ``each`` hears the loss after every one.
+
+        Raises:
+            ProbsceneError: the loss is no longer finite.
+        """
+        while self.done < self.total:
+            assert self.guide is not None
+            seed_everything(batch_seed(self.seed, 1, self.done))
+            rate = self.schedule.rate * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
+            for group in self.optimiser.param_groups:
+                group["lr"] = rate
+            loss = self._step(self.guide)
+            self.done += 1
+            where = f"at step {self.done}"
+            check_finite(loss, self.guide.net.parameters(), "the parameters", where, "begin again with a lower rate")
+            if each is not None:
+                each(self, {"loss": loss})
+
+    def _step(self, guide: ParameterTransform) -> float:
+        drawn = Drawn.of(self.model, self.structure, self.learnt, self.schedule.scenes)
+        scene, nodes = (logit.sigmoid() for logit in guide.net(drawn.graph, drawn.scene, drawn.nodes))
+        features = self.differences.features(drawn, scene.detach(), nodes.detach()).requires_grad_()
+        loss = self.discrepancy(features)
+        (slope,) = torch.autograd.grad(loss, features)
+        of_scene, of_nodes = self.differences.gradient(drawn, scene.detach(), nodes.detach(), slope)
+        self.optimiser.zero_grad()
+        ((scene * of_scene).sum() + (nodes * of_nodes).sum()).backward()
+        torch.nn.utils.clip_grad_norm_(guide.net.parameters(), LARGEST)
+        self.optimiser.step()
+        return loss.item()
+
+    def summary(self) -> dict[str, Any]:
+        """Nothing more for the log."""
+        return {}
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        if self.guide is None:
+            return {}
+        return training_state(self.guide.net, {"adam": self.optimiser}, done=self.done)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        if self.guide is not None:
+            self.done = int(restore_training(self.guide.net, {"adam": self.optimiser}, tensors)["done"])

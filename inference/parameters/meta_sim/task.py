@@ -1,0 +1,110 @@
+"""Parameters by a task's score, Meta-Sim's other loss.
+
+A task network is trained on what is generated and scored on a few labelled target images. The score has no gradient by
+the parameters. So they are sampled from normal distributions around the graph network's output, and descended is [1, 2]
+
+    -(score - b) log q(logits of u),
+
+with b a moving average of the scores. One score is all that a whole batch of scenes is told by, so that the gradient
+has a large variance. Axis letters: N scenes, M nodes.
+
+References:
+    [1] Kar et al., *Meta-Sim: Learning to Generate Synthetic Datasets*, ICCV 2019, section 3.
+    [2] Williams, *Simple statistical gradient-following algorithms*, Machine Learning 1992.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from probscene.sampling import Scenes, seed_everything
+
+from ...training import Report, batch_seed, check_finite, restore_training, training_state
+from .differences import Drawn, with_values
+from .transform import ParameterTransform
+
+KEPT = 0.8  # of the baseline, from one score to the next
+
+Score = Callable[[Scenes], float]
+"""Trains a task network on scenes and says how well it does on the target, more being better."""
+
+
+class TaskLearning:
+    """A ``Training`` of a ``ParameterTransform`` by a score.
+
+    Args:
+        guide: the transform, trained in place.
+        score: of scenes.
+        steps: of Adam; each asks for one score.
+        scenes: that a score is of.
+        spread: standard deviation around the network's output, in logits of u.
+        rate: Adam's.
+        seed: of everything random.
+
+    Attributes:
+        unit, total, done: see ``Training``.
+        baseline: the moving average of the scores; None before the first.
+    """
+
+    unit = "steps"
+
+    def __init__(
+        self,
+        guide: ParameterTransform,
+        score: Score,
+        steps: int = 50,
+        scenes: int = 200,
+        spread: float = 0.3,
+        rate: float = 1e-3,
+        seed: int = 0,
+    ):
+        self.guide, self.score, self.total, self.done = guide, score, steps, 0
+        self.scenes, self.spread, self.seed = scenes, spread, seed
+        self.baseline: float | None = None
+        self.optimiser = torch.optim.Adam(guide.net.parameters(), lr=rate)
+
+    def run(self, each: Report | None = None) -> None:
+        """Take the steps that are left; ``each`` hears the score after every one.
+
+        Raises:
+            ProbsceneError: the score is not finite.
+        """
+        guide = self.guide
+        while self.done < self.total:
+            seed_everything(batch_seed(self.seed, self.done))
+            drawn = Drawn.of(guide.model, guide.structure, guide.sites, self.scenes)
+            means = guide.net(drawn.graph, drawn.scene, drawn.nodes)
+            logits = [mean.detach() + self.spread * torch.randn_like(mean) for mean in means]
+            with torch.no_grad():
+                scenes = with_values(guide.model, guide.sites, drawn, *(logit.sigmoid() for logit in logits))
+            score = float(self.score(scenes))
+            baseline = score if self.baseline is None else self.baseline
+            log_q = drawn.scene.new_zeros(())
+            for x, mean, u in zip(logits, means, (drawn.scene, drawn.nodes), strict=True):
+                log_q = log_q - 0.5 * ((x - mean) / self.spread).square().where(~u.isnan(), 0.0).sum()  # and a constant
+            self.optimiser.zero_grad()
+            (-(score - baseline) * log_q / self.scenes).backward()
+            self.optimiser.step()
+            self.baseline = KEPT * baseline + (1 - KEPT) * score
+            self.done += 1
+            where = f"at step {self.done}"
+            check_finite(-score, guide.net.parameters(), "the parameters", where, "look at the task's score")
+            if each is not None:
+                each(self, {"loss": -score})
+
+    def summary(self) -> dict[str, Any]:
+        """The moving average of the scores."""
+        return {} if self.baseline is None else {"score": self.baseline}
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        baseline = torch.nan if self.baseline is None else self.baseline
+        return training_state(self.guide.net, {"adam": self.optimiser}, done=self.done, baseline=baseline)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        numbers = restore_training(self.guide.net, {"adam": self.optimiser}, tensors)
+        self.done, baseline = int(numbers["done"]), numbers["baseline"]
+        self.baseline = None if baseline != baseline else baseline

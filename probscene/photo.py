@@ -1,0 +1,132 @@
+"""What a camera makes of an image, in 2D and in 3D: the values, where they may lie, and the sites they are drawn at.
+
+Axis letter: N scenes.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from .errors import ModelError
+
+MAX_BLUR = 64.0  # pixels
+SEEDS = 2**31 - 1
+
+Look = Tensor | float | tuple[float, float] | dist.Distribution
+"""A value, ``(N, 1)`` or a number; or what it is drawn from: the two ends of a uniform prior, or a distribution."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """What a camera makes of an image; all are numbers or broadcast to ``(N, 1)``. The defaults leave every byte as it
+    is; labels, and depth in 3D, never change.
+
+    The effects come in this order: vignette, exposure, gains, saturation and contrast, on sRGB in 0..1; blur; noise;
+    JPEG. What they are given and what they leave are bytes; only colours and noise without a blur between them are
+    rounded once.
+
+    Args:
+        exposure: factor of all light, 1 for as it is.
+        contrast: about the middle grey 0.5, 1 for as it is.
+        saturation: 0 for grey, 1 for as it is; grey pixels stay as they are.
+        red_gain, blue_gain: white balance, factors of red and of blue; that of green is the exposure's.
+        vignette: share of the light that is missing in the image's corners, 0..1, by the square of the distance from
+            the middle.
+        blur: standard deviation of a Gaussian, pixels, 0..64; the image's border is continued outward.
+        noise: standard deviation, of 255, in each channel of each pixel for itself.
+        jpeg_quality: 1..100, as of libjpeg, rounded; infinity for no JPEG. Colour is kept at half of the resolution.
+        seed: of each image's noise, ``(N, 1)`` int64, or a number.
+    """
+
+    exposure: Tensor | float = 1.0
+    contrast: Tensor | float = 1.0
+    saturation: Tensor | float = 1.0
+    red_gain: Tensor | float = 1.0
+    blue_gain: Tensor | float = 1.0
+    vignette: Tensor | float = 0.0
+    blur: Tensor | float = 0.0
+    noise: Tensor | float = 0.0
+    jpeg_quality: Tensor | float = torch.inf
+    seed: Tensor | int = 0
+
+
+LIMITS = {field.name: (0.0, torch.inf) for field in fields(Photo) if field.name != "seed"} | {
+    "vignette": (0.0, 1.0),
+    "blur": (0.0, MAX_BLUR),
+    "jpeg_quality": (1.0, 100.0),
+}
+
+
+def check_photo(values: dict[str, Tensor]) -> None:
+    """See that the values of a ``Photo`` lie where they may.
+
+    Raises:
+        ModelError: one does not.
+    """
+    for name, (low, high) in LIMITS.items():
+        value = values[name]
+        if name == "jpeg_quality":
+            value = value[value != torch.inf]
+        if not ((value >= low) & (value <= high)).all():  # also where it is NaN
+            worst = value[~((value >= low) & (value <= high))][0]
+            raise ModelError(
+                f"Expected Photo.{name} {_within(name)}, actual {float(worst):g}; give scene.photo(...) a range or a "
+                "distribution that stays there."
+            )
+
+
+def sample_photo(num_scenes: int, looks: dict[str, Look | None]) -> Photo:
+    """A ``Photo`` whose values are sites ``photo.exposure`` and so on, one value a scene.
+
+    Args:
+        looks: by name; those that are None keep the image as it is and have no site.
+
+    Raises:
+        ModelError: a range that is none or not within the limits, or a site whose shape is not ``(N, 1)``.
+    """
+    values: dict[str, Any] = {}
+    for name in LIMITS:  # the program's order of sites does not depend on the caller's
+        look = looks.get(name)
+        if isinstance(look, tuple | list | dist.Distribution):
+            prior = look if isinstance(look, dist.Distribution) else _uniform(name, look)
+            values[name] = _site(name, num_scenes, prior)
+        elif look is not None:
+            values[name] = look
+    if "noise" in values:
+        share = _site("seed", num_scenes, dist.Uniform(0.0, 1.0), infer={"learn": False})
+        values["seed"] = (share.double() * SEEDS).long()
+    return Photo(**values)
+
+
+def _site(name: str, num_scenes: int, prior: Any, **more: Any) -> Tensor:
+    value = pyro.sample(f"photo.{name}", prior, **more)
+    if tuple(value.shape) != (num_scenes, 1):
+        raise ModelError(
+            f"Expected site 'photo.{name}' with one value a scene, shape ({num_scenes}, 1), actual "
+            f"{tuple(value.shape)}; call scene.photo(...) inside the plate 'scenes' and outside scene.nodes(...)."
+        )
+    return value
+
+
+def _uniform(name: str, ends: tuple[float, float] | list[float]) -> Any:
+    low, high = LIMITS[name]
+    try:
+        first, last = (float(end) for end in ends)
+    except (TypeError, ValueError):
+        first = last = torch.nan
+    if not (low <= first < last <= high and last < torch.inf):
+        raise ModelError(
+            f"Expected {name} of scene.photo(...) as a range (lowest, highest) {_within(name)}, actual {ends!r}; write "
+            "one number for a value that is the same in all images."
+        )
+    return dist.Uniform(first, last)
+
+
+def _within(name: str) -> str:
+    low, high = LIMITS[name]
+    bounds = f"of at least {low:g}" if high == torch.inf else f"within {low:g}..{high:g}"
+    return f"{bounds}, or infinity for no JPEG" if name == "jpeg_quality" else bounds
