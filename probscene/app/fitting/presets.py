@@ -99,7 +99,7 @@ class Preset:
     parameter_method: str = LIKELIHOOD
     parameters: ParameterSchedule = field(default_factory=ParameterSchedule)
     meta_sim: MetaSimSchedule = field(default_factory=MetaSimSchedule)
-    batches_again: int = 20
+    batches_again: int = 40
 
     @staticmethod
     def of(record: dict[str, Any]) -> "Preset":

@@ -28,7 +28,7 @@ from .outcome import compared
 
 FIRST, AGAIN = "guide", "structure-again"  # of the checkpoints
 BEFORE = "guide-first"  # of the guide that parameters are learnt with
-SLOWER = 0.5  # of the first pass's rate
+SLOWER = 0.2  # of the first pass's rate
 
 
 def learn_structure(run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, progress: Progress) -> Guide:
