@@ -29,7 +29,7 @@ from probscene.policy import Policy
 from probscene.sampling import Scenes, run_program
 
 from ..net import Graph, Seen
-from ..sites import NEAR, Site, quantiles_of, within
+from ..sites import NEAR, Site, of_scenes, quantiles_of, within
 
 AT_ONCE = 256  # scenes that a program is run on
 
@@ -44,15 +44,15 @@ class Drawn(NamedTuple):
         derivation: N of them.
         parameters: values of all sites.
         seen, graph: of the nodes that have a class.
-        scene, nodes: ``(N, G)`` and ``(N, M, S)`` u; NaN where there are none.
+        of_scene, of_nodes: ``(N, G)`` and ``(N, M, S)`` u; NaN where there are none.
     """
 
     derivation: Derivation
     parameters: dict[str, Tensor]
     seen: Seen
     graph: Graph
-    scene: Tensor
-    nodes: Tensor
+    of_scene: Tensor
+    of_nodes: Tensor
 
     @staticmethod
     def of(model: SceneModel, structure: Policy, sites: tuple[Site, ...], num: int) -> "Drawn":
@@ -62,7 +62,7 @@ class Drawn(NamedTuple):
         found, seen = quantiles_of(model, scenes), Seen.of(model.grammar, model.classes, derivation)
         there = (seen.kind >= 0).unsqueeze(-1)
         nodes = [seen.taken(found[site.name]) for site in sites if not site.of_scene]
-        scene = [found[site.name] for site in sites if site.of_scene]
+        scene = [of_scenes(found[site.name]) for site in sites if site.of_scene]
         return Drawn(
             derivation,
             scenes.parameters,
@@ -90,8 +90,8 @@ def with_values(
         rows: which scenes of ``drawn``, ``(R,)``; all where left out.
     """
     seen = Seen(*(part[rows] for part in drawn.seen))
-    scene = scene.where(~drawn.scene[rows].isnan(), torch.nan)
-    nodes = nodes.where(~drawn.nodes[rows].isnan(), torch.nan)
+    scene = scene.where(~drawn.of_scene[rows].isnan(), torch.nan)
+    nodes = nodes.where(~drawn.of_nodes[rows].isnan(), torch.nan)
     u, none = {}, torch.full(seen.place.shape, torch.nan)
     for site in sites:
         column = sum(other.of_scene == site.of_scene for other in sites[: sites.index(site)])
@@ -131,7 +131,7 @@ class Differences:
         """
         (N, G), (_, M, S) = scene.shape, nodes.shape
         u = torch.cat([scene, nodes.flatten(1)], 1).clamp(NEAR, 1 - NEAR)  # (N, G + M S)
-        there = ~torch.cat([drawn.scene, drawn.nodes.flatten(1)], 1).isnan()
+        there = ~torch.cat([drawn.of_scene, drawn.of_nodes.flatten(1)], 1).isnan()
         found, chosen = torch.zeros_like(u), there.nonzero()
         share = 1.0
         if self.most is not None and len(chosen) > self.most:

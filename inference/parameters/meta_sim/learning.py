@@ -92,7 +92,7 @@ class MetaSimLearning:
 
     def _step(self, guide: ParameterTransform) -> float:
         drawn = Drawn.of(self.model, self.structure, self.learnt, self.schedule.scenes)
-        scene, nodes = (logit.sigmoid() for logit in guide.net(drawn.graph, drawn.scene, drawn.nodes))
+        scene, nodes = (logit.sigmoid() for logit in guide.net(drawn.graph, drawn.of_scene, drawn.of_nodes))
         features = self.differences.features(drawn, scene.detach(), nodes.detach()).requires_grad_()
         loss = self.discrepancy(features)
         (slope,) = torch.autograd.grad(loss, features)

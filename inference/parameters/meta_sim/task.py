@@ -75,14 +75,14 @@ class TaskLearning:
         while self.done < self.total:
             seed_everything(batch_seed(self.seed, self.done))
             drawn = Drawn.of(guide.model, guide.structure, guide.sites, self.scenes)
-            means = guide.net(drawn.graph, drawn.scene, drawn.nodes)
+            means = guide.net(drawn.graph, drawn.of_scene, drawn.of_nodes)
             logits = [mean.detach() + self.spread * torch.randn_like(mean) for mean in means]
             with torch.no_grad():
                 scenes = with_values(guide.model, guide.sites, drawn, *(logit.sigmoid() for logit in logits))
             score = float(self.score(scenes))
             baseline = score if self.baseline is None else self.baseline
-            log_q = drawn.scene.new_zeros(())
-            for x, mean, u in zip(logits, means, (drawn.scene, drawn.nodes), strict=True):
+            log_q = drawn.of_scene.new_zeros(())
+            for x, mean, u in zip(logits, means, (drawn.of_scene, drawn.of_nodes), strict=True):
                 log_q = log_q - 0.5 * ((x - mean) / self.spread).square().where(~u.isnan(), 0.0).sum()  # and a constant
             self.optimiser.zero_grad()
             (-(score - baseline) * log_q / self.scenes).backward()

@@ -83,7 +83,7 @@ def test_the_program_moves_what_the_network_moves_at_once(trays):
     seed_everything(0)
     before = Drawn.of(trays, trays.prior, transform.sites, 40)
     with torch.no_grad():
-        moved = [x.sigmoid() for x in transform.net(before.graph, before.scene, before.nodes)]
+        moved = [x.sigmoid() for x in transform.net(before.graph, before.of_scene, before.of_nodes)]
     again = with_values(trays, transform.sites, before, *moved)
     assert torch.equal(scenes.derivation.rules, again.derivation.rules)
     for name, value in scenes.parameters.items():
@@ -95,12 +95,12 @@ def test_a_site_does_not_see_those_after_it(trays):
     transform = transform_of(trays)
     before = Drawn.of(trays, trays.prior, transform.sites, 20)
     with torch.no_grad():
-        scene, nodes = transform.net(before.graph, before.scene, before.nodes)
-        changed = before.nodes.clone()
+        scene, nodes = transform.net(before.graph, before.of_scene, before.of_nodes)
+        changed = before.of_nodes.clone()
         changed[..., 3:] = (changed[..., 3:] + 0.3).remainder(1.0)  # ball.size and what comes after it
-        again = transform.net(before.graph, before.scene, changed)
+        again = transform.net(before.graph, before.of_scene, changed)
     assert torch.equal(scene, again[0]) and torch.equal(nodes[..., :3], again[1][..., :3])
-    there = ~before.nodes[..., 3].isnan()
+    there = ~before.of_nodes[..., 3].isnan()
     assert not torch.equal(nodes[..., 3][there], again[1][..., 3][there])
 
 
@@ -109,11 +109,11 @@ def test_padding_moves_nothing(trays):
     transform = transform_of(trays)
     before = Drawn.of(trays, trays.prior, transform.sites, 30)
     with torch.no_grad():
-        _, whole = transform.net(before.graph, before.scene, before.nodes)
+        _, whole = transform.net(before.graph, before.of_scene, before.of_nodes)
         for n in range(30):
             M = max(1, int((before.seen.kind[n] >= 0).sum()))
             graph = type(before.graph)(*(part[n : n + 1, :M] for part in before.graph))
-            _, alone = transform.net(graph, before.scene[n : n + 1], before.nodes[n : n + 1, :M])
+            _, alone = transform.net(graph, before.of_scene[n : n + 1], before.of_nodes[n : n + 1, :M])
             assert torch.allclose(alone[0], whole[n, :M], atol=1e-5)
 
 
@@ -132,7 +132,7 @@ def differentiated(trays, seed=0, most=None):
     sites = tuple(site for site in find_sites(trays) if site.name in NAMES)
     seed_everything(seed)
     before = Drawn.of(trays, trays.prior, sites, 12)
-    scene, nodes = (0.1 + 0.8 * torch.rand_like(u) for u in (before.scene, before.nodes))
+    scene, nodes = (0.1 + 0.8 * torch.rand_like(u) for u in (before.of_scene, before.of_nodes))
     ways = torch.randn(12, len(NAMES))
 
     def embed(scenes):
@@ -301,7 +301,7 @@ def test_u_of_moved_values_is_what_they_were_moved_to(trays):
     sites = tuple(site for site in find_sites(trays) if site.name in NAMES)
     seed_everything(0)
     before = Drawn.of(trays, trays.prior, sites, 20)
-    scene, nodes = torch.rand_like(before.scene), torch.rand_like(before.nodes)
+    scene, nodes = torch.rand_like(before.of_scene), torch.rand_like(before.of_nodes)
     found = quantiles_of(trays, with_values(trays, sites, before, scene, nodes))
     taken = before.seen.taken(found["ball.shade"])
     there = ~taken.isnan() & (before.seen.kind >= 0)
