@@ -128,7 +128,7 @@ def demo(
     cache: Cache = None,
     no_cache: NoCache = False,
 ) -> None:
-    """The whole path on handwritten digits that come with the install; about ten minutes on two cores."""
+    """The whole path on handwritten digits that come with the install; about a quarter of an hour on two cores."""
     from ..demo import demo
 
     demo(out, checked_seed(seed), cache=cache, use_cache=not no_cache)
