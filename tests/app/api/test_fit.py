@@ -183,7 +183,9 @@ def test_a_fit_of_objects_goes_on_with_them(quick, discs, target, tmp_path, monk
     whole = quick(model, images, features=Means())
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr("probscene.app.fitting.fit.pretrain", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(
+            "probscene.app.fitting.learnt.structure.pretrain", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt)
+        )
         with pytest.raises(KeyboardInterrupt):
             quick(model, images, features=Means(), out=out)
     assert not (out / "guide.safetensors").exists()
