@@ -17,12 +17,11 @@ from torch import Tensor, nn
 from probscene.derivation import Derivation
 from probscene.grammar import Grammar
 
-from .mates import Mates
+from .mates import LOGITS, Mates
 from .mixture import LogisticMixture
 
 COMPONENTS = 6
 MOST = 40  # ranks and numbers of siblings from here on are one
-LOGITS = 4.0  # a logit of this is 1 for the network
 SMALL = 0.3  # spread of the first components' locations, in logits: components that are equal stay equal
 
 
@@ -171,7 +170,7 @@ class ParameterNet(nn.Module):
         ties = self.mates.ties(graph.together, own)
         place = self._place(graph, scene, s) + self._siblings(graph, own)
         place = place + self.mates(ties.place, ties.last, known[..., s])
-        return self._mixture(place, torch.cat([_code(x) for x in around], -1), memory, s)
+        return self._mixture(place, torch.cat([code(x) for x in around], -1), memory, s)
 
     def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
         """u of the nodes' site number ``s``, ``(N, M)``, at the quantiles ``v (N, M)``, one node after the other.
@@ -192,10 +191,10 @@ class ParameterNet(nn.Module):
             for index in (graph.parent[:, m], graph.before[:, m]):
                 table = torch.stack(columns[: m + 1], 1)  # parents and siblings before come earlier
                 around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
-            code = torch.cat([_code(x) for x in around], -1)
+            known = torch.cat([code(x) for x in around], -1)
             so_far = torch.stack(columns, 1)[..., s]
             here = place[:, m] + self.mates(ties.place[:, m : m + 1], ties.last[:, m : m + 1], so_far)[:, 0]
-            u = self._mixture(here, code, memory, s).icdf(v[:, m])
+            u = self._mixture(here, known, memory, s).icdf(v[:, m])
             found.append(u.where(has[:, m], v[:, m]))
             at_s = torch.arange(self.node_sites) == s
             columns[m] = torch.where(at_s, u.where(has[:, m], torch.nan)[:, None], columns[m])
@@ -203,15 +202,15 @@ class ParameterNet(nn.Module):
             memory = torch.gru_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
         return torch.stack(found, 1)
 
-    def _mixture(self, place: Tensor, code: Tensor, memory: Tensor, s: int) -> LogisticMixture:
-        x = torch.cat([place + self.of_values(code), memory], -1)
+    def _mixture(self, place: Tensor, known: Tensor, memory: Tensor, s: int) -> LogisticMixture:
+        x = torch.cat([place + self.of_values(known), memory], -1)
         return LogisticMixture.of(self.out[s](self.join(F.silu(x))))
 
     def _entering(self, graph: Graph, known: Tensor, s: int) -> Tensor:
         return self._entering_one(graph.kind, known, s)
 
     def _entering_one(self, kind: Tensor, known: Tensor, s: int) -> Tensor:
-        x = torch.cat([self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s], _code(known)], -1)
+        x = torch.cat([self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s], code(known)], -1)
         return F.silu(self.read(x))
 
     def _place(self, graph: Graph, scene: Tensor, s: int) -> Tensor:
@@ -233,15 +232,15 @@ class ParameterNet(nn.Module):
     def _siblings(self, graph: Graph, own: Tensor) -> Tensor:
         """``(N, M, H)``, the mean of what is known of a node's siblings and itself, of all sites before."""
         share = graph.together.to(own.dtype) / graph.number.clamp(min=1).unsqueeze(-1)
-        return self.of_siblings(share @ _code(own))
+        return self.of_siblings(share @ code(own))
 
     def _scene(self, graph: Graph, scene: Tensor) -> Tensor:
         counts = F.one_hot(graph.kind.remainder(self.kinds + 1), self.kinds + 1).sum(1)[:, : self.kinds]
-        return self.of_scene(torch.cat([counts.to(scene.dtype).log1p(), _code(scene)], -1))
+        return self.of_scene(torch.cat([counts.to(scene.dtype).log1p(), code(scene)], -1))
 
 
-def _code(u: Tensor) -> Tensor:
-    """``(..., 3 S)`` of u ``(..., S)``: whether it is known, and it, on both scales."""
+def code(u: Tensor) -> Tensor:
+    """``(..., 3 S)`` of u ``(..., S)``, NaN where it is not known: whether it is, and it, on both scales."""
     there = ~u.isnan()
     u = u.nan_to_num(0.5)
     return torch.cat([there.to(u.dtype), 2 * u - 1, u.clamp(1e-4, 1 - 1e-4).logit() / LOGITS], -1)

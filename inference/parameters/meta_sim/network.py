@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..net import LOGITS, MOST, Graph
+from ..net import MOST, Graph, code
 from ..sites import NEAR
 
 SCALE, SHIFT = 3.0, 6.0  # largest change of the scale, and of the logit
@@ -94,8 +94,8 @@ class GraphNetwork(nn.Module):
         place = [(graph.rank + 0.5) / number, 1 / number, graph.number.clamp(max=MOST) / MOST]
         place += [1.0 * (graph.rank == 0), 1.0 * (graph.rank == graph.number - 1)]
         of_nodes = self.of_kind(kind) + self.of_place(torch.stack(place, -1).to(nodes.dtype))
-        of_nodes = of_nodes + self.of_values(_code(nodes, self.node_sites))
-        root = self.of_scene(torch.cat([_code(scene, self.scene_sites), counts], -1))
+        of_nodes = of_nodes + self.of_values(code(_at_least_one(nodes)))
+        root = self.of_scene(torch.cat([code(_at_least_one(scene)), counts], -1))
         return torch.cat([root.unsqueeze(1), of_nodes * (graph.kind >= 0).unsqueeze(-1)], 1)
 
 
@@ -114,9 +114,6 @@ def _neighbours(graph: Graph, state: Tensor) -> list[Tensor]:
     return [parent, children, F.pad(before, (0, 0, 1, 0)), F.pad(after, (0, 0, 1, 0))]
 
 
-def _code(u: Tensor, sites: int) -> Tensor:
-    """``(..., 3 S)`` of u ``(..., S)``: whether it is known, and it, on both scales; S at least 1."""
-    u = u if sites else u.new_full((*u.shape[:-1], 1), torch.nan)
-    there = ~u.isnan()
-    u = u.nan_to_num(0.5)
-    return torch.cat([there.to(u.dtype), 2 * u - 1, u.clamp(1e-4, 1 - 1e-4).logit() / LOGITS], -1)
+def _at_least_one(u: Tensor) -> Tensor:
+    """u ``(..., S)``, with a site that is not known where S is 0."""
+    return u if u.shape[-1] else u.new_full((*u.shape[:-1], 1), torch.nan)
