@@ -188,12 +188,11 @@ class ParameterNet(nn.Module):
         w: Any = self.cell  # torch names its weights as it makes them
         for m in range(M):
             around = [columns[m]]
+            table = torch.stack(columns[: m + 1], 1)  # parents and siblings before come earlier
             for index in (graph.parent[:, m], graph.before[:, m]):
-                table = torch.stack(columns[: m + 1], 1)  # parents and siblings before come earlier
                 around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
             known = torch.cat([code(x) for x in around], -1)
-            so_far = torch.stack(columns, 1)[..., s]
-            here = place[:, m] + self.mates(ties.place[:, m : m + 1], ties.last[:, m : m + 1], so_far)[:, 0]
+            here = place[:, m] + self.mates(ties.place[:, m : m + 1], ties.last[:, m : m + 1], table[..., s])[:, 0]
             u = self._mixture(here, known, memory, s).icdf(v[:, m])
             found.append(u.where(has[:, m], v[:, m]))
             at_s = torch.arange(self.node_sites) == s
