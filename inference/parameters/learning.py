@@ -10,6 +10,7 @@ Axis letters: N scenes, L images, K objects.
 """
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -23,7 +24,7 @@ from ..training import Report, Training, batch_seed
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
 from .net import Graph
-from .reading.assembly import along_the_widest, assembly
+from .reading.assembly import Assembly, along_the_widest, assembly
 from .reading.eyes import Eye
 from .reading.reader import Found, Reader
 from .reading.skill import Skill
@@ -229,20 +230,22 @@ class ParameterLearning:
 
     def _read(self) -> Values:
         """What the reader reads in the target."""
+        made, images = self._assembly, self.images()
         seed_everything(batch_seed(self.seed, 3, self.phase))
-        images = self.images()
         found, skills, S = self.reader.find(images), self._skills(), len(self.node_sites)
         node, scene = (some.nonzero().flatten() for some in self._good.tensor_split([S]))
         mean, sd = (part[:, node] for part in skills[0].read(found.raw))
         scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
-        kind, parent, *nodes = along_the_widest(self._assembly(), found).values(found, len(images), mean, sd)
+        kind, parent, *nodes = along_the_widest(made, found).values(found, len(images), mean, sd)
         has = having(self.model.grammar, tuple(self.node_sites[i] for i in node.tolist()), kind)
         turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
         mean, sd = (part.where(has, torch.nan) for part in nodes)
         return Values(kind, parent, mean, sd, scene_mean, scene_sd, turns)
 
-    def _assembly(self) -> Any:
-        """What the prior's scenes have in common."""
+    @cached_property
+    def _assembly(self) -> Assembly:
+        """What the prior's scenes have in common; the same in every phase."""
+        seed_everything(batch_seed(self.seed, 4))
         valued = self.renders.draw(TRIED, self.model.pretraining_policy)
         label = valued.drawn.label
         kinds = torch.tensor([self.model.grammar.kind(name) for name in self.model.classes] + [-1])
