@@ -25,7 +25,8 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.world import World
 
-from .net import Graph, ParameterNet, Seen
+from .graph import Graph, Seen
+from .net import ParameterNet
 from .sites import NEAR, Site, site_name
 
 
@@ -45,7 +46,9 @@ class ParameterGuide(nn.Module):
         self.structure = model.prior if structure is None else structure
         self.node_sites = tuple(site for site in sites if not site.of_scene)
         self.scene_sites = tuple(site for site in sites if site.of_scene)
-        self.net = ParameterNet(len(model.grammar.kinds), len(self.node_sites), len(self.scene_sites), hidden)
+        before = [sum(other.of_scene for other in sites[:i]) for i, site in enumerate(sites) if not site.of_scene]
+        kinds = len(model.grammar.kinds)
+        self.net = ParameterNet(kinds, len(self.node_sites), len(self.scene_sites), hidden, before)
 
     def forward(self, num_scenes: int) -> Drawing | World:
         """The Pyro program: the sites ``rule_t`` and the model's own."""

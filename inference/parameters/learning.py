@@ -21,9 +21,9 @@ from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
 from ..training import Report, Training, batch_seed
+from .graph import Graph
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
-from .net import Graph
 from .reading.assembly import Assembly, along_the_widest, assembly
 from .reading.eyes import Eye
 from .reading.reader import Found, Reader

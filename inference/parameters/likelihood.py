@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from ..steps import StepTraining
-from .net import Graph, ParameterNet
+from .graph import Graph
+from .net import ParameterNet
 from .reading.reader import cut_draw
 from .sites import NEAR
 

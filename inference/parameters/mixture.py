@@ -64,7 +64,13 @@ class LogisticMixture(NamedTuple):
                 newton = logit - (self.cdf(logit) - v) / slope
                 logit = torch.where((newton > low - slack) & (newton < high + slack), newton, logit)
             u = logit.sigmoid().clamp(NEAR, 1 - NEAR)
+        return self.through(u)
+
+    def through(self, u: Tensor) -> Tensor:
+        """``u (...)``, with the gradient by the parameters that the quantile has which it is: that of the implicit
+        function."""
         if not torch.is_grad_enabled() or not self.location.requires_grad:
             return u
+        u = u.detach()
         below = self.cdf(u.logit())
         return u - (below - below.detach()) / self.log_prob(u).exp().detach().clamp(min=NEAR)

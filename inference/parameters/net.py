@@ -7,108 +7,20 @@ known of them, the siblings that are like it (``mates``), and, through a GRU, on
 scenes, M nodes, S sites of nodes, G sites of scenes, H units.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from probscene.derivation import Derivation
-from probscene.grammar import Grammar
-
+from .graph import Graph
 from .mates import LOGITS, Mates
 from .mixture import LogisticMixture
 
 COMPONENTS = 6
 MOST = 40  # ranks and numbers of siblings from here on are one
 SMALL = 0.3  # spread of the first components' locations, in logits: components that are equal stay equal
-
-
-class Graph(NamedTuple):
-    """What a scene's structure says of its nodes.
-
-    Attributes:
-        kind: ``(N, M)`` int64; -1 pads.
-        parent, before: ``(N, M)`` int64 node index of the parent and of the sibling before, -1 for none.
-        rank, number: ``(N, M)`` int64 place among its siblings, and how many they are with it.
-        same_rank, same_number: the same among siblings of its own kind.
-    """
-
-    kind: Tensor
-    parent: Tensor
-    before: Tensor
-    rank: Tensor
-    number: Tensor
-    same_rank: Tensor
-    same_number: Tensor
-
-    @property
-    def together(self) -> Tensor:
-        """``(N, M, M)`` bool, who is whose sibling, itself included."""
-        parent = self.parent.where(self.kind >= 0, -2)
-        return (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & (parent > -2).unsqueeze(-1)
-
-    @staticmethod
-    def of(kind: Tensor, parent: Tensor) -> "Graph":
-        """Of nodes in the order of a derivation, each ``(N, M)``."""
-        there = kind >= 0
-        siblings = (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & there.unsqueeze(-1) & there.unsqueeze(-2)
-        same = siblings & (kind.unsqueeze(-1) == kind.unsqueeze(-2))
-        earlier = siblings.tril(-1)
-        index = torch.arange(kind.shape[1]).expand_as(earlier)
-        before = index.where(earlier, -1).amax(-1)
-        return Graph(kind, parent, before, earlier.sum(-1), siblings.sum(-1), same.tril(-1).sum(-1), same.sum(-1))
-
-
-class Seen(NamedTuple):
-    """The nodes of derivations that have a class, without gaps: only these can be read in an image.
-
-    Attributes:
-        kind, parent: ``(N, M')``, the parent the nearest that has a class.
-        slot: ``(N, M')`` int64, which node of the derivation each is.
-        place: ``(N, M)`` int64, the reverse; whatever for nodes without a class.
-    """
-
-    kind: Tensor
-    parent: Tensor
-    slot: Tensor
-    place: Tensor
-
-    @staticmethod
-    def of(grammar: Grammar, classes: Sequence[str], derivation: Derivation) -> "Seen":
-        """Of derivations."""
-        kind, parent = derivation.kind, derivation.parent
-        has_class = torch.zeros(len(grammar.kinds) + 1, dtype=torch.bool)
-        has_class[[grammar.kind(name) for name in classes]] = True
-        while True:
-            above = parent.clamp(min=0)
-            hidden = (parent >= 0) & ~has_class[kind.gather(1, above)]
-            if not hidden.any():
-                break
-            parent = torch.where(hidden, parent.gather(1, above), parent)
-        there = has_class[kind]
-        order = (~there).long().argsort(dim=1, stable=True)
-        place = order.argsort(1)
-        slot = order[:, : max(1, int(there.sum(1).max()) if len(kind) else 1)]
-        mapped = torch.where(parent >= 0, place.gather(1, parent.clamp(min=0)), -1)
-        seen = there.gather(1, slot)
-        return Seen(kind.gather(1, slot).where(seen, -1), mapped.gather(1, slot).where(seen, -1), slot, place)
-
-    def taken(self, values: Tensor) -> Tensor:
-        """``(N, M', ...)`` of values of the derivation's nodes ``(N, M, ...)``. There may be fewer, or more, where a
-        scenario's own program has drawn them; what is taken is of no use in scenes of another."""
-        slot = self.slot.clamp(max=values.shape[1] - 1)
-        return values.gather(1, slot.view(*slot.shape, *(1,) * (values.ndim - 2)).expand(-1, -1, *values.shape[2:]))
-
-    def put(self, values: Tensor, others: Tensor) -> Tensor:
-        """``(N, M)`` of values ``(N, M')``; ``others (N, M)``, as wide as in ``taken``, where a node has no class."""
-        M = others.shape[1]
-        place = F.pad(self.place[:, :M], (0, max(0, M - self.place.shape[1])), value=values.shape[1])
-        at = place.clamp(max=values.shape[1] - 1)
-        back = values.gather(1, at)
-        there = (place < values.shape[1]) & (self.kind.gather(1, at) >= 0)
-        return back.where(there, others)
 
 
 class ParameterNet(nn.Module):
@@ -118,11 +30,21 @@ class ParameterNet(nn.Module):
         kinds: how many the grammar has.
         node_sites, scene_sites: S and G, those that are learnt.
         hidden: H.
+        before: how many of the scenes' sites come before each of the nodes' sites; all where None.
         components: of each mixture.
     """
 
-    def __init__(self, kinds: int, node_sites: int, scene_sites: int, hidden: int = 64, components: int = COMPONENTS):
+    def __init__(
+        self,
+        kinds: int,
+        node_sites: int,
+        scene_sites: int,
+        hidden: int = 64,
+        before: Sequence[int] | None = None,
+        components: int = COMPONENTS,
+    ):
         super().__init__()
+        self.before = tuple(before) if before is not None else (scene_sites,) * node_sites
         self.kinds, self.node_sites, self.scene_sites = kinds, node_sites, scene_sites
         S, G, K = node_sites, scene_sites, 3 * components
         self.of_kind = nn.Embedding(kinds + 1, hidden)
@@ -179,12 +101,44 @@ class ParameterNet(nn.Module):
             scene, values: as of ``node_mixture``, without site ``s``.
             has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
         """
-        N, M = v.shape
+        return self._one_by_one(graph, scene, values, s, v, has, LogisticMixture.icdf)
+
+    def retraced(self, graph: Graph, scene: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """``scene (N, G)`` and ``values (N, M, S)`` of a sample, with the gradients that they have as quantiles of the
+        mixtures that they come from, each through all before it [1].
+
+        References:
+            [1] Figurnov, Mohamed, Mnih, *Implicit reparameterization gradients*, NeurIPS 2018.
+        """
+        for g in range(self.scene_sites):
+            u = scene[:, g : g + 1]
+            moved = self.scene_mixture(graph, scene, g).through(u.nan_to_num(0.5)).where(~u.isnan(), torch.nan)
+            scene = torch.cat([scene[:, :g], moved, scene[:, g + 1 :]], 1)
+        for s in range(self.node_sites):
+            u = values[..., s]
+            has = ~u.isnan()
+            moved = self._one_by_one(graph, scene, values, s, u.nan_to_num(0.5), has, LogisticMixture.through)
+            moved = moved.where(has, torch.nan).unsqueeze(-1)
+            values = torch.cat([values[..., :s], moved, values[..., s + 1 :]], -1)
+        return scene, values
+
+    def _one_by_one(
+        self,
+        graph: Graph,
+        scene: Tensor,
+        values: Tensor,
+        s: int,
+        given: Tensor,
+        has: Tensor,
+        take: Callable[[LogisticMixture, Tensor], Tensor],
+    ) -> Tensor:
+        """u of site ``s``, ``(N, M)``, that is taken of each node's mixture and what is given for it, ``(N, M)``."""
+        N, M = given.shape
         earlier = torch.arange(self.node_sites) < s
         rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
         own = torch.stack(columns, 1)
         place, ties = self._place(graph, scene, s) + self._siblings(graph, own), self.mates.ties(graph.together, own)
-        memory, found = v.new_zeros(N, self.cell.hidden_size), []
+        memory, found = given.new_zeros(N, self.cell.hidden_size), []
         w: Any = self.cell  # torch names its weights as it makes them
         for m in range(M):
             around = [columns[m]]
@@ -193,8 +147,8 @@ class ParameterNet(nn.Module):
                 around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
             known = torch.cat([code(x) for x in around], -1)
             here = place[:, m] + self.mates(ties.place[:, m : m + 1], ties.last[:, m : m + 1], table[..., s])[:, 0]
-            u = self._mixture(here, known, memory, s).icdf(v[:, m])
-            found.append(u.where(has[:, m], v[:, m]))
+            u = take(self._mixture(here, known, memory, s), given[:, m]).where(has[:, m], given[:, m])
+            found.append(u)
             at_s = torch.arange(self.node_sites) == s
             columns[m] = torch.where(at_s, u.where(has[:, m], torch.nan)[:, None], columns[m])
             x = self._entering_one(graph.kind[:, m], columns[m], s)
@@ -215,6 +169,7 @@ class ParameterNet(nn.Module):
     def _place(self, graph: Graph, scene: Tensor, s: int) -> Tensor:
         """``(N, M, H)``, what does not change from node to node."""
         rank, number = (x.clamp(max=MOST) for x in (graph.rank, graph.number))
+        scene = scene.where(torch.arange(self.scene_sites) < self.before[s], torch.nan)
         ranks = [graph.rank, graph.same_rank]
         numbers = [graph.number.clamp(min=1), graph.same_number.clamp(min=1)]
         part = [(r + 0.5) / n for r, n in zip(ranks, numbers, strict=True)] + [1 / n for n in numbers]

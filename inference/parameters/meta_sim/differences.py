@@ -28,7 +28,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import Scenes, run_program
 
-from ..net import Graph, Seen
+from ..graph import Graph, Seen
 from ..sites import NEAR, Site, of_scenes, quantiles_of, within
 
 AT_ONCE = 256  # scenes that a program is run on

@@ -20,7 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..net import MOST, Graph, code
+from ..graph import Graph
+from ..net import MOST, code
 from ..sites import NEAR
 
 SCALE, SHIFT = 3.0, 6.0  # largest change of the scale, and of the logit

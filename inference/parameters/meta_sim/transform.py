@@ -20,7 +20,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.world import World
 
-from ..net import Graph, Seen
+from ..graph import Graph, Seen
 from ..sites import NEAR, Site, of_scenes
 from .network import GraphNetwork
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from probscene.grammar import Grammar
 
-from ..net import Graph
+from ..graph import Graph
 from ..sites import NEAR, site_name
 
 SAME, SPACED = 0.3, 0.3  # shares of the arranged scenes' sites; the rest is independent

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from probscene.grammar import Grammar
 
-from ..net import Graph
+from ..graph import Graph
 from .reader import Found
 
 FREE, SHUFFLED = -1, -2  # axes

@@ -11,7 +11,7 @@ from probscene.policy import Policy
 from probscene.sampling import Scenes, sample
 
 from ...features.base import Examples
-from ..net import Seen
+from ..graph import Seen
 from ..sites import Site, of_scenes, quantiles_of, within
 from .arrangements import Arranged
 from .training import Valued

@@ -9,8 +9,9 @@ from pyro import poutine
 from pyro.infer import SVI, Predictive, Trace_ELBO
 from pyro.optim import Adam
 
+from probscene.inference.parameters.graph import Graph, Seen
 from probscene.inference.parameters.guide import ParameterGuide
-from probscene.inference.parameters.net import Graph, Seen
+from probscene.inference.parameters.likelihood import Values, log_density
 from probscene.inference.parameters.sites import Site, find_sites, of_scenes, quantiles_of, site_name
 from probscene.sampling import run_program, sample, seed_everything
 
@@ -94,6 +95,29 @@ def test_density_and_sampling_are_one_distribution(model):
             back = guide.net.node_mixture(graph, scene, again, s).cdf(found.logit())
         inside = has & (found > 1e-5) & (found < 1 - 1e-5)
         assert inside.sum() > 30 and torch.allclose(back[inside], v[inside], atol=1e-6)
+
+
+def values_of(guide, scenes):
+    """The u that a sample of a guide has."""
+    model, u = guide.model, quantiles_of(guide.model, scenes)
+    seen = Seen.of(model.grammar, model.classes, scenes.derivation.trimmed())
+    nodes = torch.stack([seen.taken(u[site.name]) for site in guide.node_sites], -1)
+    nodes = nodes.where((seen.kind >= 0).unsqueeze(-1), torch.nan)
+    scene = torch.cat([of_scenes(u[site.name]) for site in guide.scene_sites], 1)
+    sites = len(guide.node_sites) + len(guide.scene_sites)
+    zeros = torch.zeros_like(nodes), torch.zeros_like(scene)
+    return Values(seen.kind, seen.parent, nodes, zeros[0], scene, zeros[1], torch.zeros(sites, dtype=torch.bool))
+
+
+def test_what_is_fitted_is_what_is_sampled(model):
+    """The density that maximum likelihood raises is that of the program with learnt parameters."""
+    guide = guide_of(model)
+    scenes = drawn(guide.suited(model), 200)
+    with torch.no_grad():
+        found = log_density(guide.net, values_of(guide, scenes)).sum(1)
+    prior = run_program(model, scenes.derivation, scenes.parameters).log_prob
+    away = (found - (scenes.log_prob - prior)).abs()
+    assert float(away.median()) < 1e-2 and float((away < 0.1).float().mean()) > 0.9  # u of float32 near 0 and 1
 
 
 def test_a_density_is_the_same_whatever_else_is_in_the_batch(model):

@@ -7,9 +7,10 @@ import torch
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
+from probscene.inference.parameters.graph import Graph
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, log_density, posterior_draws
-from probscene.inference.parameters.net import Graph, ParameterNet
+from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.reading import reader
 from probscene.inference.parameters.reading.eyes import RenderEye
 from probscene.inference.parameters.schedule import ParameterSchedule

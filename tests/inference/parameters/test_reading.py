@@ -15,7 +15,7 @@ from probscene.grammar import Grammar
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import STRIDE as CELL
 from probscene.inference.features.counting.batches import cells
-from probscene.inference.parameters.net import Graph, Seen
+from probscene.inference.parameters.graph import Graph, Seen
 from probscene.inference.parameters.reading.assembly import along_the_widest, assembly
 from probscene.inference.parameters.reading.reader import Found, blocks, circles, cut_draw, cut_mean
 from probscene.inference.parameters.reading.skill import CIRCLE, LINE, TWICE, Skill
