@@ -91,12 +91,12 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     monkeypatch.setattr(reader, "LEAST_MASS", 10.0)  # no object is found
     counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
-    schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=0, reader_images=2)
+    schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=0, energy_steps=0, reader_images=2)
     empty = torch.zeros(30, 3, 64, 64, dtype=torch.uint8)
     learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: empty, schedule)
     learning.run()
-    assert learning.skill is not None
-    learning.skill = learning.skill._replace(share=torch.ones_like(learning.skill.share))
+    assert learning.tried.skill is not None
+    learning.tried.skill = learning.tried.skill._replace(share=torch.ones_like(learning.tried.skill.share))
     site = next(site for site in learning.sites if site.name == "ball.away")
     assert [site.name for site in learning.learnt] == ["scene.bright", "floor.turn"]
     assert learning.why_not(site) == "it was read 0 times in the target, of 20 that it takes"

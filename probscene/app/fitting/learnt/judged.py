@@ -12,6 +12,9 @@ from torch import Tensor
 
 from probscene.inference.guides.base import Guide
 from probscene.inference.judging.farther import farther
+from probscene.inference.judging.two_sample import Features
+from probscene.inference.parameters.best import HeldOut
+from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.training import batch_seed
@@ -57,8 +60,8 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
     if isinstance(learning, MetaSimLearning):  # which reads nothing
         return Judged(distances, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
-    readings = {name: learning.readings(some) for name, some in images.items()}
-    halves = [learning.readings(held[i::2]) for i in (0, 1)]
+    readings = {name: learning.tried.readings(some) for name, some in images.items()}
+    halves = [learning.tried.readings(held[i::2]) for i in (0, 1)]
     sites = {}
     for site in learning.learnt:
         each = {name: _quantiles(found[site.name]) for name, found in readings.items()}
@@ -67,6 +70,19 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         }
         sites[site.name] = each | {"distance": away | {"floor": _distance(*(half[site.name] for half in halves))}}
     return Judged(distances, sites)
+
+
+def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
+    """What judges guides while they are trained, by the same images and features."""
+    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
+
+    embed = EfficientNetLite().embed
+
+    def look(learnt: ParameterGuide) -> Features:
+        seed_everything(batch_seed(run.record["seed"], 6, 3))
+        return embed(_renders(run, learnt.suited(run.model), guide, len(held))).double().numpy()
+
+    return HeldOut(look, embed(held).double().numpy())
 
 
 def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> Tensor:

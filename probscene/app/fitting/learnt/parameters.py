@@ -29,7 +29,7 @@ from ..observer import Observer
 from ..parts import inner
 from ..presets import META_SIM
 from ..storage import Keeper
-from .judged import judged
+from .judged import held_out, judged
 from .meta_sim import meta_sim_learning, sites_record
 
 if TYPE_CHECKING:
@@ -80,6 +80,7 @@ def learn_parameters(
                 lambda: _some(target, ~held, run.preset.parameters.images),
                 run.preset.parameters,
                 batch_seed(run.record["seed"], 5),
+                held_out(run, guide, _some(target, held, JUDGED)),
             )
         else:
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
@@ -148,8 +149,8 @@ def _record(
     method = {"method": run.preset.parameter_method}
     if isinstance(learning, MetaSimLearning):
         return method | {"sites": sites_record(learning), **judged(run, guide, learning, held).distances}
-    assert learning.skill is not None
-    shares = learning.skill.share.tolist()
+    assert learning.tried.skill is not None
+    shares = learning.tried.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
     found = judged(run, guide, learning, held)
     sites = []  # in the program's order, which is that of the network's columns

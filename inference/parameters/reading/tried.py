@@ -1,0 +1,122 @@
+"""A reader, what it can read, and what it reads in images.
+
+Axis letters: L images, M nodes, K objects, S sites of nodes, G sites of scenes.
+"""
+
+import torch
+from torch import Tensor
+
+from probscene.model import SceneModel
+
+from ..likelihood import Values
+from ..sites import Site, having
+from .assembly import Assembly
+from .reader import Found, Reader
+from .skill import Skill
+from .training import MIN_VISIBLE, Valued
+
+ENOUGH = 20  # readings of a site in the target, from which it is learnt
+NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
+
+
+class TriedReader:
+    """Args:
+        model: the scene model.
+        reader: of its classes and of these sites.
+        node_sites, scene_sites: that are not kept.
+
+    Attributes:
+        skill: of the reader, for the sites of nodes and then of scenes; None before it was tried.
+        readings_of: ``(S + G,)`` how many readings of each there are in the target.
+    """
+
+    def __init__(self, model: SceneModel, reader: Reader, node_sites: tuple[Site, ...], scene_sites: tuple[Site, ...]):
+        self.model, self.reader, self.node_sites, self.scene_sites = model, reader, node_sites, scene_sites
+        self.skill: Skill | None = None
+        self.readings_of = torch.zeros(0, dtype=torch.int64)
+
+    def on(self, valued: Valued, images: Tensor) -> None:
+        """Try it on renders of the prior, and see how often it finds each class in the target's images."""
+        found = self.reader.find(valued.drawn.image)
+        which = matched(found, valued)
+        of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
+        of_scenes = Skill.of(found.overall, valued.overall)
+        self.skill = Skill(*(torch.cat(pair) for pair in zip(of_nodes, of_scenes, strict=True)))
+        objects = self.reader.find(images).label.bincount(minlength=len(self.model.classes))
+        of_class = dict(zip(self.model.classes, objects.tolist(), strict=True))
+        number = [sum(of_class.get(kind, 0) for kind in site.kinds) for site in self.node_sites]
+        self.readings_of = torch.tensor([*number, *(len(images) for _ in self.scene_sites)], dtype=torch.int64)
+
+    @property
+    def good(self) -> Tensor:
+        """``(S + G,)`` bool, which are learnt; none before it was tried."""
+        if self.skill is None:
+            return torch.zeros(len(self.node_sites) + len(self.scene_sites), dtype=torch.bool)
+        return self.skill.readable & (self.readings_of >= ENOUGH)
+
+    @property
+    def good_sites(self) -> frozenset[Site]:
+        """Those."""
+        each = zip((*self.node_sites, *self.scene_sites), self.good.tolist(), strict=True)
+        return frozenset(site for site, good in each if good)
+
+    @property
+    def columns(self) -> tuple[Tensor, Tensor]:
+        """Their numbers, among the sites of nodes and among those of scenes."""
+        node, scene = self.good.tensor_split([len(self.node_sites)])
+        return node.nonzero().flatten(), scene.nonzero().flatten()
+
+    def why_not(self, site: Site) -> str:
+        """Why a site is not learnt; empty where it is."""
+        if site in self.good_sites:
+            return ""
+        assert self.skill is not None
+        number = [*self.node_sites, *self.scene_sites].index(site)
+        if not self.skill.readable[number]:
+            return "it cannot be read in renders"
+        return f"it was read {int(self.readings_of[number])} times in the target, of {ENOUGH} that it takes"
+
+    def readings(self, images: Tensor) -> dict[str, Tensor]:
+        """u of each learnt site as it is read in ``(L, C, H, W)`` uint8 images, of all objects that have it or of all
+        scenes."""
+        found, (nodes, scenes) = self.reader.find(images), self._skills()
+        kind = kinds_of(self.model, found.label)
+        has = having(self.model.grammar, self.node_sites, kind).unbind(1)
+        each = [u[there] for u, there in zip(nodes.read(found.raw)[0].unbind(1), has, strict=True)]
+        sites = (*self.node_sites, *self.scene_sites)
+        columns = zip(sites, [*each, *scenes.read(found.overall)[0].unbind(1)], strict=True)
+        return {site.name: u.clamp(0, 1) for site, u in columns if site in self.good_sites}
+
+    def values(self, made: Assembly, found: Found, number: int, of: Tensor | None = None) -> tuple[Values, Tensor]:
+        """Scene graphs of what was found in so many images, with the learnt sites; and what ``of (K,)`` says of each
+        object, ``(L, M)`` int64, -1 where there is none."""
+        skills, (node, scene) = self._skills(), self.columns
+        mean, sd = (part[:, node] for part in skills[0].read(found.raw))
+        scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
+        of = torch.full((len(mean),), -1) if of is None else of
+        both = torch.cat([mean, of[:, None].to(mean.dtype)], 1)
+        kind, parent, both, sd = made.values(found, number, both, sd)
+        has = having(self.model.grammar, tuple(self.node_sites[i] for i in node.tolist()), kind)
+        turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
+        mean, sd = (part.where(has, torch.nan) for part in (both[..., :-1], sd))
+        return Values(kind, parent, mean, sd, scene_mean, scene_sd, turns), both[..., -1].nan_to_num(-1).long()
+
+    def _skills(self) -> tuple[Skill, Skill]:
+        """Of the sites of nodes, and of scenes."""
+        assert self.skill is not None
+        S = len(self.node_sites)
+        return Skill(*(part[:S] for part in self.skill)), Skill(*(part[S:] for part in self.skill))
+
+
+def kinds_of(model: SceneModel, label: Tensor) -> Tensor:
+    """The grammar's kind of each class ``(...)``; -1 for none."""
+    return torch.tensor([*(model.grammar.kind(name) for name in model.classes), -1])[label]
+
+
+def matched(found: Found, valued: Valued) -> Tensor:
+    """``(K,)`` the node nearest to each object that was found; -1 where none is near."""
+    drawn = valued.drawn
+    there = (drawn.label >= 0) & (drawn.visible >= MIN_VISIBLE)
+    away = (drawn.centre[found.image] - found.centre[:, None]).norm(dim=-1).masked_fill(~there[found.image], torch.inf)
+    least, which = away.min(1)
+    return torch.where(least < NEAR_ENOUGH, which, -1)

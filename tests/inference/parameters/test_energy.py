@@ -1,0 +1,150 @@
+"""Refinement by an energy distance of readings."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from probscene.inference.parameters.energy import EnergyDistance, OwnReadings, energy_distance, moving
+from probscene.inference.parameters.graph import Graph
+from probscene.inference.parameters.likelihood import Values
+from probscene.inference.parameters.net import ParameterNet
+from probscene.sampling import seed_everything
+
+SITES = 2
+
+
+def values_of(nodes, scene, turns=(False,) * (SITES + 1)):
+    """Readings of chains of siblings, of one kind."""
+    number, most = nodes.shape[:2]
+    kind, parent = torch.zeros(number, most, dtype=torch.int64), torch.full((number, most), -1)
+    return Values(
+        kind, parent, nodes, torch.full_like(nodes, 0.05), scene, torch.full_like(scene, 0.05), torch.tensor(turns)
+    )
+
+
+def random_net(seed=0, spread=0.4):
+    torch.manual_seed(seed)
+    net = ParameterNet(1, SITES, 1, hidden=12, before=(1, 1))
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=spread)
+    return net.double()
+
+
+def drawn(net, number, nodes=3, quantiles=None):
+    """u of a guide's scenes, with gradients where they are on."""
+    kind, parent = torch.zeros(number, nodes, dtype=torch.int64), torch.full((number, nodes), -1)
+    graph = Graph.of(kind, parent)
+    v = torch.rand(number, nodes * SITES + 1).double() if quantiles is None else quantiles
+    scene = net.scene_mixture(graph, torch.full((number, 1), torch.nan).double(), 0).icdf(v[:, :1])
+    values = torch.full((number, nodes, SITES), torch.nan).double()
+    for s in range(SITES):
+        part = v[:, 1 + s * nodes : 1 + (s + 1) * nodes]
+        found = net.sample(graph, scene, values, s, part, kind >= 0)
+        values = torch.cat([values[..., :s], found.unsqueeze(-1), values[..., s + 1 :]], -1)
+    return graph, scene, values
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 2**31))
+def test_what_is_retraced_has_the_sampler_s_gradient(seed):
+    net, weight = random_net(), None
+    seed_everything(seed)
+    v = torch.rand(20, 3 * SITES + 1).double()
+    graph, scene, values = drawn(net, 20, quantiles=v)
+    again_scene, again = net.retraced(graph, scene.detach(), values.detach())
+    assert torch.allclose(again, values) and torch.allclose(again_scene, scene)
+    weight = torch.randn(values.shape).double(), torch.randn(scene.shape).double()
+    gradients = []
+    for nodes, of_scene in ((values, scene), (again, again_scene)):
+        net.zero_grad()
+        ((weight[0] * nodes).sum() + (weight[1] * of_scene).sum()).backward()
+        gradients.append(torch.cat([p.grad.flatten() for p in net.parameters() if p.grad is not None]))
+    assert torch.allclose(*gradients, rtol=1e-6, atol=1e-9)
+
+
+def test_the_gradient_is_that_of_finite_differences():
+    """Of the energy distance of samples at given quantiles, along a random direction of the weights."""
+    net = random_net()
+    seed_everything(1)
+    v = torch.rand(30, 3 * SITES + 1).double()
+    target = values_of(torch.rand(60, 3, SITES).double(), torch.rand(60, 1).double())
+
+    def found(step):
+        with torch.no_grad():
+            for parameter, way in zip(net.parameters(), direction, strict=True):
+                parameter += step * way
+        _, scene, values = drawn(net, 30, quantiles=v)
+        with torch.no_grad():
+            for parameter, way in zip(net.parameters(), direction, strict=True):
+                parameter -= step * way
+        return scene.detach(), values.detach()
+
+    direction = [torch.randn_like(parameter) for parameter in net.parameters()]
+    away = 1e-5
+    low, high = (energy_distance(values_of(nodes, scene), target) for scene, nodes in (found(-away), found(away)))
+    scene, nodes = found(0.0)
+    read = values_of(nodes, scene)
+    own = OwnReadings(read.kind, read.parent, nodes, scene, read, torch.arange(3).expand(30, 3))
+    energy_distance(moving(net, own), target).backward()
+    slope = sum(
+        float((p.grad * way).sum()) for p, way in zip(net.parameters(), direction, strict=True) if p.grad is not None
+    )
+    assert slope == pytest.approx(float(high - low) / (2 * away), rel=1e-3)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**31), st.floats(0.15, 0.3))
+def test_the_distance_is_zero_for_one_distribution_and_no_other(seed, away):
+    torch.manual_seed(seed)
+    one, other = (values_of(0.3 + 0.2 * torch.rand(150, 2, SITES), 0.3 + 0.2 * torch.rand(150, 1)) for _ in range(2))
+    shifted = one._replace(nodes=one.nodes + away)
+    same, apart = (float(energy_distance(each, other)) for each in (one, shifted))
+    assert abs(same) < 0.012 < apart
+
+
+def test_a_circle_has_no_ends():
+    torch.manual_seed(0)
+    ends = values_of((0.1 * torch.rand(100, 1, SITES) - 0.05).remainder(1.0), torch.rand(100, 1))
+    middle = values_of(0.1 * torch.rand(100, 1, SITES) + 0.01, ends.scene)
+    turns = torch.ones(SITES + 1, dtype=torch.bool)
+    line = float(energy_distance(middle, ends))
+    assert float(energy_distance(middle._replace(turns=turns), ends._replace(turns=turns))) < 0.3 * line
+
+
+def test_objects_that_were_not_drawn_do_not_move():
+    net = random_net()
+    graph, scene, nodes = (x if isinstance(x, Graph) else x.detach() for x in drawn(net, 10))
+    read = values_of(nodes, scene)
+    which = torch.tensor([0, -1, 2]).expand(10, 3)
+    found = moving(net, OwnReadings(graph.kind, graph.parent, nodes, scene, read, which))
+    moves = torch.autograd.grad(
+        found.nodes[:, 1].sum() + 0 * found.nodes.sum(), list(net.parameters()), allow_unused=True
+    )
+    assert all(gradient is None or not gradient.any() for gradient in moves)
+    assert torch.equal(found.nodes, nodes)
+
+
+def test_errors_of_the_reader_are_taken_out():
+    """A reader that halves every distance from the middle, and says that it is sure: likelihood believes it."""
+    torch.manual_seed(0)
+    net = ParameterNet(1, SITES, 1, hidden=12, before=(1, 1))
+    drawn_values = 0.2 + 0.1 * torch.rand(300, 3, SITES)
+
+    def read(u):
+        return 0.5 + 0.5 * (u - 0.5)
+
+    def own(number):
+        with torch.no_grad():
+            graph, scene, nodes = drawn(net.double(), number)
+        net.float()
+        nodes, scene = nodes.float(), scene.float()
+        values = values_of(read(nodes), scene)
+        return OwnReadings(graph.kind, graph.parent, nodes, scene, values, torch.arange(3).expand(number, 3))
+
+    target = values_of(read(drawn_values), torch.rand(300, 1))
+    training = EnergyDistance(net, target, own, steps=150, scenes=60, learning_rate=2e-2)
+    training.run()
+    _, _, nodes = drawn(net.double(), 500)
+    assert float(drawn_values.mean()) == pytest.approx(0.25, abs=0.01)
+    assert float(nodes.detach().mean()) == pytest.approx(0.25, abs=0.06)  # what is read has a mean of .375
