@@ -45,3 +45,27 @@ class Best:
                 return
             guide.net.load_state_dict(now)
         self.weights, self.looks = now, looks
+
+
+def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:
+    """Names of the sites whose learnt values do not surely bring renders nearer to the images, each tried alone.
+
+    Those that do are tried together as well; where that is no nearer than the prior, all are named but the best one.
+    """
+    names = frozenset(site.name for site in guide.sites)
+
+    def look(useful: frozenset[str]) -> Features:
+        guide.passed = names - useful
+        return held.look(guide)
+
+    prior, away = look(frozenset()), {}
+    for name in sorted(names):
+        apart = farther(prior, look(frozenset((name,))), held.real)
+        if apart.sure:
+            away[name] = apart.other
+    if len(away) > 1:
+        apart = farther(look(frozenset(away)), prior, held.real)
+        if apart.one >= apart.other:
+            away = {min(away, key=away.__getitem__): 0.0}
+    guide.passed = frozenset()
+    return names - frozenset(away)

@@ -38,10 +38,14 @@ class ParameterGuide(nn.Module):
         sites: those that are learnt, in the order of the program.
         structure: the policy of the structures; the model's prior where None.
         hidden: units of the network.
+
+    Attributes:
+        passed: names of sites that draw from their prior all the same; the others' distributions depend on them.
     """
 
     def __init__(self, model: SceneModel, sites: tuple[Site, ...], structure: Policy | None = None, hidden: int = 64):
         super().__init__()
+        self.passed: frozenset[str] = frozenset()
         self.model, self.sites = model, sites
         self.structure = model.prior if structure is None else structure
         self.node_sites = tuple(site for site in sites if not site.of_scene)
@@ -97,19 +101,31 @@ class Learnt(Messenger):
         self.values = torch.full((N, M, len(self.guide.node_sites)), torch.nan)
 
     def _pyro_sample(self, msg: Any) -> None:
-        if self.seen is None:
+        if self._own(msg) in self.guide.passed:
             return
-        own = site_name(self.guide.model.grammar, msg["name"])
-        for sites, made in ((self.guide.scene_sites, OfScenes), (self.guide.node_sites, OfNodes)):
-            names = [site.name for site in sites]
-            if own in names:
-                mask = True if msg["mask"] is None else msg["mask"]
-                has = torch.as_tensor(mask).expand(msg["fn"].batch_shape)
-                msg["fn"] = made(msg["fn"], self, names.index(own), has)
+        learnt = self._learnt(msg)
+        if learnt is not None:
+            msg["fn"] = learnt
 
     def _pyro_post_sample(self, msg: Any) -> None:
-        if isinstance(msg["fn"], _OfSites):
-            msg["fn"].keep(msg["value"])
+        learnt = msg["fn"] if isinstance(msg["fn"], _OfSites) else self._learnt(msg)
+        if learnt is not None:
+            learnt.keep(msg["value"])
+
+    def _learnt(self, msg: Any) -> "_OfSites | None":
+        """The distribution that the guide has for a site; None where it is not of the guide."""
+        if self.seen is None:
+            return None
+        for sites, made in ((self.guide.scene_sites, OfScenes), (self.guide.node_sites, OfNodes)):
+            names = [site.name for site in sites]
+            if self._own(msg) in names:
+                mask = True if msg["mask"] is None else msg["mask"]
+                has = torch.as_tensor(mask).expand(msg["fn"].batch_shape)
+                return made(msg["fn"], self, names.index(self._own(msg)), has)
+        return None
+
+    def _own(self, msg: Any) -> str:
+        return site_name(self.guide.model.grammar, msg["name"])
 
 
 class _OfSites(TorchDistribution):

@@ -3,6 +3,7 @@
 Axis letters: L images, C H W.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,9 +12,9 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from probscene.inference.guides.base import Guide
-from probscene.inference.judging.farther import farther
+from probscene.inference.judging.farther import Farther, farther
 from probscene.inference.judging.two_sample import Features
-from probscene.inference.parameters.best import HeldOut
+from probscene.inference.parameters.best import HeldOut, useless
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
@@ -34,7 +35,8 @@ class Judged(NamedTuple):
 
     Attributes:
         distances: ``kept``, ``"learnt"`` where its renders are nearer to the images than those with the prior's
-            parameters, else ``"prior"``; and both energy distances.
+            parameters, else ``"prior"``; and both energy distances. Where not all of what was learnt brings them
+            nearer, sites that do so alone are kept, and the guide passes the others.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -45,16 +47,24 @@ class Judged(NamedTuple):
 
 def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSimLearning, held: Tensor) -> Judged:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features."""
-    if learning.guide is None:
+    learnt = learning.guide
+    if learnt is None:
         return Judged({"kept": "prior"}, {})
-    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
+    look, images = _embed(), {"target": held}
+    real = look(held)
 
-    look, images = EfficientNetLite().embed, {"target": held}
-    for i, (name, model) in enumerate({"learnt": learning.guide.suited(run.model), "prior": run.model}.items()):
-        seed_everything(batch_seed(run.record["seed"], 6, i))
-        images[name] = _renders(run, model, guide, len(held))
-    seen = {name: look(some).double().numpy() for name, some in images.items()}
-    apart = farther(seen["learnt"], seen["prior"], seen["target"])
+    def compared() -> Farther:
+        for i, (name, model) in enumerate({"learnt": learnt.suited(run.model), "prior": run.model}.items()):
+            seed_everything(batch_seed(run.record["seed"], 6, i))
+            images[name] = _renders(run, model, guide, len(held))
+        return farther(look(images["learnt"]), look(images["prior"]), real)
+
+    apart = compared()
+    if apart.one >= apart.other and isinstance(learnt, ParameterGuide):
+        passed = useless(learnt, held_out(run, guide, held))
+        if len(passed) < len(learnt.sites):
+            learnt.passed = passed
+            apart = compared()
     kept = "learnt" if apart.one < apart.other else "prior"
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if isinstance(learning, MetaSimLearning):  # which reads nothing
@@ -74,15 +84,20 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
 
 def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
     """What judges guides while they are trained, by the same images and features."""
-    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
-
-    embed = EfficientNetLite().embed
+    embed = _embed()
 
     def look(learnt: ParameterGuide) -> Features:
         seed_everything(batch_seed(run.record["seed"], 6, 3))
-        return embed(_renders(run, learnt.suited(run.model), guide, len(held))).double().numpy()
+        return embed(_renders(run, learnt.suited(run.model), guide, len(held)))
 
-    return HeldOut(look, embed(held).double().numpy())
+    return HeldOut(look, embed(held))
+
+
+def _embed() -> Callable[[Tensor], Features]:
+    from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
+
+    embed = EfficientNetLite().embed
+    return lambda images: embed(images).double().numpy()
 
 
 def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> Tensor:

@@ -126,11 +126,13 @@ def learnt_by(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> P
         tensors: see ``beside``.
     """
     record, schedule = run.parameters, run.preset.meta_sim
-    sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in record["sites"] if site["learnt"])
+    fitted = [site for site in record["sites"] if site.get("fitted", site["learnt"])]
+    sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in fitted)
     if record.get("method") == META_SIM:
         guide = ParameterTransform(run.model, sites, policy, schedule.hidden, schedule.rounds)
     else:
         guide = ParameterGuide(run.model, sites, policy)
+        guide.passed = frozenset(site["name"] for site in fitted if not site["learnt"])
     guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
     return guide.eval()
 
@@ -153,11 +155,13 @@ def _record(
     shares = learning.tried.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
     found = judged(run, guide, learning, held)
+    passed = frozenset() if learning.guide is None else learning.guide.passed
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
-        share, is_learnt = skill.get(site, torch.nan), site in learning.learnt
-        known, because = share if share == share else None, learning.why_not(site)
-        about = {"name": site.name, "kinds": site.kinds, "learnt": is_learnt, "skill": known, "because": because}
+        share, fitted = skill.get(site, torch.nan), site in learning.learnt
+        because = "scenes come no nearer to held-out images by it" if site.name in passed else learning.why_not(site)
+        about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}
+        about |= {"fitted": fitted, "skill": share if share == share else None, "because": because}
         sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
     return method | {"sites": sites, **found.distances}
 
