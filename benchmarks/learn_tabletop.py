@@ -2,10 +2,11 @@
 
     python benchmarks/learn_tabletop.py --out FOLDER [--seeds 0 1 2] [--images 2000] [--preset quick]
 
-The model is that of ``docs/writing_models.md``: mugs stand anywhere around the middle of their plate. In the target,
-which numpy and OpenCV draw, they stand to the right of it. No line of the model says so. Printed are Wasserstein-1
-distances, pixels, of ``mug.dx`` and ``mug.dy`` from the truth, for the prior, what was learnt, and a second sample of
-the truth as large, which is the floor; each with the interval that holds 95 % of bootstraps over scenes.
+The model is that of ``examples/parameter_guide.py``: mugs stand anywhere around the middle of their plate. In the
+target, which numpy and OpenCV draw, they stand to the right of it. No line of the model says so. Printed are
+Wasserstein-1 distances, pixels, of ``mug.dx`` and ``mug.dy`` from the truth, for the prior, the start, what was learnt,
+and a second sample of the truth as large, which is the floor; each with the interval that holds 95 % of bootstraps over
+scenes.
 """
 
 import argparse
@@ -14,37 +15,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pyro
-import pyro.distributions as dist
 from scipy.stats import wasserstein_distance
 
 import probscene as ps
 from probscene.app.files import write_json
+from probscene.app.loading import load_model
 
-GRAMMAR = ps.Grammar("""
-    Scene  -> table(Plates)
-    Plates -> plate(Mugs) Plates | ε
-    Mugs   -> mug Mugs | ε
-""")
-PRIOR = ps.StructurePrior(GRAMMAR, Plates=ps.counts(0, 1, 1, 1), Mugs=ps.counts(1, 1, 1))
+MODEL = Path(__file__).parents[1] / "examples" / "parameter_guide.py"
 SIDE, SCENES, RESAMPLES = 256, 1000, 200
-
-
-@ps.scene_model(GRAMMAR, PRIOR, canvas=(SIDE, SIDE), max_steps=60, classes=("plate", "mug"))
-def tabletop(scene):
-    """As a user would write it."""
-    with scene.nodes("plate"):
-        gap = pyro.sample("plate.gap", dist.Uniform(0.2, 0.8))
-        y = pyro.sample("plate.y", dist.Uniform(50.0, 206.0))
-    with scene.nodes("mug"):
-        dx = pyro.sample("mug.dx", dist.Normal(0.0, 12.0))
-        dy = pyro.sample("mug.dy", dist.Normal(0.0, 12.0))
-    x = SIDE * (scene.rank("plate") + gap) / scene.count("plate").clamp(min=1)
-    return scene.draw(
-        ps.Sprites.disc("plate", x, y, radius=30.0),
-        ps.Sprites.disc("mug", scene.of_parent(x) + dx, scene.of_parent(y) + dy, radius=9.0, tint=(0.8, 0.3, 0.2)),
-        background=(0.4, 0.3, 0.2),
-    )
 
 
 def draw_target(images: int, folder: Path, seed: int) -> None:
@@ -74,7 +52,7 @@ def _fixed(place) -> tuple[int, int]:
     return int(x), int(y)
 
 
-def drawn(policy, seed: int) -> list[np.ndarray]:
+def drawn(tabletop: ps.SceneModel, policy: ps.Policy, seed: int) -> list[np.ndarray]:
     """dx and dy of each scene's mugs, ``(mugs, 2)`` each."""
     ps.seed_everything(seed)
     scenes = ps.sample(tabletop, policy, SCENES)
@@ -107,11 +85,12 @@ def main():
     if not target.is_dir():
         draw_target(args.images, target, 0)
     true = truth(rng, 20_000)
+    tabletop = load_model(str(MODEL))
     for seed in args.seeds:
-        run = ps.fit(
-            tabletop, target, preset=args.preset, seed=seed, out=args.out / f"run-{seed}", features="count", threads=1
-        )
-        sources = {"prior": drawn(tabletop.prior, seed), "learnt": drawn(run.guide, seed)}
+        how = {"preset": args.preset, "seed": seed, "features": "count", "threads": 1}
+        run = ps.fit(str(MODEL), target, out=args.out / f"run-{seed}", **how)
+        policies = {"prior": tabletop.prior, "start": tabletop.pretraining_policy, "learnt": run.guide}
+        sources = {name: drawn(tabletop, policy, seed) for name, policy in policies.items()}
         sources["floor"] = [truth(rng, len(some)) for some in sources["learnt"]]
         rows.append({"seed": seed} | {name: distances(scenes, true) for name, scenes in sources.items()})
         print(json.dumps(rows[-1]), flush=True)
