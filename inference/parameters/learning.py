@@ -114,6 +114,10 @@ class ParameterLearning:
             if self.phase and not self.learnt:  # nothing can be read
                 self.phase, self.done = len(self.lengths), self.total
                 return
+            if self.phases[self.phase] == ENERGY and not self.tried.noisy.any():
+                self.phase += 1
+                self.done = sum(self.lengths[: self.phase])
+                continue
             if self.inner is None:
                 self.inner = self._begun()
             before = sum(self.lengths[: self.phase])
@@ -181,7 +185,9 @@ class ParameterLearning:
         values, made = self._read()
         if what == ENERGY:
             scenes, rate = schedule.energy_scenes, schedule.energy_rate
-            return EnergyDistance(guide.net, values, partial(self._own, made), steps, scenes, rate, seed)
+            return EnergyDistance(
+                guide.net, values, partial(self._own, made), self.tried.noisy, steps, scenes, rate, seed
+            )
         rate = schedule.rate if first else 0.6 * schedule.rate
         return MaximumLikelihood(guide.net, values, steps, learning_rate=rate, seed=seed)
 

@@ -16,6 +16,7 @@ from .skill import Skill
 from .training import MIN_VISIBLE, Valued
 
 ENOUGH = 20  # readings of a site in the target, from which it is learnt
+SHARP = 0.9  # share of a site's variance from which on it is read sharply
 NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
 
 
@@ -65,6 +66,12 @@ class TriedReader:
         """Their numbers, among the sites of nodes and among those of scenes."""
         node, scene = self.good.tensor_split([len(self.node_sites)])
         return node.nonzero().flatten(), scene.nonzero().flatten()
+
+    @property
+    def noisy(self) -> Tensor:
+        """Of the sites that are learnt, in the order of ``columns``, which are read with an error of some size."""
+        assert self.skill is not None
+        return self.skill.share[self.good] < SHARP
 
     def why_not(self, site: Site) -> str:
         """Why a site is not learnt; empty where it is."""

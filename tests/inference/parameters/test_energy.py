@@ -143,7 +143,8 @@ def test_errors_of_the_reader_are_taken_out():
         return OwnReadings(graph.kind, graph.parent, nodes, scene, values, torch.arange(3).expand(number, 3))
 
     target = values_of(read(drawn_values), torch.rand(300, 1))
-    training = EnergyDistance(net, target, own, steps=150, scenes=60, learning_rate=2e-2)
+    noisy = torch.tensor([True, True, False])
+    training = EnergyDistance(net, target, own, noisy, steps=200, scenes=60, learning_rate=3e-2)
     training.run()
     _, _, nodes = drawn(net.double(), 500)
     assert float(drawn_values.mean()) == pytest.approx(0.25, abs=0.01)
