@@ -31,6 +31,8 @@ SHORT = {
     "parameters.rounds": 1,
     "parameters.round_reader_steps": 2,
     "parameters.round_steps": 2,
+    "parameters.energy_steps": 2,
+    "parameters.energy_scenes": 6,
 }
 SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache", "--no-verdict"]
 SETTINGS += [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]

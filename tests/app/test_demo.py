@@ -18,7 +18,8 @@ from probscene.errors import DataError, ModelError
 SHORT = override(
     QUICK, ["count.steps=16", "count.images=4", "count.crops=4", "width=4,8,8", "batches=2", "num_scenes=20",
             "pretrain_derivations=50", "pretrain_epochs=1", "parameters.reader_steps=4", "parameters.rounds=1",
-            "parameters.steps=2", "parameters.round_reader_steps=2", "parameters.round_steps=2"]
+            "parameters.steps=2", "parameters.round_reader_steps=2", "parameters.round_steps=2",
+            "parameters.energy_steps=2", "parameters.energy_scenes=6"]
 )  # fmt: skip
 
 

@@ -49,6 +49,7 @@ def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
     settings = {"count.steps": 150, "count.images": 8, "width": "8,16,32", "batches": 4, "num_scenes": 60}
     settings |= {"pretrain_derivations": 300, "parameters.reader_steps": 150, "parameters.steps": 150}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 40, "parameters.round_steps": 60}
+    settings |= {"parameters.energy_steps": 5, "parameters.energy_scenes": 40}
     learn = {"learn": "structure,parameters", "features": "count", "threads": 1, "cache": False, "progress": False}
     run = fit(model, tmp_path / "target" / "images", "quick", settings=settings, out=tmp_path / "run", **learn)
     record = run.parameters

@@ -175,6 +175,7 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     settings = {"count.steps": 150, "count.images": 8, "width": "8,16,32", "batches": 4, "num_scenes": 60}
     settings |= {"pretrain_derivations": 300, "parameters.reader_steps": 250, "parameters.steps": 250}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 60, "parameters.round_steps": 100}
+    settings |= {"parameters.energy_steps": 5, "parameters.energy_scenes": 40}
     learn = {"learn": "structure,parameters", "features": "count", "threads": 1, "cache": False, "progress": False}
     run = fit(dots(False), tmp_path / "target" / "images", "quick", settings=settings, out=tmp_path / "run", **learn)
     record = run.parameters
