@@ -4,7 +4,8 @@
 
 Each seed's target is drawn by the driving models themselves with another, random distribution of structures
 (``SceneModel.target``); fits see its images. Printed for each seed is the total variation of the number of cars in a
-scene, 20,000 structures of the prior and of the learnt guide against 20,000 of the target's, and how long the fit took.
+scene, 20,000 structures of the prior, the start and the learnt guide against 20,000 of the target's, and how long the
+fit took.
 """
 
 import argparse
@@ -16,6 +17,7 @@ import numpy as np
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
+from probscene.app.evaluation.sources import LEARNT, before
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import preset
@@ -58,7 +60,7 @@ def main():
         run = fit(args.model, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
         truth = counted(model, target.prior)
         row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
-        for name, policy in (("prior", model.prior), ("learnt", run.guide)):
+        for name, policy in {**before(model), LEARNT: run.guide}.items():
             found = counted(model, policy)
             each = {
                 c: round(total_variation(histogram(found[:, i]), histogram(truth[:, i])), 4)
@@ -69,7 +71,7 @@ def main():
         rows.append(row)
         print(json.dumps(row), flush=True)
         write_json(args.out / "results.json", rows)
-    for name in ("prior", "learnt"):
+    for name in (*before(model), LEARNT):
         cars = [row[name]["total_variation"]["car"] for row in rows]
         print(f"{name:8} cars, total variation: mean {np.mean(cars):.3f}, {min(cars):.3f} to {max(cars):.3f}")
 

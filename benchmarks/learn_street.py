@@ -5,7 +5,7 @@
 Fits see the images alone. ``LABELS`` is KITTI's ``label_2``, or a CSV of counts, of the same images. Cars of scenes are
 counted as the labels count them, of 2,000 rendered scenes (``probscene evaluate``). Printed for each seed: total
 variation and Wasserstein-1 of the number of cars from the labels', FID and KID in EfficientNet's features, each for the
-prior and for what was learnt; FOLDER holds the runs, ``results.json`` and a histogram, ``cars.png``.
+prior, the start and what was learnt; FOLDER holds the runs, ``results.json`` and a histogram, ``cars.png``.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import numpy as np
 from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import Evaluation, evaluate
 from probscene.app.evaluation.labels import read_labels
+from probscene.app.evaluation.sources import FITTED
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import preset
@@ -38,10 +39,10 @@ def cars(found: Evaluation) -> dict[str, np.ndarray]:
 
 
 def row(found: Evaluation) -> dict:
-    """How far prior and learnt are from the labels and from the images."""
+    """How far prior, start and learnt are from the labels and from the images."""
     each = cars(found)
     out = {"truth": {"mean": round(float(np.dot(np.arange(len(each["truth"])), each["truth"])), 2)}}
-    for name in ("prior", "learnt"):
+    for name in (name for name in each if name in FITTED):
         out[name] = {
             "mean": round(float(np.dot(np.arange(len(each[name])), each[name])), 2),
             "total_variation": round(float(total_variation(each[name], each["truth"])), 3),
@@ -57,7 +58,8 @@ def picture(histograms: list[dict[str, np.ndarray]], path: Path) -> None:
     most = max(len(each) for found in histograms for each in found.values())
     figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
     axes.bar(range(len(histograms[0]["truth"])), histograms[0]["truth"], color="0.85", width=0.9, label="labels")
-    axes.plot(histograms[0]["prior"], "o--", color="tab:orange", label="prior")
+    for name, colour in (("prior", "tab:orange"), ("start", "tab:purple")):
+        axes.plot(histograms[0][name], "o--", color=colour, label=name)
     for i, found in enumerate(histograms):
         axes.plot(found["learnt"], "o-", color="tab:blue", alpha=0.6, label="learnt" if i == 0 else None)
     axes.set(xlabel="cars in an image", ylabel="share of images", xlim=(-0.6, most - 0.4))

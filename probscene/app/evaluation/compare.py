@@ -23,11 +23,11 @@ from ..fitting.run import RunFolder
 from .evaluate import Evaluation, network_counts
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
-from .sources import Source
+from .sources import PRIOR, START, Source, before
 from .structure_counts import GROUPS, PARENTS, label
 from .visible import Visible, counted, number_of, seen_by, whole_note
 
-PRIOR, TRUTH, ESTIMATE = "prior", "truth", "estimate"
+TRUTH, ESTIMATE = "truth", "estimate"
 SAME = ("model", "model_sha256", "assets")  # what runs of one model agree in
 
 
@@ -51,7 +51,8 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Comparison(Evaluation):
-    """An evaluation of several runs: ``sources`` are ``prior``, each run's, then ``truth`` or ``estimate``.
+    """An evaluation of several runs: ``sources`` are ``prior``, ``start`` where it is another policy, each run's, then
+    ``truth`` or ``estimate``.
 
     Attributes:
         runs: by name.
@@ -65,9 +66,9 @@ class Comparison(Evaluation):
         return next((name for name in (TRUTH, ESTIMATE) if name in self.sources), None)
 
     def distances(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """From prior and runs to the reference."""
-        b = self.reference
-        return {} if b is None else {b: {a: self.distance(a, b) for a in (PRIOR, *self.runs)}}
+        """From prior, start and runs to the reference."""
+        b, others = self.reference, (*before(self.run.model), *self.runs)
+        return {} if b is None else {b: {a: self.distance(a, b) for a in others}}
 
     def record(self) -> dict[str, Any]:
         """Everything, for JSON."""
@@ -134,10 +135,10 @@ def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
     for each in given:
         run = each if isinstance(each, RunFolder) else RunFolder.at(Path(each))
         path, name = run.path, run.path.resolve().name
-        if name in runs or name in (PRIOR, TRUTH, ESTIMATE):
+        if name in runs or name in (PRIOR, START, TRUTH, ESTIMATE):
             raise RunError(
-                f"Expected runs in folders of different names, none of them {PRIOR}, {TRUTH} or {ESTIMATE}, actual "
-                f"another {name!r} at {path}; rename the folder, or save the run under another name."
+                f"Expected runs in folders of different names, none of them {PRIOR}, {START}, {TRUTH} or {ESTIMATE}, "
+                f"actual another {name!r} at {path}; rename the folder, or save the run under another name."
             )
         first = next(iter(runs.values()), run)
         if differs := next((key for key in SAME if run.record[key] != first.record[key]), None):
@@ -183,17 +184,18 @@ def compare(
             f"{other.target}; say with --target which to compare with."
         )
     model, done = first.model, 0
+    policies = before(model) | {name: run.guide for name, run in runs.items()}
     seen, notes = seen_by(model, first, truth, visible)
     columns = list(range(len(model.classes))) if truth is None else truth.columns(model)
 
     def each(scenes):
         nonlocal done
         done += scenes
-        progress("counting", done, (1 + len(runs)) * number_of(seen, num), "")
+        progress("counting", done, len(policies) * number_of(seen, num), "")
 
     sources: dict[str, Source] = {}
     likelihoods: dict[str, Likelihood] = {}
-    for name, policy in {PRIOR: model.prior, **{name: run.guide for name, run in runs.items()}}.items():
+    for name, policy in policies.items():
         found = counted(model, policy, num, seed, seen, each)
         sources[name] = Source.of(found.counts, found.children).only(columns)
         if truth is not None and truth.derivation is not None:

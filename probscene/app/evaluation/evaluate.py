@@ -1,8 +1,9 @@
 """``probscene evaluate``: which structures are learnt, beside the prior's, the truth's and what the network sees.
 
-Sources of counts: ``prior`` and ``learnt`` are sampled structures; ``truth`` is a file of labels of the target's
-images; ``estimate`` is what the run's feature network counts in them, rounded. The last is no truth: the network learnt
-on prior renders alone and errs where objects crowd, but it is there without a single label.
+Sources of counts: ``prior``, ``start`` where fits set out from another policy, and ``learnt`` are sampled structures;
+``truth`` is a file of labels of the target's images; ``estimate`` is what the run's feature network counts in them,
+rounded. The last is no truth: the network learnt on prior renders alone and errs where objects crowd, but it is there
+without a single label.
 
 Where kinds nest (cars on roads), children are counted by node and by the node's rank: which no context-free prior can
 weigh, and totals hide.
@@ -32,7 +33,7 @@ from .estimate import estimated
 from .image_distances import IMAGES, Distances, image_distances
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
-from .sources import Source
+from .sources import FITTED, LEARNT, Source, before
 from .structure_counts import Relation
 from .visible import Visible, counted, number_of, seen_by, whole_note
 
@@ -45,8 +46,8 @@ class Evaluation:
         run: the run.
         target: path of the target's images.
         classes: the C names; only those that are labelled, where there are labels.
-        sources: ``prior``, ``learnt``, then ``truth`` and ``estimate`` where they are known.
-        likelihoods: of the truth's structures under ``prior`` and ``learnt``, where they are known.
+        sources: ``FITTED``, then ``truth`` and ``estimate``, where they are known.
+        likelihoods: of the truth's structures under each of ``FITTED``, where they are known.
         images: FID and KID by the features' name; see ``image_distances``.
         notes: of the labels.
         piled: the lists that are too short for what was learnt.
@@ -126,9 +127,9 @@ class Evaluation:
         }
 
     def distances(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """From prior and learnt to the truth and to the estimate, where there are such."""
+        """From prior, start and learnt to the truth and to the estimate, where there are such."""
         known = [name for name in ("truth", "estimate") if name in self.sources]
-        return {b: {a: self.distance(a, b) for a in ("prior", "learnt")} for b in known}
+        return {b: {a: self.distance(a, b) for a in FITTED if a in self.sources} for b in known}
 
     def record(self) -> dict[str, Any]:
         """Everything, for JSON."""
@@ -191,8 +192,7 @@ def evaluate(
         num: structures a source; see ``visible.SHOWN`` where they are rendered for it.
         features: networks to compare images by, see ``seen.network``; none, as it renders.
         images: how many are compared at most, where they are.
-        visible: least visible shares of what is counted in rendered scenes, see ``visible.Visible``; those of the run,
-            where it has some and this is None.
+        visible: least visible shares of what is counted in rendered scenes; those of the run where this is None.
 
     Raises:
         ProbsceneError: a number that is not positive; see ``image_distances`` and ``seen_by``.
@@ -202,14 +202,14 @@ def evaluate(
         raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
     if features and target is None:
         raise ProbsceneError("Expected the target's images to compare features with, actual none.")
-    policies = {"prior": run.model.prior, "learnt": run.guide}
+    policies = {**before(run.model), LEARNT: run.guide}
     seen, notes = seen_by(run.model, run, truth, visible)
     done = 0
 
     def each(scenes):
         nonlocal done
         done += scenes
-        progress("counting", done, 2 * number_of(seen, num), "")
+        progress("counting", done, len(policies) * number_of(seen, num), "")
 
     columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
     compared = {}

@@ -15,10 +15,11 @@ from probscene.errors import DataError, ProbsceneError
 
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, features_of, network
+from .sources import LEARNT, before
 
 IMAGES = 1000
 Distances = dict[str, tuple[Any, ...]]
-"""By ``prior``, ``learnt`` and ``floor``: the ``Figure`` of FID and that of KID."""
+"""By ``prior``, ``start`` where it is another policy, ``learnt`` and ``floor``: the ``Figure`` of FID and of KID."""
 
 
 def image_distances(
@@ -50,7 +51,8 @@ def image_distances(
     nets = [network(choice, run) for choice in choices]
     m = min(num, len(target) // 2)
     order = torch.randperm(len(target), generator=torch.Generator().manual_seed(seed))
-    done, total = 0, len(nets) * (len(target) + 2 * m)
+    policies = {**before(run.model), LEARNT: run.guide}
+    done, total = 0, len(nets) * (len(target) + len(policies) * m)
 
     def each(images):
         nonlocal done
@@ -60,10 +62,9 @@ def image_distances(
     found = {}
     for name, net in nets:
         real = features_in(run, target, net, each)[order]
-        sides = {
-            source: features_of(run, policy, m, net, seed, each)
-            for source, policy in (("prior", run.model.prior), ("learnt", run.guide))
-        } | {"floor": real[m : 2 * m]}
+        sides = {source: features_of(run, policy, m, net, seed, each) for source, policy in policies.items()} | {
+            "floor": real[m : 2 * m]
+        }
         found[name] = {
             source: (fid(real[:m], side, name, seed=seed), kid(real[:m], side, name, seed=seed))
             for source, side in sides.items()

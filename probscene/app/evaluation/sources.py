@@ -11,9 +11,21 @@ from numpy.typing import NDArray
 
 from probscene.inference.judging.metrics import Histogram, histogram_interval, pooled_shares_interval
 from probscene.inference.judging.tally import Tally, resamples, tally_images
+from probscene.model import SceneModel
+from probscene.policy import Policy
 from probscene.relations import PerParent
 
 from .structure_counts import Counts, Relation, tallies
+
+PRIOR, START, LEARNT = "prior", "start", "learnt"
+FITTED = PRIOR, START, LEARNT  # sources that are sampled, in the order of a fit
+
+
+def before(model: SceneModel) -> dict[str, Policy]:
+    """The policies that a fit is held against: the prior, and where it is another the one that guides are pretrained
+    on, from which fits set out."""
+    start = {} if model.pretraining is None else {START: model.pretraining}
+    return {PRIOR: model.prior, **start}
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from ..evaluation.evaluate import Evaluation
 from .tables import nested_counts
 
 INK, FAINT = "#010203", "#010204"
-SOURCES = {"prior": "#010205", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
+SOURCES = {"prior": "#010205", "start": "#010209", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
 VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
 READ = {"prior": "prior", "learnt": "learnt", "target": "truth"}  # in what a site is read, and its colour
 TALLEST = 6.0  # of a histogram over u, times the prior's density

@@ -10,12 +10,13 @@ from matplotlib.figure import Figure
 
 from probscene.errors import DataError
 
-from ..evaluation.compare import ESTIMATE, PRIOR, TRUTH, Comparison, Row
+from ..evaluation.compare import ESTIMATE, TRUTH, Comparison, Row
+from ..evaluation.sources import PRIOR, START
 from ..evaluation.structure_counts import ALL, OTHERS, label
 from ..files import make_folder, write_whole
 from .charts import label_bins
 
-COLOURS = {PRIOR: "#9aa3ad", TRUTH: "#30363d", ESTIMATE: "#30363d"}
+COLOURS = {PRIOR: "#9aa3ad", START: "#8e7cc3", TRUTH: "#30363d", ESTIMATE: "#30363d"}
 RUNS = ("#2b7bba", "#e07b39", "#3a9a5b", "#b04f9e", "#c9a227", "#5c6bc0")
 INK, FAINT = "#1f2328", "#d0d7de"
 CLASSES = "class of an object"  # the row of ``Comparison.shares_of_classes``

@@ -18,6 +18,7 @@ from probscene.errors import DataError, RunError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.judge import SCENES, Judged, judge
 from ..evaluation.labels import read_labels
+from ..evaluation.sources import START
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
 from ..fitting import session
@@ -42,6 +43,7 @@ READ = {
 }
 LEGEND = {
     "prior": "prior",
+    "start": "start: where the fit set out",
     "learnt": "learnt",
     "truth": "truth (labels)",
     "estimate": "estimate: what the feature network counts in the target's images, without labels",
@@ -148,12 +150,13 @@ def _headline(evaluation: Evaluation) -> str:
     for b, found in evaluation.distances().items():
         to = "to the truth" if b == "truth" else "to the network's estimate"
         for key, what in (("number", "number of objects"), ("classes", "classes")):
-            prior, learnt = (_figure(found[a][key]) for a in ("prior", "learnt"))
-            rows.append(f'<div class="card">{what}, {to}<b>{prior} → {learnt}</b></div>')
+            figures = " → ".join(_figure(each[key]) for each in found.values())
+            rows.append(f'<div class="card">{what}, {to}<b>{figures}</b></div>')
     walls = "".join(f"<p>{html.escape(text)}</p>" for text in (*evaluation.kept, *evaluation.warnings))
     if not rows:
         return f"<p>There are neither labels nor an estimate to compare with.</p>{walls}"
-    note = "Total variation: first the prior's, then that of what was learnt."
+    start = ", of the start, from which the fit set out" if START in evaluation.sources else ""
+    note = f"Total variation: of the prior{start}, and of what was learnt."
     return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>{walls}'
 
 

@@ -15,11 +15,10 @@ from probscene.inference.judging.tally import Interval, Tally
 from ..evaluation.compare import ESTIMATE, Comparison, Row
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.likelihood import Likelihood
-from ..evaluation.sources import Source
+from ..evaluation.sources import FITTED, Source
 from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, label
 
-NAMES = {"prior": "prior", "learnt": "learnt", "truth": "truth", "estimate": "estimate *"}
-FITTED = ("prior", "learnt")
+NAMES = {"prior": "prior", "start": "start", "learnt": "learnt", "truth": "truth", "estimate": "estimate *"}
 FOOTNOTE = (
     "* An estimate without labels: what the feature network counts in the target's images, rounded; not the truth."
 )
@@ -68,8 +67,8 @@ def apart(evaluation: Evaluation, spread: bool = False) -> list[Table]:
 def distances(
     measured: dict[str, Any], means: Mapping[str, Mapping[str, Any]] | None = None, spread: bool = False
 ) -> list[Table]:
-    """How far prior and learnt structures are from the truth and from the estimate: a table each, with a row for all
-    objects, one for each class's count, and one for the classes' shares.
+    """How far prior, start and learnt structures are from the truth and from the estimate: a table each, with a row for
+    all objects, one for each class's count, and one for the classes' shares.
 
     Args:
         measured: ``Evaluation.distances()``.
@@ -78,12 +77,12 @@ def distances(
     """
     tables = []
     for b, found in measured.items():
-        shown = () if means is None else (*FITTED, b)
-        table = _distances(f"Distance to {WORDS[b]}", shown, "" if tables else LEGEND)
-        kinds = {kind: [_both(found[a]["kinds"][kind]) for a in FITTED] for kind in found["learnt"]["kinds"]}
-        rows = {ALL_OBJECTS: [(found[a]["number"], found[a]["number_wasserstein"]) for a in FITTED]}
+        shown = () if means is None else (*found, b)
+        table = _distances(f"Distance to {WORDS[b]}", found, shown, "" if tables else LEGEND)
+        kinds = {kind: [_both(each["kinds"][kind]) for each in found.values()] for kind in found["learnt"]["kinds"]}
+        rows = {ALL_OBJECTS: [(each["number"], each["number_wasserstein"]) for each in found.values()]}
         if len(kinds) > 1:  # one class is all objects
-            rows |= kinds | {SHARES: [(found[a]["classes"], None) for a in FITTED]}
+            rows |= kinds | {SHARES: [(each["classes"], None) for each in found.values()]}
         for words, values in rows.items():
             _add(table, words, values, [means[name].get(words) for name in shown] if means else [], spread)
         tables.append(table)
@@ -95,9 +94,9 @@ def _both(found: dict[str, Any] | None) -> tuple[Interval | None, Interval | Non
     return (None, None) if found is None else (Interval(**found["total_variation"]), Interval(**found["wasserstein"]))
 
 
-def _distances(title: str, shown: Iterable[str], legend: str = "") -> Table:
-    """A table with columns of both distances of prior and learnt, and of the means of the sources shown."""
-    heads = [f"{what}\n{a}" for what in ("TV", "W-1") for a in FITTED]
+def _distances(title: str, sources: Iterable[str], shown: Iterable[str], legend: str = "") -> Table:
+    """A table with columns of both distances of some sources, and of the means of those that are shown."""
+    heads = [f"{what}\n{a}" for what in ("TV", "W-1") for a in sources]
     table = _table(title, "", [*heads, *(f"mean\n{'seen *' if name == ESTIMATE else name}" for name in shown)])
     if legend:
         table.caption, table.caption_justify = legend, "left"
@@ -179,19 +178,19 @@ def nested(evaluation: Evaluation, spread: bool = False) -> list[Table]:
     rows, tables = nested_counts(evaluation), []
     if not rows:
         return []
-    title = "Counts by what they depend on"
+    title, fitted = "Counts by what they depend on", [name for name in FITTED if name in evaluation.sources]
     for b in (name for name in evaluation.sources if name not in FITTED):
-        table = _distances(f"{title}, distance to {WORDS[b]}", (*FITTED, b))
+        table = _distances(f"{title}, distance to {WORDS[b]}", fitted, (*fitted, b))
         for words, each in rows.items():
             if b in each:
-                found = [each[a].distance(each[b]) if a in each else None for a in FITTED]
-                _add(table, words, [x or (None, None) for x in found], [_mean(each, n) for n in (*FITTED, b)], spread)
+                found = [each[a].distance(each[b]) if a in each else None for a in fitted]
+                _add(table, words, [x or (None, None) for x in found], [_mean(each, n) for n in (*fitted, b)], spread)
         if table.row_count:
             tables.append(table)
     if not tables:
-        table = _table(f"{title}, means", "", list(FITTED))
+        table = _table(f"{title}, means", "", fitted)
         for words, each in rows.items():
-            table.add_row(words, *(_figure(_mean(each, name), 2) for name in FITTED))
+            table.add_row(words, *(_figure(_mean(each, name), 2) for name in fitted))
         tables.append(table)
     return tables
 

@@ -1,16 +1,20 @@
 """Evaluation: counts against plain loops, labels read strictly, estimates called estimates."""
 
+import io
 import json
 import random
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.stats
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
+from probscene.app.evaluation.compare import compare
 from probscene.app.evaluation.evaluate import evaluate, network_counts
 from probscene.app.evaluation.labels import Labels, counts_of_dataset
 from probscene.app.evaluation.sources import Source
@@ -18,6 +22,8 @@ from probscene.app.evaluation.structure_counts import StructureCounts, sampled
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labelling.counts import read_table, write_counts
 from probscene.app.loading import load_model
+from probscene.app.views.comparison import draw
+from probscene.app.views.tables import show
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
 
@@ -109,6 +115,26 @@ def test_a_network_that_does_not_count_gives_no_estimate(fitted, target):
     paper = RunFolder(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
     assert network_counts(paper, opened(target.images), quiet) is None
     assert list(evaluate(paper, None, None, quiet, num=20).sources) == ["prior", "learnt"]
+
+
+def test_where_fits_set_out_from_another_policy_it_is_a_source(fitted, target, tmp_path):
+    run = RunFolder.at(fitted)
+    start = load_model(str(run.record["model"])).target(0).prior
+    run._model = replace(run.model, pretraining=start)
+    found = evaluate(run, opened(target.images), None, quiet, num=200, features=["run"], images=8)
+    assert list(found.sources) == ["prior", "start", "learnt", "estimate"]
+    assert np.array_equal(found.sources["start"].counts, structure_counts(run.model, start, 200, 0))
+    assert list(found.distances()["estimate"]) == ["prior", "start", "learnt"] == list(found.images["run"])[:3]
+    assert list(found.images["run"]) == ["prior", "start", "learnt", "floor"]
+    json.dumps(found.record())
+    console = Console(width=200, file=io.StringIO())
+    show(found, console)
+    assert console.file.getvalue().count("start") >= 4
+    several = compare({"one": run}, opened(target.images), None, quiet, num=50)
+    assert list(several.sources) == ["prior", "start", "one", "estimate"]
+    assert list(several.distances()["estimate"]) == ["prior", "start", "one"]
+    draw(several, tmp_path / "compared.png")
+    assert (tmp_path / "compared.png").exists()
 
 
 def test_the_command_prints_and_writes_the_same(call, fitted, target, tmp_path):

@@ -110,8 +110,8 @@ def interrupted_at(training, stop):
 
 @pytest.mark.parametrize(
     ("of", "stop"),
-    [("ParameterLearning", 6), ("ParameterLearning", 8), ("ParameterLearning", 11), ("Again", 2)],
-    ids=["reader", "likelihood", "round", "structure again"],
+    [*(("ParameterLearning", stop) for stop in (6, 8, 11, 16)), ("Again", 2)],
+    ids=["reader", "likelihood", "round", "energy", "structure again"],
 )
 def test_a_fit_goes_on_to_the_same_bytes(both, of, stop, call, discs, target, tmp_path, monkeypatch):
     words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
