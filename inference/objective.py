@@ -9,13 +9,14 @@ divergence between the features of the rendered batch and those of real images [
     sum_i (c_i - b_i) grad log q(T_i) / N,
 
 with the exact marginal over latent vectors in log q; parameters keep their prior, so log q(alpha | T) has no gradient.
-A derivation longer than T_max is redrawn, and a scene that took more than ``reject_threshold`` failed attempts pays
-``reject_weight`` more; the paper's supplement adds that outside the score function, where it has no gradient.
+A derivation longer than T_max is redrawn, and the probability that a scene takes more than ``reject_threshold`` failed
+attempts costs ``reject_weight``. How often a scene failed says nothing of the derivation that was accepted, so a term
+in its cost would have no gradient, and the paper's supplement adds it outside the score function, where it has none
+either. But with Z the probability to end, grad Z is Z E grad log q(T) over the derivations that do. So the gradient of
+P(failures >= k) = (1 - Z)^k is ``-k (1 - Z)^(k - 1) Z E grad log q(T)``: all advantages less the same number.
 
-None of this keeps probability from leaking to derivations that do not end in time, because only those that do are
-scored. Half the squared number f of failed attempts per scene is therefore minimised as well (not in the paper). With Z
-the probability to end, f is (1 - Z) / Z and grad Z is Z E grad log q(T) over derivations that do, so its gradient is
-``-f (1 + f) E grad log q(T)``: all advantages less the same number, which is 0 where nothing fails.
+That term hardly moves where nearly all scenes end in time. Half the squared number f = (1 - Z) / Z of failed attempts
+per scene is therefore minimised as well (not in the paper), whose gradient is ``-f (1 + f) E grad log q(T)``.
 
 Departures that an argument turns on: ``updates`` takes several steps on one rendered batch with the clipped importance
 ratio of [3]; ``baseline="leave_one_out"`` uses the mean of the other scenes' costs [4] instead of the moving average
@@ -28,6 +29,7 @@ References:
     [4] Kool, van Hoof, Welling, *Buy 4 REINFORCE samples, get a baseline for free!*, 2019.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -55,7 +57,7 @@ class SceneBatch(NamedTuple):
         derivation: structures, N.
         features: ``(N, D)``.
         cost: ``(N,)``.
-        advantage: ``(N,)`` cost less baseline and leak, scaled.
+        advantage: ``(N,)`` cost less baseline, scaled, and what failed attempts cost.
         rejections: mean failed attempts a scene.
     """
 
@@ -76,7 +78,7 @@ class ScoreFunction:
         decay: weight of the new value in the moving average.
         updates: steps taken on one rendered batch.
         clip: the importance ratio of those steps stays within ``1 +- clip``.
-        scale: of the whole cost; under Adam it changes nothing but the weight of the rejections.
+        scale: of the cost; under Adam it changes nothing but the weight of failed attempts, which is not scaled.
         reject_weight, reject_threshold: lambda and epsilon of section 3.3.
         incompletion_weight: of half the squared number of failed attempts.
         prior, prior_kl_weight: a policy, and the weight of the reverse KL from it: ``log q(T) - log p(T)`` nats, at
@@ -114,6 +116,10 @@ class ScoreFunction:
             raise ProbsceneError(
                 f"Expected updates >= 1, decay in (0, 1] and clip > 0, actual {updates}, {decay} and {clip}."
             )
+        if reject_threshold < 0:
+            raise ProbsceneError(
+                f"Expected a reject_threshold of at least 0 failed attempts, actual {reject_threshold}."
+            )
         self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
         self.updates, self.clip, self.scale = updates, clip, scale
         self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
@@ -146,15 +152,19 @@ class ScoreFunction:
             derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps)
             features = self.observe(run_program(model, derivation, failures=failures))
             cost = self.divergence(features, real)
-            cost = cost + self.reject_weight * (failures > self.reject_threshold)
             strata = torch.zeros(len(cost), dtype=torch.int64) if self.strata is None else self.strata(derivation)
             if self.prior is not None and self.prior_kl_weight:
                 away = guide.log_prob(derivation) - self.prior.log_prob(derivation)
                 cost = cost + self.prior_kl_weight * away.clamp(max=FAR)
             failed = failures.float().mean().item()
-            leak = self.incompletion_weight * failed * (1 + failed)
-            advantage = self.scale * (cost - self._baseline(cost, strata) - leak)
+            advantage = self.scale * (cost - self._baseline(cost, strata)) - self._failing(failed)
             return SceneBatch(derivation, features, cost, advantage, failed)
+
+    def _failing(self, failed: float) -> float:
+        """What is taken off all advantages where scenes failed so often in the mean."""
+        ends, least = 1 / (1 + failed), math.floor(self.reject_threshold) + 1
+        rejected = least * (1 - ends) ** (least - 1) * ends
+        return self.reject_weight * rejected + self.incompletion_weight * failed * (1 + failed)
 
     def _baseline(self, cost: Tensor, strata: Tensor) -> Tensor:
         baseline = torch.zeros_like(cost)

@@ -3,7 +3,8 @@
 Maximum likelihood takes a reader at its word. Where a reading is off by nature, as of an angle that is read as too
 upright, so is what is learnt. Here one reader reads both sides, and its errors with them. The gradient of the energy
 distance [1] by a reading goes on to the value that was drawn, as if what is read moved with it one to one, and from
-there through the quantiles of the mixtures to the guide's weights (``ParameterNet.retraced``).
+there through the quantile of its mixture to the guide's weights (``ParameterNet.moving``). Only the last layers of the
+sites that are read with an error of some size are trained: what is read sharply, likelihood learns better.
 
 Objects are compared kind by kind, each with its sibling before it, its place among its siblings and their number; so
 are scenes. Axis letters: N scenes, M nodes, R rows, D entries.
@@ -13,7 +14,8 @@ References:
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -81,13 +83,28 @@ class EnergyDistance(StepTraining):
     def loss(self) -> Tensor:
         """See ``StepTraining``."""
         target = self.values.of(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
-        found = energy_distance(moving(self.net, self.draw(self.scenes)), target)
+        own = self.draw(self.scenes)
+        with _only(self.net, self.module):
+            found = energy_distance(moving(self.net, own), target)
         return found + 0 * sum(weight.sum() for weight in self.module.parameters())  # where nothing can be compared
+
+
+@contextmanager
+def _only(net: nn.Module, part: nn.Module) -> Iterator[None]:
+    """Inside it, what is computed has gradients by a part of a network alone, and takes no memory for the others."""
+    before = [(weight, weight.requires_grad) for weight in net.parameters()]
+    net.requires_grad_(False)
+    part.requires_grad_(True)
+    try:
+        yield
+    finally:
+        for weight, had in before:
+            weight.requires_grad_(had)
 
 
 def moving(net: ParameterNet, own: OwnReadings) -> Values:
     """What is read, moving with what was drawn."""
-    scene, nodes = net.retraced(Graph.of(own.kind, own.parent), own.scene, own.nodes)
+    scene, nodes = net.moving(Graph.of(own.kind, own.parent), own.scene, own.nodes)
     moved = (nodes - own.nodes).nan_to_num(0.0)
     at = own.which.clamp(min=0).unsqueeze(-1).expand(-1, -1, moved.shape[2])
     moved = moved.gather(1, at).where((own.which >= 0).unsqueeze(-1), 0.0)

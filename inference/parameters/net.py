@@ -7,7 +7,7 @@ known of them, the siblings that are like it (``mates``), and, through a GRU, on
 scenes, M nodes, S sites of nodes, G sites of scenes, H units.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -101,44 +101,12 @@ class ParameterNet(nn.Module):
             scene, values: as of ``node_mixture``, without site ``s``.
             has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
         """
-        return self._one_by_one(graph, scene, values, s, v, has, LogisticMixture.icdf)
-
-    def retraced(self, graph: Graph, scene: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """``scene (N, G)`` and ``values (N, M, S)`` of a sample, with the gradients that they have as quantiles of the
-        mixtures that they come from, each through all before it [1].
-
-        References:
-            [1] Figurnov, Mohamed, Mnih, *Implicit reparameterization gradients*, NeurIPS 2018.
-        """
-        for g in range(self.scene_sites):
-            u = scene[:, g : g + 1]
-            moved = self.scene_mixture(graph, scene, g).through(u.nan_to_num(0.5)).where(~u.isnan(), torch.nan)
-            scene = torch.cat([scene[:, :g], moved, scene[:, g + 1 :]], 1)
-        for s in range(self.node_sites):
-            u = values[..., s]
-            has = ~u.isnan()
-            moved = self._one_by_one(graph, scene, values, s, u.nan_to_num(0.5), has, LogisticMixture.through)
-            moved = moved.where(has, torch.nan).unsqueeze(-1)
-            values = torch.cat([values[..., :s], moved, values[..., s + 1 :]], -1)
-        return scene, values
-
-    def _one_by_one(
-        self,
-        graph: Graph,
-        scene: Tensor,
-        values: Tensor,
-        s: int,
-        given: Tensor,
-        has: Tensor,
-        take: Callable[[LogisticMixture, Tensor], Tensor],
-    ) -> Tensor:
-        """u of site ``s``, ``(N, M)``, that is taken of each node's mixture and what is given for it, ``(N, M)``."""
-        N, M = given.shape
+        N, M = v.shape
         earlier = torch.arange(self.node_sites) < s
         rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
         own = torch.stack(columns, 1)
         place, ties = self._place(graph, scene, s) + self._siblings(graph, own), self.mates.ties(graph.together, own)
-        memory, found = given.new_zeros(N, self.cell.hidden_size), []
+        memory, found = v.new_zeros(N, self.cell.hidden_size), []
         w: Any = self.cell  # torch names its weights as it makes them
         for m in range(M):
             around = [columns[m]]
@@ -147,13 +115,33 @@ class ParameterNet(nn.Module):
                 around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
             known = torch.cat([code(x) for x in around], -1)
             here = place[:, m] + self.mates(ties.place[:, m : m + 1], ties.last[:, m : m + 1], table[..., s])[:, 0]
-            u = take(self._mixture(here, known, memory, s), given[:, m]).where(has[:, m], given[:, m])
+            u = self._mixture(here, known, memory, s).icdf(v[:, m]).where(has[:, m], v[:, m])
             found.append(u)
             at_s = torch.arange(self.node_sites) == s
             columns[m] = torch.where(at_s, u.where(has[:, m], torch.nan)[:, None], columns[m])
             x = self._entering_one(graph.kind[:, m], columns[m], s)
             memory = torch.gru_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
         return torch.stack(found, 1)
+
+    def moving(self, graph: Graph, scene: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """``scene (N, G)`` and ``values (N, M, S)`` of a sample, each with the gradient that it has as a quantile of
+        the mixture that it was drawn from, what comes before it held [1].
+
+        References:
+            [1] Figurnov, Mohamed, Mnih, *Implicit reparameterization gradients*, NeurIPS 2018.
+        """
+        scenes = [
+            self.scene_mixture(graph, scene, g).through(u[:, None].nan_to_num(0.5))[:, 0]
+            for g, u in enumerate(scene.unbind(1))
+        ]
+        nodes = [
+            self.node_mixture(graph, scene, values, s).through(u.nan_to_num(0.5))
+            for s, u in enumerate(values.unbind(2))
+        ]
+        return (
+            torch.stack(scenes, 1).where(~scene.isnan(), torch.nan) if scenes else scene,
+            torch.stack(nodes, 2).where(~values.isnan(), torch.nan) if nodes else values,
+        )
 
     def _mixture(self, place: Tensor, known: Tensor, memory: Tensor, s: int) -> LogisticMixture:
         x = torch.cat([place + self.of_values(known), memory], -1)

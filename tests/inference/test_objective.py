@@ -147,17 +147,45 @@ def test_moving_average_is_the_papers(small):
         assert torch.allclose(loss.batch.advantage, loss.batch.cost - expected)
 
 
-def test_scenes_that_were_redrawn_pay(small, dots):
-    """With T_max cut to what half the scenes need, those that failed more than once pay lambda more."""
-    guide = LSTMGuide(dots.grammar, 4, hidden=8)
-    loss = ScoreFunction(
-        lambda scenes: scenes.failures.float().unsqueeze(1), lambda g, r: torch.zeros(len(g)), reject_weight=0.25
+@pytest.mark.parametrize("threshold", [0.0, 1.0, 2.5])
+@pytest.mark.parametrize("costs", ["none", "fixed"])
+def test_the_gradient_of_all_terms_is_exact_where_derivations_may_not_end(dots, costs, threshold):
+    """Of the cost of scenes that ended, the probability of more failed attempts than the threshold, and half their
+    squared number; two thirds of the derivations end."""
+    pyro.set_rng_seed(6)
+    guide = LSTMGuide(dots.grammar, 6, hidden=8)
+    kinds = (
+        torch.linspace(-1, 1.5, len(dots.grammar.kinds)) if costs == "fixed" else torch.zeros(len(dots.grammar.kinds))
     )
-    loss(lambda n: dots(n), guide, 200, real=None)
-    failures = loss.batch.features.squeeze(1)
-    assert failures.max() > 1
-    assert torch.equal(loss.batch.cost, 0.25 * (failures > 1))
-    assert loss.batch.rejections == pytest.approx(failures.mean().item())
+    derivations = enumerate_derivations(dots.grammar, 6)
+    log_q = guide.log_prob(derivations)
+    ends = log_q.exp().sum()
+    assert 0.3 < float(ends.detach()) < 0.8
+    failing = 1 - ends
+    of_scene = (derivations.counts(len(dots.grammar.kinds)) * kinds).sum(1)
+    expected = (log_q.exp() * of_scene).sum() / ends
+    penalty = failing ** (int(threshold) + 1)
+    exact = gradients(expected + 0.7 * penalty + 0.5 * 0.2 * (failing / ends) ** 2, guide)
+    loss = ScoreFunction(
+        lambda scenes: scenes.derivation.counts(len(dots.grammar.kinds)).float(), lambda g, r: (g * kinds).sum(1),
+        reject_weight=0.7, reject_threshold=threshold, incompletion_weight=0.2,
+    )  # fmt: skip
+    runs = torch.stack([gradients(loss(dots, guide, 20_000, real=None), guide) for _ in range(6)])
+    assert float(torch.nn.functional.cosine_similarity(runs.mean(0), exact, 0)) >= 0.999
+    assert float(runs.mean(0).norm() / exact.norm()) == pytest.approx(1, abs=0.05)
+
+
+def test_what_failed_attempts_cost_is_not_scaled(dots):
+    """The paper scales the log ratio, and gives the penalty a weight of its own."""
+    grads = []
+    for scale in (1.0, 1e-2):
+        pyro.set_rng_seed(7)
+        guide = LSTMGuide(dots.grammar, 6, hidden=8)
+        loss = ScoreFunction(
+            lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)), scale=scale
+        )
+        grads.append(gradients(loss(dots, guide, 500, real=None), guide))
+    assert grads[0].any() and torch.equal(*grads)
 
 
 def test_leaked_probability_is_drawn_back(dots):
@@ -199,6 +227,6 @@ def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
 
 
 def test_bad_arguments_are_named(small):
-    for arguments in ({"baseline": "median"}, {"updates": 0}, {"decay": 0.0}, {"clip": -1.0}):
+    for arguments in ({"baseline": "median"}, {"updates": 0}, {"decay": 0.0}, {"clip": -1.0}, {"reject_threshold": -1}):
         with pytest.raises(ProbsceneError, match="Expected"):
             ScoreFunction(structure_features(small), FixedCost(small), **arguments)

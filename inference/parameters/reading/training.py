@@ -37,6 +37,11 @@ class Valued(NamedTuple):
     u: Tensor
     overall: Tensor
 
+    def of(self, rows: slice) -> "Valued":
+        """Some of the scenes."""
+        drawn = self.drawn._replace(**{name: part[rows] for name, part in self.drawn._asdict().items()})
+        return Valued(drawn, *(part[rows] for part in self[1:]))
+
 
 class ReaderTraining(StepTraining):
     """Resumable training.
