@@ -40,13 +40,15 @@ from torch import Tensor
 
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.errors import ProbsceneError
+from probscene.errors import ModelError, ProbsceneError
 from probscene.policy import Policy
 from probscene.sampling import Scenes, run_program
 
 from .divergence import Divergence
+from .guides.base import Guide
 
 FAR = 20.0  # nats
+NEEDED = ("grammar", "log_prob", "max_steps")  # of a guide
 BASELINES = ("moving_average", "leave_one_out", "none")
 
 
@@ -68,8 +70,21 @@ class SceneBatch(NamedTuple):
     rejections: float
 
 
+def _check(guide: object) -> None:
+    missing = [name for name in NEEDED if not hasattr(guide, name)]
+    if missing:
+        raise ModelError(
+            f"Expected a guide with {', '.join(NEEDED[:-1])} and {NEEDED[-1]}, actual {type(guide).__name__} without "
+            f"{', '.join(missing)}; derive it from probscene.inference.guides.base.Guide."
+        )
+
+
 class ScoreFunction:
     """A loss for ``pyro.infer.SVI``: ``loss(model, guide, num_scenes, real=...)``.
+
+    The guide has a ``grammar``, ``max_steps`` and ``log_prob(derivation)``, and is a ``Policy`` of its grammar:
+    ``Guide``, or a module of one's own. Without gradients, as in ``SVI.evaluate_loss``, a call draws scenes of its own
+    and changes nothing.
 
     Args:
         observe: features ``(N, D)`` of a batch of ``Scenes``, for example render and embed; no gradient is taken.
@@ -129,14 +144,22 @@ class ScoreFunction:
         self.averages: dict[int, float] = {}  # moving, by stratum
         self.batch: SceneBatch | None = None
         self._used = 0
+        self._real: Tensor | None = None  # what the batch was compared with
         self._drawn_with: Tensor | None = None  # log q(T) under the guide that drew the batch
 
-    def __call__(self, model: Callable[[int], Any], guide, num_scenes: int, real: Tensor) -> Tensor:
-        """A scalar whose value is the mean cost and whose gradient is the score-function estimate."""
+    def __call__(self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor) -> Tensor:
+        """A scalar whose value is the mean cost and whose gradient is the score-function estimate.
+
+        Raises:
+            ModelError: the guide lacks something.
+        """
+        _check(guide)
+        if not torch.is_grad_enabled():
+            return self._costs(model, guide, num_scenes, real)[2].mean()
         if am_i_wrapped():  # in SVI, which learns the parameters that it sees registered
             pyro.module("guide", guide)
-        if self.batch is None or self._used == self.updates:
-            self.batch, self._used = self._draw(model, guide, num_scenes, real), 0
+        if self.batch is None or self._used == self.updates or not self._drawn_for(self.batch, num_scenes, real):
+            self.batch, self._used, self._real = self._draw(model, guide, num_scenes, real), 0, real
         batch = self.batch
         log_prob = guide.log_prob(batch.derivation)
         if self._used == 0:
@@ -147,16 +170,28 @@ class ScoreFunction:
         surrogate = torch.maximum(batch.advantage * ratio, batch.advantage * clipped).mean()
         return batch.cost.mean() + surrogate - surrogate.detach()
 
-    def _draw(self, model, guide, num_scenes: int, real: Tensor) -> SceneBatch:
+    def _drawn_for(self, batch: SceneBatch, num_scenes: int, real: Tensor) -> bool:
+        before = self._real
+        if len(batch.cost) != num_scenes or (before is None) != (real is None):
+            return False
+        return before is real or torch.equal(before, real)  # pyright: ignore[reportArgumentType]
+
+    def _costs(
+        self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor
+    ) -> tuple[Derivation, Tensor, Tensor, float]:
+        """Scenes of the guide, their features and costs, and the mean number of failed attempts."""
+        derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps)
+        features = self.observe(run_program(model, derivation, failures=failures))
+        cost = self.divergence(features, real)
+        if self.prior is not None and self.prior_kl_weight:
+            away = guide.log_prob(derivation) - self.prior.log_prob(derivation)
+            cost = cost + self.prior_kl_weight * away.clamp(max=FAR)
+        return derivation, features, cost, failures.float().mean().item()
+
+    def _draw(self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor) -> SceneBatch:
         with torch.no_grad():
-            derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps)
-            features = self.observe(run_program(model, derivation, failures=failures))
-            cost = self.divergence(features, real)
+            derivation, features, cost, failed = self._costs(model, guide, num_scenes, real)
             strata = torch.zeros(len(cost), dtype=torch.int64) if self.strata is None else self.strata(derivation)
-            if self.prior is not None and self.prior_kl_weight:
-                away = guide.log_prob(derivation) - self.prior.log_prob(derivation)
-                cost = cost + self.prior_kl_weight * away.clamp(max=FAR)
-            failed = failures.float().mean().item()
             advantage = self.scale * (cost - self._baseline(cost, strata)) - self._failing(failed)
             return SceneBatch(derivation, features, cost, advantage, failed)
 

@@ -10,7 +10,7 @@ from pyro.optim import Adam
 
 from probscene.app.fitting.presets import QUICK
 from probscene.enumeration import enumerate_derivations
-from probscene.errors import ProbsceneError
+from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.learn import Trainer
@@ -224,6 +224,44 @@ def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
     loss(dots, LSTMGuide(dots.grammar, 12, hidden=8), 200, real=None)
     something = loss.batch.derivation.lengths > 2
     assert something.any() and (loss.batch.cost[something] == 0.1 * FAR).all()
+
+
+def test_evaluating_the_loss_changes_nothing(small):
+    """Neither the batch, nor how many updates it has left, nor a moving average."""
+    guide = LSTMGuide(small.grammar, 4, hidden=8)
+    loss = ScoreFunction(structure_features(small), FixedCost(small), baseline="moving_average", updates=3)
+    svi = SVI(small.program, guide, Adam({"lr": 1e-3}), loss=loss)
+    first = svi.evaluate_loss(40, real=None)
+    assert loss.batch is None and loss.averages == {} and first == pytest.approx(2.0, abs=1.5)
+    drawn = []
+    for _ in range(6):
+        svi.step(40, real=None)
+        drawn.append(loss.batch)
+        averages = dict(loss.averages)
+        svi.evaluate_loss(25, real=None)
+        assert loss.batch is drawn[-1] and loss.averages == averages
+    assert [batch is drawn[0] for batch in drawn] == [True] * 3 + [False] * 3
+
+
+def test_other_arguments_start_another_batch(small):
+    guide = LSTMGuide(small.grammar, 4, hidden=8)
+    loss = ScoreFunction(structure_features(small), FixedCost(small), updates=5)
+    real = small.features, small.features + 1
+    drawn = []
+    for num, given in ((30, real[0]), (30, real[0].clone()), (20, real[0]), (20, real[1]), (20, real[1])):
+        loss(small.program, guide, num, real=given)
+        drawn.append(loss.batch)
+    assert [len(batch.cost) for batch in drawn] == [30, 30, 20, 20, 20]
+    assert drawn[0] is drawn[1] and drawn[3] is drawn[4]
+    assert len({id(batch) for batch in drawn}) == 3
+
+
+def test_a_guide_that_is_none_is_told_what_is_missing(small):
+    loss = ScoreFunction(structure_features(small), FixedCost(small))
+    with pytest.raises(ModelError, match="log_prob and max_steps, actual StructurePrior without max_steps"):
+        loss(small.program, StructurePrior(small.grammar), 20, real=None)
+    with pytest.raises(ModelError, match="actual function without grammar, log_prob, max_steps"):
+        loss(small.program, lambda num_scenes: None, 20, real=None)
 
 
 def test_bad_arguments_are_named(small):
