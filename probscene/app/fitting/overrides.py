@@ -6,37 +6,52 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from probscene.errors import ProbsceneError
-from probscene.inference.guides.lstm import GUIDES
 from probscene.inference.objective import BASELINES
 
-from .parts import is_file_part, lasting_word
-from .presets import BOTH, LIKELIHOOD, META_SIM, OBJECTIVES, STRUCTURE, TRAINED, Preset
+from .parts import lasting_word
+from .presets import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, Preset
 
 CHOICES = {
-    "features": TRAINED,
-    "objective": OBJECTIVES,
     "baseline": BASELINES,
-    "guide": GUIDES,
     "learn": (STRUCTURE, BOTH),
     "parameter_method": (LIKELIHOOD, META_SIM),
 }
-LEAST = {"num_scenes": 2, "scenes": 2, "batches_again": 0, "rounds": 0}
+LEAST = {"num_scenes": 2, "scenes": 2, "batches_again": 0, "rounds": 0, "energy_steps": 0}
+FIRST = {"objective": Preset.with_objective, "guide": Preset.with_guide, "features": Preset.with_features}
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate", "difference")
 
 
 def override(preset: Preset, settings: list[str]) -> Preset:
     """A preset with ``settings`` such as ``"batches=2"``, ``"count.steps=32"`` or ``"width=8,16,32"``.
 
-    ``none`` stands for no value, ``true`` and ``false`` for themselves.
+    ``none`` stands for no value, ``true`` and ``false`` for themselves. Objective, guide and features come first, with
+    all that suits them, as by ``Preset.with_objective`` and the like.
 
     Raises:
-        ProbsceneError: no ``=``, an unknown field, or a value of another type or out of range.
+        ProbsceneError: no ``=``, an unknown field, a value of another type or out of range, a setting that the chosen
+            guide or objective does not read, or one that leaves nothing to learn.
     """
+    pairs = []
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise ProbsceneError(f"Expected --set key=value, actual {setting!r}.")
-        preset = _replaced(preset, key.strip().split("."), text.strip(), key.strip())
+        pairs.append((key.strip(), text.strip()))
+    for key, text in sorted(pairs, key=lambda pair: pair[0] not in FIRST):
+        if key in FIRST:
+            preset = FIRST[key](preset, lasting_word(text))
+        else:
+            preset = _replaced(preset, key.split("."), text, key)
+    for key, _ in pairs:
+        if key in (unread := preset.unread()):
+            raise ProbsceneError(
+                f"Expected settings that are read, actual --set {key}=...: {unread[key]}; leave it out."
+            )
+    if preset.objective == "mmd" and preset.baseline == "leave_one_out":
+        raise ProbsceneError(
+            "Expected a baseline of moving_average or none with objective=mmd, actual leave_one_out: all scenes share "
+            "one cost, so that their advantages would all be 0."
+        )
     return preset
 
 
@@ -78,7 +93,7 @@ def _read(text: str, wanted: Any, key: str) -> Any:
 
 
 def _check(name: str, value: Any, key: str) -> None:
-    if isinstance(value, str) and value not in CHOICES[name] and not is_file_part(value):
+    if isinstance(value, str) and value not in CHOICES[name]:
         raise ProbsceneError(f"Expected --set {key}=... among {', '.join(CHOICES[name])}, actual {value!r}.")
     if type(value) is int and value < LEAST.get(name, 1):
         raise ProbsceneError(f"Expected --set {key}=... of at least {LEAST.get(name, 1)}, actual {value}.")

@@ -203,6 +203,19 @@ class Preset:
             return replace(self, guide=kind, pretrain_rate=5e-3, hidden=100, num_latents=32)
         return replace(self, guide=kind)
 
+    def unread(self) -> dict[str, str]:
+        """Settings that the chosen guide or objective does not read, and why."""
+        guide, found = set(self.guide_settings()), {}
+        for name in ("hidden", "num_latents", "index"):
+            if name not in guide:
+                found[name] = f"the guide {self.guide!r} has no such setting"
+        of_kde = "" if self.objective in ("kde", "js") else "only the objectives kde and js estimate densities"
+        of_any = "" if self.objective in OBJECTIVES else f"the objective {self.objective!r} has settings of its own"
+        for name, because in (("variance", of_any), ("marginal_variance", of_kde), ("leave_one_out", of_kde)):
+            if because:
+                found[name] = because
+        return found
+
     def guide_settings(self) -> dict[str, Any]:
         """The arguments of ``make_guide`` that a run keeps."""
         of_kind = {"lstm": ("hidden", "num_latents", "index"), "pcfg": (), "grammar-vae": ("hidden", "num_latents")}
