@@ -71,11 +71,12 @@ def check_program(model: SceneModel, scenes: int, rendered: int) -> Findings:
     """Run a model's program and render some of its scenes; arguments as of ``check_model``."""
     watch, store = Watch(model.grammar), pyro.get_param_store()
     with store.scope(store.get_state()), chunk_randomness(0, 0):
+        known = set(store.keys())
         try:
             policies = [model.prior] if model.pretraining is None else [model.prior, model.pretraining]
             number = -(-scenes // len(policies))
             drawn = [sample(watched(model, watch), policy, number) for policy in policies]
-            wrong = _not_finite(drawn)
+            wrong = [*_not_finite(drawn), *_parameters(set(store.keys()) - known)]
             if wrong:
                 return Findings(wrong, [], {})
             batches = _rendered(model, drawn, rendered)
@@ -102,6 +103,14 @@ def _not_finite(drawn: list[Scenes]) -> list[str]:
                     "parameters of its distribution, and divide by nothing that can be 0."
                 )
     return list(wrong.values())
+
+
+def _parameters(names: set[str]) -> list[str]:
+    return [
+        f"The program has pyro.param({name!r}), which no fit learns; make it a number, or a site that parameters are "
+        f"learnt of, such as pyro.sample({name!r}, dist.Uniform(low, high))."
+        for name in sorted(names)
+    ]
 
 
 def _rendered(model: SceneModel, drawn: list[Scenes], rendered: int) -> list[tuple[Tensor, RenderBatch]]:

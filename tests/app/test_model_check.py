@@ -44,6 +44,11 @@ FAULTS = {
         BLUE + 'Sprites.box("blue", x, y, 20.0, 20.0, labelled=False),',
         ("Class 'blue' can never be seen: something covers them", "from the back to the front"),
     ),
+    "a parameter of Pyro's": (
+        X,
+        X + '\n            pyro.param("shift", dist.Uniform(0.0, 1.0).sample)',
+        ("pyro.param('shift'), which no fit learns", "such as pyro.sample('shift',"),
+    ),
     "not finite": (
         X,
         f'{X}\n            pyro.sample("z", dist.LogNormal(85.0, 5.0))',
@@ -229,7 +234,8 @@ def test_it_leaves_no_trace(discs):
     pyro.clear_param_store()
     pyro.param("kept", torch.tensor(5.0))
     before = torch.get_rng_state()
-    assert not check_model(replace(model, program=program)).faults
+    (fault,) = check_model(replace(model, program=program)).faults
+    assert "pyro.param('drawn')" in fault
     assert torch.equal(torch.get_rng_state(), before) and set(pyro.get_param_store()) == {"kept"}
     pyro.clear_param_store()
 
