@@ -117,10 +117,12 @@ def energy_distance(one: Values, other: Values) -> Tensor:
     has them."""
     total, weight = one.scene.new_zeros(()), 0.0
     rows, others = _rows(one), _rows(other)
-    for kind in other.kind[other.kind >= 0].unique().tolist():
-        here, there = rows[one.kind == kind][: ROWS[0]], others[other.kind == kind][: ROWS[1]]
+    read, also = ~one.nodes.isnan().all(2), ~other.nodes.isnan().all(2)
+    for kind in other.kind[also].unique().tolist():
+        mine, theirs = read & (one.kind == kind), also & (other.kind == kind)
+        here, there = rows[mine][: ROWS[0]], others[theirs][: ROWS[1]]
         if len(here) > 1 and len(there) > 1:
-            number = float((other.kind == kind).sum()) * other.nodes.shape[2]
+            number = float(theirs.sum()) * other.nodes.shape[2]
             total, weight = total + number * _energy(here, there), weight + number
     if one.scene.shape[1]:
         turns = one.turns[one.nodes.shape[2] :]

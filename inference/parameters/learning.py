@@ -23,7 +23,7 @@ from probscene.sampling import seed_everything
 
 from ..training import Report, Training, batch_seed
 from .best import Best, HeldOut
-from .energy import EnergyDistance, OwnReadings
+from .energy import EnergyDistance, OwnReadings, energy_distance
 from .graph import Graph
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
@@ -232,6 +232,20 @@ class ParameterLearning:
         found = self.tried.reader.find(images)
         made = along_the_widest(made, found)
         return self.tried.values(made, found, len(images))[0], made
+
+    @torch.no_grad()
+    def apart(self, images: Tensor, target: Tensor) -> dict[str, float]:
+        """Squared energy distance of what is read of each learnt site in ``(L, C, H, W)`` uint8 images from what is
+        read in others, with its siblings'."""
+        found = [self.tried.reader.find(some) for some in (images, target)]
+        made = along_the_widest(self._assembly, found[1])
+        seed_everything(batch_seed(self.seed, 6))
+        one, other = (
+            self.tried.values(made, objects, len(some))[0]
+            for objects, some in zip(found, (images, target), strict=True)
+        )
+        sites = [site for site in (*self.node_sites, *self.scene_sites) if site in self.tried.good_sites]
+        return {site.name: float(energy_distance(one.site(i), other.site(i))) for i, site in enumerate(sites)}
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int) -> OwnReadings:

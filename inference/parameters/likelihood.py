@@ -61,6 +61,21 @@ class Values(NamedTuple):
             self.turns,
         )
 
+    def site(self, number: int) -> "Values":
+        """Of one site alone, of those of nodes and then of scenes."""
+        node = slice(number, number + 1)
+        first = max(0, number - self.nodes.shape[2])
+        scene = slice(first, first + (number >= self.nodes.shape[2]))
+        return Values(
+            self.kind,
+            self.parent,
+            self.nodes[..., node],
+            self.nodes_sd[..., node],
+            self.scene[:, scene],
+            self.scene_sd[:, scene],
+            self.turns[node],
+        )
+
     def drawn(self) -> "Values":
         """u drawn from what was read."""
         return self._replace(

@@ -32,6 +32,7 @@ def anything_is_read(patch):
     patch.setattr(skill, "READABLE", -1e9)
     patch.setattr(reader, "LEAST_MASS", 1e-3)
     patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
+    patch.setattr(judged, "not_nearer", lambda *_: frozenset())
 
 
 @pytest.fixture(scope="module")
@@ -195,3 +196,13 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
 
     prior, after = beside(run.model.prior), beside(run.guide)
     assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
+
+
+def test_sites_whose_readings_come_no_nearer_keep_the_prior():
+    class Learning:
+        def apart(self, images, target):
+            assert target == "target"
+            return {"learnt": {"x": 0.1, "y": 0.3, "z": 0.2}, "prior": {"x": 0.5, "y": 0.2, "z": 0.2}}[images]
+
+    images = {name: name for name in ("learnt", "prior", "target")}
+    assert judged.not_nearer(Learning(), images) == {"y", "z"}

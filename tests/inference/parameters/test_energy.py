@@ -142,3 +142,14 @@ def test_errors_of_the_reader_are_taken_out():
     _, _, nodes = drawn(net.double(), 500)
     assert float(drawn_values.mean()) == pytest.approx(0.25, abs=0.01)
     assert float(nodes.detach().mean()) == pytest.approx(0.25, abs=0.06)  # what is read has a mean of .375
+
+
+def test_a_site_alone_is_compared_by_its_objects_and_no_others():
+    """Of nodes of two kinds, of which one has the site, and of scenes."""
+    torch.manual_seed(0)
+    read = values_of(torch.rand(80, 4, SITES), torch.rand(80, 1))
+    kind = torch.tensor([0, 1, 0, 1]).expand(80, 4)
+    read = read._replace(kind=kind, nodes=read.nodes.where((kind == 0).unsqueeze(-1), torch.nan))
+    shifted = read._replace(nodes=read.nodes + torch.tensor([0.3, 0.0]), scene=read.scene + 0.3)
+    found = [float(energy_distance(shifted.site(i), read.site(i))) for i in range(SITES + 1)]
+    assert found[0] > 0.01 and found[2] > 0.01 and found[1] < 1e-6

@@ -34,9 +34,10 @@ class Judged(NamedTuple):
     """For JSON.
 
     Attributes:
-        distances: ``kept``, ``"learnt"`` where its renders are nearer to the images than those with the prior's
-            parameters, else ``"prior"``; and both energy distances. Where not all of what was learnt brings them
-            nearer, sites that do so alone are kept, and the guide passes the others.
+        distances: ``kept``, ``"prior"`` where renders with learnt parameters are surely farther from the images than
+            those with the prior's, else ``"learnt"``; and both energy distances. The guide passes sites of which what
+            is read in its renders is no nearer to what is read in the images. Where they are surely farther all the
+            same, only the sites that bring them nearer alone are kept.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -60,12 +61,15 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         return farther(look(images["learnt"]), look(images["prior"]), real)
 
     apart = compared()
-    if apart.one >= apart.other and isinstance(learnt, ParameterGuide):
-        passed = useless(learnt, held_out(run, guide, held))
-        if len(passed) < len(learnt.sites):
-            learnt.passed = passed
+    if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
+        learnt.passed = not_nearer(learning, images)
+        if learnt.passed:
             apart = compared()
-    kept = "learnt" if apart.one < apart.other else "prior"
+        if apart.sure:
+            learnt.passed = useless(learnt, held_out(run, guide, held))
+            apart = compared()
+    nothing = isinstance(learnt, ParameterGuide) and len(learnt.passed) == len(learnt.sites)
+    kept = "prior" if apart.sure or nothing else "learnt"
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if isinstance(learning, MetaSimLearning):  # which reads nothing
         return Judged(distances, {})
@@ -80,6 +84,13 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         }
         sites[site.name] = each | {"distance": away | {"floor": _distance(*(half[site.name] for half in halves))}}
     return Judged(distances, sites)
+
+
+def not_nearer(learning: ParameterLearning, images: dict[str, Tensor]) -> frozenset[str]:
+    """Sites of which what is read in learnt renders is no nearer to what is read in the target than with the prior's
+    parameters."""
+    away = {name: learning.apart(images[name], images["target"]) for name in ("learnt", "prior")}
+    return frozenset(site for site, far in away["learnt"].items() if far >= away["prior"][site])
 
 
 def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
