@@ -87,11 +87,13 @@ def quantiles(model: SceneModel, drawn_by: SceneModel, policy: Policy, seed: int
 
 def distance(scenes: list[np.ndarray], truth: list[np.ndarray]) -> list[float]:
     """Wasserstein-1, and the interval of 95 % of bootstraps."""
-    true, rng = np.concatenate(truth), np.random.default_rng(0)
-    each = [wasserstein_distance(np.concatenate(scenes), true)]
+    true, values, rng = np.concatenate(truth), np.concatenate(scenes), np.random.default_rng(0)
+    which = np.repeat(np.arange(len(scenes)), [len(some) for some in scenes])
+    each = []
     for _ in range(RESAMPLES):
-        each.append(wasserstein_distance(np.concatenate([scenes[j] for j in rng.integers(SCENES, size=SCENES)]), true))
-    return [float(each[0]), *np.quantile(each[1:], (0.025, 0.975)).tolist()]
+        drawn = rng.multinomial(len(scenes), np.full(len(scenes), 1 / len(scenes)))
+        each.append(wasserstein_distance(values, true, drawn[which]))
+    return [float(wasserstein_distance(values, true)), *np.quantile(each, (0.025, 0.975)).tolist()]
 
 
 def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 CLOSE = 0.12  # of u
 LOGITS = 4.0  # a logit of this is 1 for the network
 FEATURES = 6  # of each way
+PAIRS = 4_000_000  # of nodes, times sites, that are looked at together, at most
 
 
 class Ties(NamedTuple):
@@ -47,6 +48,11 @@ class Mates(nn.Module):
             together: ``(N, M, M)`` bool, who is whose sibling, itself included.
             own: ``(N, M, S)`` u, NaN where they are not known.
         """
+        at_once = max(1, PAIRS // max(1, own.shape[1] ** 2 * max(1, own.shape[2])))
+        parts = [self._ties(*some) for some in zip(together.split(at_once), own.split(at_once), strict=True)]
+        return parts[0] if len(parts) == 1 else Ties(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+    def _ties(self, together: Tensor, own: Tensor) -> Ties:
         u = own if own.shape[2] else own.new_full((*own.shape[:2], 1), torch.nan)
         known = ~u.isnan()
         one, other = u.unsqueeze(2), u.unsqueeze(1)

@@ -9,9 +9,11 @@ from pyro import poutine
 from pyro.infer import SVI, Predictive, Trace_ELBO
 from pyro.optim import Adam
 
+from probscene.inference.parameters import mates as module
 from probscene.inference.parameters.graph import Graph, Seen
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.likelihood import Values, log_density
+from probscene.inference.parameters.mates import Mates
 from probscene.inference.parameters.sites import Site, find_sites, of_scenes, quantiles_of, site_name
 from probscene.sampling import run_program, sample, seed_everything
 
@@ -191,3 +193,14 @@ def test_svi_learns_it(model):
 
 def test_a_site_is_told_by_its_name_alone(trays):
     assert guide_of(trays).sites[0] == Site("scene.bright", ())
+
+
+def test_ties_of_many_scenes_are_those_of_each(monkeypatch):
+    torch.manual_seed(0)
+    mates = Mates(3, 8)
+    own = torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
+    together = torch.rand(20, 6, 6) < 0.6
+    whole = mates.ties(together, own)
+    monkeypatch.setattr(module, "PAIRS", 1)
+    for one, other in zip(whole, mates.ties(together, own), strict=True):
+        assert torch.equal(one, other)
