@@ -199,7 +199,7 @@ def test_ties_of_many_scenes_are_those_of_each(monkeypatch):
     torch.manual_seed(0)
     mates = Mates(3, 8)
     own = torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
-    together = torch.rand(20, 6, 6) < 0.6
+    together = Graph.of(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).together
     whole = mates.ties(together, own)
     monkeypatch.setattr(module, "PAIRS", 1)
     for one, other in zip(whole, mates.ties(together, own), strict=True):
