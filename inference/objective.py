@@ -165,6 +165,7 @@ class ScoreFunction:
         if self._used == 0:
             self._drawn_with = log_prob.detach()
         self._used += 1
+        assert self._drawn_with is not None
         ratio = torch.exp(log_prob - self._drawn_with)
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         surrogate = torch.maximum(batch.advantage * ratio, batch.advantage * clipped).mean()
