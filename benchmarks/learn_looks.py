@@ -19,13 +19,14 @@ from copy import copy
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from learn_driving import counted
-from learn_lanes import picture
 from learn_parameters import IMAGES, drawn, said
 from pyro.poutine.messenger import Messenger
 from scipy.stats import wasserstein_distance
+from torch import Tensor
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
@@ -47,7 +48,7 @@ from probscene.sampling import sample, seed_everything
 HIDDEN = ("camera.height", "camera.pitch", "camera.exposure", "sun.azimuth", "sun.elevation", "weather.cloud")
 HIDDEN += ("weather.haze", "car.across", "car.make", "car.colour")
 WIDTH = 1 / 3  # of the prior's probability that is left to a hidden site
-SCENES, RESAMPLES = 1000, 200
+SCENES, RESAMPLES, SHOWN = 1000, 200, 6
 
 
 class Narrowed(Messenger):
@@ -134,8 +135,16 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
         _, pictures = drawn(run, policy, 1)
         row["kid"][source] = said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))
         panels += [pictures] if source != "start" else []
-    picture([*panels, torch.stack([real.load(i) for i in range(9)])], args.out / f"scenes-{seed}.png")
+    picture([*panels, torch.stack([real.load(i) for i in range(SHOWN)])], args.out / f"scenes-{seed}.png")
     return row
+
+
+def picture(sources: list[Tensor], path: Path) -> None:
+    """A column of images of each source, ``(N, 3, H, W)``."""
+    columns = [np.concatenate(list(images[:SHOWN].permute(0, 2, 3, 1).numpy())) for images in sources]
+    white = [np.pad(column, ((0, 0), (0, 20), (0, 0)), constant_values=255) for column in columns]
+    whole = np.concatenate(white, 1)[:, :-20, ::-1]
+    cv2.imwrite(str(path), cv2.resize(whole, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
 def main():
