@@ -37,7 +37,7 @@ def _learn(run: RunFolder) -> str:
         return "Train the reader longer: the default preset, or --set parameters.reader_steps."
     if record["kept"] != "learnt":
         return (
-            "What was learnt was farther from held-out images and is not used: take the default preset, or more images."
+            "What was learnt came no nearer to held-out images, and is unused: take the default preset or more images."
         )
     return "Fit longer: the default preset, or --set parameters.steps and parameters.rounds."
 

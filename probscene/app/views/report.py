@@ -213,7 +213,7 @@ def _sites(run: RunFolder) -> str:
 
 def _not_kept(record: dict[str, Any]) -> str:
     figures = f"{record['learnt']:.2f} against {record['prior']:.2f} in energy distance"
-    return f"<p>All sites keep the prior: learnt scenes are farther from held-out images, {figures}.</p>"
+    return f"<p>All sites keep the prior: learnt scenes come no nearer to held-out images, {figures}.</p>"
 
 
 def _legend(words: dict[str, str]) -> str:

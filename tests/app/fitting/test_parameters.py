@@ -206,3 +206,25 @@ def test_sites_whose_readings_come_no_nearer_keep_the_prior():
 
     images = {name: name for name in ("learnt", "prior", "target")}
     assert judged.not_nearer(Learning(), images) == {"y", "z"}
+
+
+@pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
+def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
+    anything_is_read(monkeypatch)
+    monkeypatch.setattr(judged, "not_nearer", lambda *_: frozenset(passed))
+    out = tmp_path / "run"
+    done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
+    assert done.code == 0, done.err
+    run = RunFolder.at(out)
+    record = {site["name"]: site for site in run.parameters["sites"]}
+    if len(passed) == 2:
+        assert run.parameters["kept"] == "prior" and run.guide.suits is None
+        assert "All keep the prior, as learnt scenes come no nearer" in done.err + done.out
+        return
+    assert (record["x"]["learnt"], record["y"]["learnt"], run.parameters["kept"]) == (False, True, "learnt")
+    assert record["x"]["because"] == "scenes come no nearer to held-out images by it"
+    found = []
+    for model in (run.guide.suits(run.model), run.model):
+        seed_everything(0)
+        found.append(sample(model, run.model.prior, 30).parameters)
+    assert torch.equal(found[0]["x"], found[1]["x"]) and not torch.equal(found[0]["y"], found[1]["y"])

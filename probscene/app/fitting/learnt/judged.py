@@ -68,8 +68,9 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         if apart.sure:
             learnt.passed = useless(learnt, held_out(run, guide, held))
             apart = compared()
-    nothing = isinstance(learnt, ParameterGuide) and len(learnt.passed) == len(learnt.sites)
-    kept = "prior" if apart.sure or nothing else "learnt"
+    kept = "prior" if apart.sure else "learnt"
+    if isinstance(learnt, ParameterGuide) and len(learnt.passed) == len(learnt.sites):
+        kept, learnt.passed = "prior", frozenset()
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if isinstance(learning, MetaSimLearning):  # which reads nothing
         return Judged(distances, {})

@@ -177,7 +177,7 @@ def _said(record: dict[str, Any]) -> str:
     said += f" Keeping the prior: {others}." if others else ""
     if record["kept"] != "learnt":
         said += (
-            f" All keep the prior, as learnt scenes are farther from held-out images, {record['learnt']:.2f} against "
+            f" All keep the prior, as learnt scenes come no nearer to held-out images, {record['learnt']:.2f} against "
             f"{record['prior']:.2f} in energy distance."
         )
     return said
