@@ -211,6 +211,7 @@ def test_sites_whose_readings_come_no_nearer_keep_the_prior():
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
 def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
+    monkeypatch.setattr(judged, "farther", lambda *_: Farther(1.0, 1.0, 0.0))
     monkeypatch.setattr(judged, "not_nearer", lambda *_: frozenset(passed))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)

@@ -35,9 +35,9 @@ class Judged(NamedTuple):
 
     Attributes:
         distances: ``kept``, ``"prior"`` where renders with learnt parameters are surely farther from the images than
-            those with the prior's, else ``"learnt"``; and both energy distances. The guide passes sites of which what
-            is read in its renders is no nearer to what is read in the images. Where they are surely farther all the
-            same, only the sites that bring them nearer alone are kept.
+            those with the prior's, else ``"learnt"``; and both energy distances. Where they are no nearer, the guide
+            passes sites of which what is read in its renders is no nearer to what is read in the images. Where they are
+            surely farther all the same, only the sites that bring them nearer alone are kept.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -61,10 +61,9 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         return farther(look(images["learnt"]), look(images["prior"]), real)
 
     apart = compared()
-    if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
+    if apart.one >= apart.other and isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         learnt.passed = not_nearer(learning, images)
-        if learnt.passed:
-            apart = compared()
+        apart = compared()
         if apart.sure:
             learnt.passed = useless(learnt, held_out(run, guide, held))
             apart = compared()
