@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from ..steps import StepTraining
 from .graph import Graph
 from .likelihood import Values
-from .net import ParameterNet
+from .net import ParameterNet, gathered
 
 ROWS = 400, 1600  # of the guide's and of the target's objects of a kind that are compared in a step, at most
 PLACE, NUMBER = 2.0, 4.0  # what one place among siblings and one object more count, in u
@@ -106,8 +106,7 @@ def moving(net: ParameterNet, own: OwnReadings) -> Values:
     """What is read, moving with what was drawn."""
     scene, nodes = net.moving(Graph.of(own.kind, own.parent), own.scene, own.nodes)
     moved = (nodes - own.nodes).nan_to_num(0.0)
-    at = own.which.clamp(min=0).unsqueeze(-1).expand(-1, -1, moved.shape[2])
-    moved = moved.gather(1, at).where((own.which >= 0).unsqueeze(-1), 0.0)
+    moved = gathered(moved, own.which).nan_to_num(0.0)
     of_scene = (scene - own.scene).nan_to_num(0.0)
     return own.read._replace(nodes=own.read.nodes + moved, scene=own.read.scene + of_scene)
 
@@ -136,8 +135,7 @@ def _rows(values: Values) -> Tensor:
     """``(N, M, D)`` each object with its sibling before it, its place and their number."""
     graph = Graph.of(values.kind, values.parent)
     own = _placed(values.nodes, values.turns[: values.nodes.shape[2]])
-    at = graph.before.clamp(min=0).unsqueeze(-1).expand(-1, -1, own.shape[2])
-    before = own.gather(1, at).where((graph.before >= 0).unsqueeze(-1), 0.0)
+    before = gathered(own, graph.before).nan_to_num(0.0)
     place = torch.stack([PLACE * graph.rank, NUMBER * graph.number], -1).to(own.dtype)
     return torch.cat([own, before, place], -1)
 

@@ -88,7 +88,7 @@ class ParameterNet(nn.Module):
         states, _ = self.cell(self._entering(graph, known, s))
         memory = F.pad(states, (0, 0, 1, 0))[:, :-1]
         own = known.where(torch.arange(self.node_sites) < s, torch.nan)
-        around = [own, _gathered(known, graph.parent), _gathered(known, graph.before)]
+        around = [own, gathered(known, graph.parent), gathered(known, graph.before)]
         ties = self.mates.ties(graph.together, own)
         place = self._place(graph, scene, s) + self._siblings(graph, own)
         place = place + self.mates(ties.place, ties.last, known[..., s])
@@ -188,7 +188,7 @@ def code(u: Tensor) -> Tensor:
     return torch.cat([there.to(u.dtype), 2 * u - 1, u.clamp(1e-4, 1 - 1e-4).logit() / LOGITS], -1)
 
 
-def _gathered(values: Tensor, index: Tensor) -> Tensor:
+def gathered(values: Tensor, index: Tensor) -> Tensor:
     """Entries ``(N, M, S)`` of ``values`` at nodes ``index (N, M)``; NaN for -1."""
     at = index.clamp(min=0).unsqueeze(-1).expand(-1, -1, values.shape[2])
     return values.gather(1, at).where((index >= 0).unsqueeze(-1), torch.nan)
