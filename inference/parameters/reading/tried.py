@@ -21,7 +21,9 @@ NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
 
 
 class TriedReader:
-    """Args:
+    """A reader of a model's sites; it is tried once, and reads from then on those of them that it can read.
+
+    Args:
         model: the scene model.
         reader: of its classes and of these sites.
         node_sites, scene_sites: that are not kept.
