@@ -34,10 +34,11 @@ class Judged(NamedTuple):
     """For JSON.
 
     Attributes:
-        distances: ``kept``, ``"prior"`` where renders with learnt parameters are surely farther from the images than
-            those with the prior's, else ``"learnt"``; and both energy distances. Where they are no nearer, the guide
-            passes sites of which what is read in its renders is no nearer to what is read in the images. Where they are
-            surely farther all the same, only the sites that bring them nearer alone are kept.
+        distances: ``kept``, ``"learnt"`` where renders with learnt parameters are nearer to the images than those with
+            the prior's, else ``"prior"``; and both energy distances. Where they are no nearer, the guide passes sites of
+            which what is read in its renders is no nearer to what is read in the images; where they are surely farther
+            all the same, all but those that bring them nearer alone. With the others it is kept, unless it is surely
+            farther then.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -51,25 +52,31 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
     learnt = learning.guide
     if learnt is None:
         return Judged({"kept": "prior"}, {})
+    judge = learning.best.held if isinstance(learning, ParameterLearning) and learning.best is not None else None
     look, images = _embed(), {"target": held}
-    real = look(held)
+    real = look(held) if judge is None else judge.real
+
+    def drawn(name: str, model: SceneModel) -> Features:
+        seed_everything(batch_seed(run.record["seed"], 6, int(name == "prior")))
+        images[name] = _renders(run, model, guide, len(held))
+        return look(images[name])
+
+    of_prior = drawn("prior", run.model)
 
     def compared() -> Farther:
-        for i, (name, model) in enumerate({"learnt": learnt.suited(run.model), "prior": run.model}.items()):
-            seed_everything(batch_seed(run.record["seed"], 6, i))
-            images[name] = _renders(run, model, guide, len(held))
-        return farther(look(images["learnt"]), look(images["prior"]), real)
+        return farther(drawn("learnt", learnt.suited(run.model)), of_prior, real)
 
     apart = compared()
-    if apart.one >= apart.other and isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
+    kept = "learnt" if apart.one < apart.other else "prior"
+    if kept == "prior" and isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         learnt.passed = not_nearer(learning, images)
         apart = compared()
-        if apart.sure:
-            learnt.passed = useless(learnt, held_out(run, guide, held))
+        if apart.sure and judge is not None:
+            learnt.passed = useless(learnt, judge)
             apart = compared()
-    kept = "prior" if apart.sure else "learnt"
-    if isinstance(learnt, ParameterGuide) and len(learnt.passed) == len(learnt.sites):
-        kept, learnt.passed = "prior", frozenset()
+        kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
+        if kept == "prior":
+            learnt.passed = frozenset()
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if isinstance(learning, MetaSimLearning):  # which reads nothing
         return Judged(distances, {})
