@@ -35,10 +35,10 @@ class Judged(NamedTuple):
 
     Attributes:
         distances: ``kept``, ``"learnt"`` where renders with learnt parameters are nearer to the images than those with
-            the prior's, else ``"prior"``; and both energy distances. Where they are no nearer, the guide passes sites of
-            which what is read in its renders is no nearer to what is read in the images; where they are surely farther
-            all the same, all but those that bring them nearer alone. With the others it is kept, unless it is surely
-            farther then.
+            the prior's, else ``"prior"``; and both energy distances. Where they are no nearer, the guide passes sites
+            of which what is read in its renders is no nearer to what is read in the images; where they are surely
+            farther all the same, all but those that bring them nearer alone. With the others it is kept, unless its
+            renders are surely farther then.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
