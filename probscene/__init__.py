@@ -37,6 +37,7 @@ _MODULES = {
     "probscene.derivation": ("Derivation",),
     "probscene.derive": ("derive",),
     "probscene.drawing": ("Drawing", "Sprites"),
+    "probscene.enumeration": ("enumerate_derivations",),
     "probscene.errors": (
         "DataError", "GrammarError", "MachineError", "ModelError", "ProbsceneError", "RunError", "SamplingError",
     ),
@@ -87,6 +88,7 @@ if TYPE_CHECKING:
     from .derivation import Derivation
     from .derive import derive
     from .drawing import Drawing, Sprites
+    from .enumeration import enumerate_derivations
     from .errors import DataError, GrammarError, MachineError, ModelError, ProbsceneError, RunError, SamplingError
     from .grammar import Grammar
     from .image_array import ImageArray
@@ -105,8 +107,9 @@ __all__ = [
     "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "ParameterGuide", "Photo",
     "Policy", "Preset", "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError",
     "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World",
-    "compare", "counts", "derive", "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain",
-    "ranked", "render", "report", "sample", "scene_model", "seed_everything", "trial", "weights",
+    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
+    "load_model", "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything", "trial",
+    "weights",
 ]  # fmt: skip
 
 

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
+from torch import Tensor
 
 from .grammar import Grammar
-from .structure import StructurePrior
 
 CRITICAL = 1 - 1e-6  # the table is float32: a spectral radius from here on counts as 1
 
@@ -33,6 +33,10 @@ class Type(NamedTuple):
 class Branching:
     """The types that can occur under a structure prior and what they turn into.
 
+    Args:
+        grammar: the grammar.
+        log_probs: ``(V + 1, P, C, K)`` the table of a ``StructurePrior``.
+
     Attributes:
         types: the I types, the start first.
         owner: ``(E,)`` which type a production expands.
@@ -41,10 +45,10 @@ class Branching:
         children: ``(E, R)`` the types it leaves behind; I pads.
     """
 
-    def __init__(self, grammar: Grammar, prior: StructurePrior):
+    def __init__(self, grammar: Grammar, log_probs: Tensor):
         self.grammar = grammar
-        _, P, C, _ = prior.table.shape
-        table = prior.table.double().exp().numpy()
+        _, P, C, _ = log_probs.shape
+        table = log_probs.double().exp().numpy()
         # A list's repeats become the rank that its elements read, so they are told apart as far as either axis goes.
         last = max(C, P) - 1
         below = [[v for v in row if v >= 0] for row in grammar.children.tolist()]

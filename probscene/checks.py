@@ -131,7 +131,7 @@ def check_grammar(grammar: Grammar, prior: Policy, max_steps: int, samples: int 
 
 
 def _exact(grammar: Grammar, prior: StructurePrior, max_steps: int) -> Report:
-    process = Branching(grammar, prior)
+    process = Branching(grammar, prior.table)
     used = process.expected_rules()
     ends = process.spectral_radius < CRITICAL
     lengths = process.lengths(max_steps, QUANTILES[-1] - ROUNDING, LONGEST_LOOK if ends else 0)

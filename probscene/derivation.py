@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -150,49 +151,46 @@ class Derivation:
 
 
 def expand(grammar: Grammar, choose: Callable[..., Tensor], N: int, max_steps: int) -> Derivation:
-    """Run the stack machine; ``choose(t, frontier, previous_rule)`` gives the rules ``(N,)``, -1 where finished."""
+    """Run the stack machine; ``choose(t, frontier, previous_rule)`` gives the rules ``(N,)``, whatever where finished.
+
+    It counts in numpy, whose calls cost a fraction of torch's where scenes are a few hundred.
+    """
     V, R = len(grammar.nonterminals), grammar.children.shape[1]
-    finished = torch.tensor([V, 0, 0, -1])
+    deepest = 2 + (max_steps + 1) * max(1, R - 1)
     # A stack entry is (symbol, repeat, parent_repeat, owner node); entry 0 is the finished scene and is never popped.
-    stack = finished.repeat(N, 2 + (max_steps + 1) * max(1, R - 1) + R, 1)
-    stack[:, 1] = torch.tensor([0, 0, 0, -1])
-    top = torch.ones(N, dtype=torch.int64)
-    previous = torch.full((N,), -1)
-    nodes = torch.zeros(N, dtype=torch.int64)
-    slots = torch.arange(R)
-    history = []
+    # Scenes lie side by side, so that the next entry is N further.
+    stack = np.zeros((4, (deepest + R) * N), np.int64)
+    stack[0, :N], stack[3] = V, -1
+    scene, above = np.arange(N), N * np.arange(R)[:, None]
+    top, spare, nodes = scene + N, scene + deepest * N + above, np.zeros(N, np.int64)
+    children, owners = grammar.children.T.contiguous().numpy(), grammar.child_owner.T.contiguous().numpy()  # (R, K)
+    same = children == grammar.lhs.numpy()
+    inside = ~same & grammar.recursive[grammar.lhs].numpy()
+    grows, num_objects = N * (grammar.num_children.numpy() - 1), grammar.num_objects.numpy()
+    previous, history = torch.full((N,), -1), []
     for t in range(max_steps):
-        entry = stack.gather(1, top.view(N, 1, 1).expand(N, 1, 4)).squeeze(1)
-        symbol, repeat, parent_repeat, owner = entry.unbind(1)
-        if not (symbol < V).any():
+        symbol, repeat, parent_repeat, owner = (part.take(top) for part in stack)
+        if not np.count_nonzero(symbol < V):
             break
-        rule = choose(t, Frontier(symbol, repeat, parent_repeat), previous)
-        k = rule.clamp(min=0)
-        active = rule >= 0
+        frontier = Frontier(*map(torch.from_numpy, (symbol, repeat, parent_repeat)))
+        rule = np.where(symbol < V, choose(t, frontier, previous).numpy(), -1)
+        previous, active, k = torch.from_numpy(rule), rule >= 0, np.maximum(rule, 0)
         history.append((rule, nodes, owner, symbol, repeat, parent_repeat))
-        child, below = grammar.children[k], grammar.child_owner[k]  # (N, R)
-        same = child == symbol.unsqueeze(1)
-        around = repeat.where(grammar.recursive[symbol], parent_repeat).unsqueeze(1)
-        pushed = torch.stack(
-            [
-                child,
-                (repeat.unsqueeze(1) + 1) * same,
-                parent_repeat.unsqueeze(1).where(same, around),
-                owner.unsqueeze(1).where(below < 0, nodes.unsqueeze(1) + below),
-            ],
-            -1,
-        )
+        below = owners.take(k, 1)  # (R, N)
         # Writing the padding too is harmless: what lies above the new top is overwritten before it is popped.
-        at = (top.unsqueeze(1) + slots).where(active.unsqueeze(1), stack.shape[1] - R + slots)
-        stack = stack.scatter(1, at.unsqueeze(-1).expand(N, R, 4), pushed)
-        top = top + (grammar.num_children[k] - 1) * active
-        nodes = nodes + grammar.num_objects[k] * active
-        previous = rule
+        at = np.where(active, top + above, spare)
+        stack[0][at] = children.take(k, 1)
+        stack[1][at] = (repeat + 1) * same.take(k, 1)
+        stack[2][at] = parent_repeat + (repeat - parent_repeat) * inside.take(k, 1)
+        stack[3][at] = np.where(below < 0, owner, nodes + below)
+        top = top + grows.take(k) * active
+        nodes = nodes + num_objects.take(k) * active
     if not history:
-        history.append((torch.full((N,), -1), nodes, nodes, torch.full((N,), V), nodes, nodes))
-    rules, base, owner, symbol, repeat, parent_repeat = (torch.stack(x, 1) for x in zip(*history, strict=True))
-    kind, parent = _scene_graph(grammar, rules, base, owner, nodes)
-    return Derivation(rules, top == 0, kind, parent, Frontier(symbol, repeat, parent_repeat))
+        history.append((np.full(N, -1), nodes, nodes, np.full(N, V), nodes, nodes))
+    columns = np.ascontiguousarray(np.array(history).transpose(1, 2, 0))  # (6, N, T)
+    rules, base, owner, symbol, repeat, parent_repeat = torch.from_numpy(columns).unbind()
+    kind, parent = _scene_graph(grammar, rules, base, owner, torch.from_numpy(nodes))
+    return Derivation(rules, torch.from_numpy(top < N), kind, parent, Frontier(symbol, repeat, parent_repeat))
 
 
 def _scene_graph(grammar: Grammar, rules: Tensor, base: Tensor, owner: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,29 +5,39 @@ masked. ``Given`` is an effect handler that hands ``derive`` what is derived alr
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import cast
 
 import pyro
-import pyro.distributions as dist
 import torch
+from pyro.ops.provenance import detach_provenance, get_provenance, track_provenance
+from pyro.poutine.indep_messenger import IndepMessenger
 from pyro.poutine.messenger import Messenger
-from pyro.poutine.runtime import effectful
+from pyro.poutine.runtime import _PYRO_STACK, effectful
 from torch import Tensor
 
-from .derivation import Derivation, expand
+from .derivation import Derivation, Frontier, expand
 from .errors import ModelError, SamplingError
 from .grammar import Grammar
 from .policy import Policy, masked
+from .rules import Choice, RuleCategorical
+
+RULE = "rule"  # of sites, before _0
 
 
 @effectful(type="derive")
 def _derived(grammar: Grammar, choose: Callable[..., Tensor], num_scenes: int, max_steps: int) -> Derivation:
-    """``expand``, unless a handler has the derivations."""
+    """``expand``, unless a handler has the derivations. Its message has a name, which users' handlers may ask for."""
     return expand(grammar, choose, num_scenes, max_steps)
+
+
+_effect = cast(Callable[..., Derivation], _derived)  # which takes a name as well
 
 
 class Given(Messenger):
     """Inside it ``derive`` gives derivations that are known: the stack machine does not run, and no ``rule_t`` is a
-    site. A program that derives scenes of another grammar, or another number of them, still samples.
+    site. A program that derives scenes of another grammar, under another name, or another number of them, still
+    samples.
 
     Args:
         grammar: whose derivations they are.
@@ -41,7 +51,8 @@ class Given(Messenger):
 
     def _pyro_derive(self, msg):
         grammar, _, num_scenes, max_steps = msg["args"]
-        if msg["done"] or num_scenes != len(self.derivation) or grammar.rules != self.grammar.rules:
+        others = msg["name"] != _message(RULE) or num_scenes != len(self.derivation)
+        if msg["done"] or others or grammar.rules != self.grammar.rules:
             return
         longest = self.derivation.rules.shape[1]
         if longest > max_steps and not self.any_length:
@@ -53,27 +64,79 @@ class Given(Messenger):
         msg["value"], msg["done"] = self.derivation, True
 
 
-def derive(grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int) -> Derivation:
+def derive(
+    grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int, *, name: str = RULE, static: bool = False
+) -> Derivation:
     """Sample derivations: a Pyro program with sites ``rule_0``, ``rule_1``, ... of shape ``(N, 1)``.
 
     Call it inside ``pyro.plate("scenes", num_scenes, dim=-2)``. It stops when every scene is complete, at the latest
     after ``max_steps``; what is not complete by then says so in ``Derivation.complete``, for the caller to redraw.
+    Sites are left out where nothing but plates would hear of them; one seed draws the same.
 
     Args:
         policy: the structure prior, a PCFG, or a guide.
+        name: of its sites, before ``_0``. A program that derives several times names all but one, which is that of the
+            ``SceneModel``.
+        static: make ``max_steps`` sites in every call, masked after the last rule, for what needs the same sites in
+            every call: ``Predictive`` and autoguides.
+
+    Raises:
+        ModelError: it is called under a plate of another shape, for vectorised particles or enumeration in parallel; a
+            handler gives a rule that does not expand the nonterminal.
     """
-    memory = policy.start(num_scenes)
+    if _unheard() and not static:
+        return _effect(grammar, Choice(grammar, policy, num_scenes), num_scenes, max_steps, name=_message(name))
+    memory, done = policy.start(num_scenes), 0
+    before = frozenset()  # what the rules depend on, which is lost in ``expand``
 
-    def choose(t, frontier, previous):
-        nonlocal memory
+    def choose(t: int, frontier: Frontier, previous: Tensor) -> Tensor:
+        nonlocal memory, done, before
         logits, memory = policy.step(memory, frontier, previous)
-        active = frontier.symbol < len(grammar.nonterminals)
-        allowed = masked(grammar, logits, frontier, policy.support)
-        rule = dist.Categorical(logits=allowed.unsqueeze(-2), validate_args=False)
-        value = pyro.sample(f"rule_{t}", rule.mask(active.unsqueeze(-1))).squeeze(-1)
-        return value.where(active, -1)
+        active, done = frontier.symbol < len(grammar.nonterminals), t + 1
+        allowed = track_provenance(masked(grammar, logits, frontier, policy.support), before)
+        rule = RuleCategorical(logits=allowed.unsqueeze(-2), validate_args=False)
+        value = pyro.sample(f"{name}_{t}", rule.mask(active.unsqueeze(-1)))
+        before |= get_provenance(value)
+        value = detach_provenance(value)
+        _check(grammar, f"{name}_{t}", value, frontier)
+        return value.squeeze(-1)
 
-    return _derived(grammar, choose, num_scenes, max_steps)
+    derivation = _effect(grammar, choose, num_scenes, max_steps, name=_message(name))
+    for t in range(done, max_steps if static else done):
+        nothing = RuleCategorical(logits=torch.zeros(num_scenes, 1, len(grammar.rules)), validate_args=False)
+        pyro.sample(f"{name}_{t}", nothing.mask(torch.zeros(num_scenes, 1, dtype=torch.bool)))
+    nodes = {key: track_provenance(getattr(derivation, key), before) for key in ("kind", "parent")}
+    return replace(derivation, **nodes) if before else derivation
+
+
+def _message(name: str) -> str:
+    return f"derive_{name}"
+
+
+def _unheard() -> bool:
+    """Whether nothing but plates would hear of a site."""
+    return all(isinstance(handler, IndepMessenger) for handler in _PYRO_STACK)
+
+
+def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> None:
+    """See that a site has one rule a scene, which expands its nonterminal."""
+    shape = len(frontier.symbol), 1
+    if value.shape != shape:
+        raise ModelError(
+            f"Expected site {site!r} of shape {shape}, one rule a scene, actual {tuple(value.shape)}. Call derive "
+            f"inside pyro.plate('scenes', {shape[0]}, dim=-2), and outside vectorised particles and enumeration: take "
+            "num_particles without vectorize_particles, Predictive without parallel, and for a sum over structures "
+            "enumerate_derivations(grammar, max_steps)."
+        )
+    rule = value.squeeze(-1)
+    wrong = ~grammar.legal[frontier.symbol, rule] & (frontier.symbol < len(grammar.nonterminals))
+    if wrong.any():
+        i = int(wrong.nonzero()[0])
+        raise ModelError(
+            f"Expected at site {site!r} a rule of {grammar.nonterminals[int(frontier.symbol[i])]} in scene {i}, actual "
+            f"{int(rule[i])} ({grammar.rules[int(rule[i])]}); condition on Derivation.sites(), and for a sum over "
+            "structures take enumerate_derivations(grammar, max_steps)."
+        )
 
 
 def derive_complete(
@@ -93,7 +156,7 @@ def derive_complete(
         for _ in range(attempts):
             if not len(todo):
                 break
-            drawn = derive(grammar, policy, len(todo), max_steps)
+            drawn = _effect(grammar, Choice(grammar, policy, len(todo)), len(todo), max_steps, name=_message(RULE))
             parts.append((todo[drawn.complete], drawn[drawn.complete]))
             todo = todo[~drawn.complete]
             failures[todo] += 1

@@ -64,6 +64,11 @@ def masked(grammar: Grammar, logits: Tensor, frontier: Frontier, support: "Suppo
     return torch.where(_allowed(grammar, frontier, support), logits, MASKED)
 
 
+def cumulative(logits: Tensor) -> Tensor:
+    """``(..., K)`` the cumulative distribution of logits."""
+    return (logits - logits.logsumexp(-1, keepdim=True)).softmax(-1).cumsum(-1)
+
+
 def rule_log_probs(
     grammar: Grammar, logits: Tensor, derivation: Derivation, support: "Support | None" = None
 ) -> Tensor:

@@ -30,21 +30,28 @@ class SceneGraph:
     Args:
         grammar: the grammar.
         derivation: its derivations.
+        max_nodes: M, for what needs one shape in every call, such as autoguides; as few as the scenes have where None.
 
     Attributes:
         kind: ``(N, M)`` int64, -1 pads.
         parent: ``(N, M)`` int64 node index, -1 for none.
+
+    Raises:
+        ModelError: a scene has more nodes than ``max_nodes``.
     """
 
-    def __init__(self, grammar: Grammar, derivation: Derivation):
+    def __init__(self, grammar: Grammar, derivation: Derivation, max_nodes: int | None = None):
+        if max_nodes is not None:
+            derivation = _as_wide(grammar, derivation, max_nodes)
         self.grammar, self.derivation = grammar, derivation
         self.kind, self.parent = derivation.kind, derivation.parent
         self._plate = pyro.plate("nodes", self.kind.shape[1], dim=-1)
 
     def mask(self, *kinds: str) -> Tensor:
         """``(N, M)`` bool, the nodes of the named kinds."""
-        wanted = torch.tensor([self.grammar.kind(name) for name in kinds])
-        return torch.isin(self.kind, wanted)
+        wanted = torch.zeros(len(self.grammar.kinds) + 1, dtype=torch.bool)  # the last is padding
+        wanted[[self.grammar.kind(name) for name in kinds]] = True
+        return wanted[self.kind]
 
     @contextmanager
     def nodes(self, *kinds: str):
@@ -58,7 +65,8 @@ class SceneGraph:
 
     def of_parent(self, value: Tensor | float, default: float = 0.0) -> Tensor:
         """Each node's parent's entry of ``value (N, M)``; ``default`` where there is no parent."""
-        return _of_parent(torch.as_tensor(value).expand(self.kind.shape), self.parent, default)
+        values = torch.as_tensor(value).expand(self.kind.shape)
+        return cast(Callable[..., Tensor], _of_parent)(values, self.parent, default, name="of_parent")
 
     def rank(self, *kinds: str) -> Tensor:
         """``(N, M)`` int64, how many nodes of these kinds and of the same parent come before a node."""
@@ -145,6 +153,17 @@ class SceneGraph:
                 mask = self.mask(*kinds)
                 found.append(resolve(layer, mask if layer.present is None else mask & layer.present))
         return tuple(found)
+
+
+def _as_wide(grammar: Grammar, derivation: Derivation, max_nodes: int) -> Derivation:
+    derivation = derivation.trimmed()
+    most = derivation.kind.shape[1]
+    if most > max_nodes:
+        raise ModelError(
+            f"Expected scenes of at most max_nodes = {max_nodes} nodes, actual {most}; give SceneGraph a larger "
+            "one, or none."
+        )
+    return derivation.padded(grammar, 0, max_nodes)
 
 
 @effectful(type="of_parent")

@@ -5,17 +5,20 @@ P(n = c) instead: the frontier carries how often the list has repeated, and the 
 hazard h(c) = P(n = c) / P(n >= c).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from .branching import Branching
 from .derivation import Frontier
 from .errors import GrammarError
 from .grammar import Grammar
-from .policy import Policy
+from .policy import Policy, cumulative
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,52 @@ class StructurePrior(Policy):
         table[V, :, :, 0] = 1.0
         self.table = table.log().float()
 
+    def where(self, legal: Callable[[str, int, int], bool], repeats: int = 1, ranks: int = 1) -> "StructurePrior":
+        """This prior without some productions, by what was derived so far.
+
+        Those that are left share the probability: of a list first those that go on, or those that end it, so that its
+        length stays as it was where one of them is left.
+
+        ``prior.where(lambda production, repeat, rank: repeat > 0 or production != "Plates -> ε", repeats=2)``: the list
+        does not end before its first plate. Guides keep to it, as to all that a prior says is impossible.
+
+        Args:
+            legal: whether a production, as the grammar prints it, may be taken after so many repeats of its list, in an
+                element of such a rank in the list around.
+            repeats, ranks: of how many ``legal`` is asked, from 0 on; all later ones are as the last.
+
+        Raises:
+            GrammarError: nothing is left in a state that can be reached, or no production is ever left out.
+        """
+        _, P, C, K = self.table.shape
+        P, C = max(P, ranks), max(C, repeats)
+        table, rules = grown(self.table, P, C).clone(), self.grammar.rules
+        keep = torch.tensor(
+            [[[bool(legal(str(r), c, p)) for r in rules] for c in range(repeats)] for p in range(ranks)]
+        )
+        keep = grown(keep.unsqueeze(0), P, C)[0].expand(len(table) - 1, P, C, K)
+        if keep.all():
+            raise GrammarError(
+                f"Expected a production that is not legal somewhere, actual all legal up to repeat {repeats - 1} and "
+                f"rank {ranks - 1}; write productions as '{rules[0]}'; repeats and ranks say how far is asked."
+            )
+        before, left = table[:-1].double().exp(), torch.zeros(table[:-1].shape, dtype=torch.float64)
+        again = (self.grammar.children == self.grammar.lhs[:, None]).any(1)
+        for group in (again, ~again):
+            share = before * (keep & group)
+            left += share * ((before * group).sum(-1, keepdim=True) / share.sum(-1, keepdim=True)).nan_to_num(0.0, 0.0)
+        empty = (left == 0).all(-1, keepdim=True)
+        table[:-1] = (left / left.sum(-1, keepdim=True)).log().where(~empty, -torch.inf).float()
+        made = StructurePrior.of_table(self.grammar, table)
+        for symbol, repeat, rank in Branching(self.grammar, table).types:
+            if empty[symbol, min(rank, P - 1), min(repeat, C - 1)]:
+                raise GrammarError(
+                    f"Expected a production of {self.grammar.nonterminals[symbol]} that is legal after {repeat} "
+                    f"repeats at rank {rank}, actual none that has a probability there."
+                )
+        table[:-1] = torch.where(empty, grown(self.table, P, C)[:-1], table[:-1])  # which nothing reaches
+        return made
+
     @staticmethod
     def joined(
         grammar: Grammar,
@@ -143,9 +192,26 @@ class StructurePrior(Policy):
         """``(N, T, K)`` at once."""
         return self._look_up(derivation.frontier)
 
-    def _look_up(self, frontier: Frontier) -> Tensor:
+    @cached_property
+    def cumulative(self) -> np.ndarray:
+        """``(K, states)`` the cumulative distributions of the rules."""
+        return cumulative(self.table.flatten(0, 2)).T.contiguous().numpy()
+
+    def state(self, symbol: np.ndarray, repeat: np.ndarray, parent_repeat: np.ndarray) -> np.ndarray:
+        """``(...)`` row of ``table.flatten(0, 2)``, of a frontier."""
         _, P, C, _ = self.table.shape
-        return self.table[frontier.symbol, frontier.parent_repeat.clamp(max=P - 1), frontier.repeat.clamp(max=C - 1)]
+        row = symbol if P == 1 else symbol * P + np.minimum(parent_repeat, P - 1)
+        return row if C == 1 else row * C + np.minimum(repeat, C - 1)
+
+    def _look_up(self, frontier: Frontier) -> Tensor:
+        row = self.state(frontier.symbol.numpy(), frontier.repeat.numpy(), frontier.parent_repeat.numpy())
+        return self.table.flatten(0, 2)[torch.from_numpy(row)]
+
+
+def grown(table: Tensor, P: int, C: int) -> Tensor:
+    """A table ``(..., p, c, K)`` for more ranks and repeats, of which all later ones are as the last."""
+    ranks, repeats = torch.arange(P).clamp(max=table.shape[-3] - 1), torch.arange(C).clamp(max=table.shape[-2] - 1)
+    return table[..., ranks, :, :][..., repeats, :]
 
 
 def hazards(probs: Tensor) -> Tensor:

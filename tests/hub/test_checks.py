@@ -35,14 +35,14 @@ def exact(prior, max_steps, limit=4000):
 @given(st.from_type(StructurePrior))
 def test_lengths_are_those_of_the_enumeration(prior):
     every, q = exact(prior, 8)
-    lengths = Branching(prior.grammar, prior).lengths(8)
+    lengths = Branching(prior.grammar, prior.table).lengths(8)
     for n in range(9):
         assert lengths[n] == pytest.approx(q[every.lengths == n].sum().item(), abs=1e-6)
 
 
 @given(st.from_type(StructurePrior))
 def test_expectations_are_sums_over_the_enumeration(prior):
-    process = Branching(prior.grammar, prior)
+    process = Branching(prior.grammar, prior.table)
     assume(process.longest() <= 14)
     every, q = exact(prior, int(process.longest()))
     report = check_grammar(prior.grammar, prior, 14)
@@ -60,7 +60,7 @@ def test_expectations_are_sums_over_the_enumeration(prior):
 
 @given(st.from_type(StructurePrior))
 def test_the_mean_length_is_the_mean_of_the_lengths(prior):
-    process = Branching(prior.grammar, prior)
+    process = Branching(prior.grammar, prior.table)
     assume(process.spectral_radius < 0.8)
     lengths = process.lengths(300)
     mean = sum(n * p for n, p in enumerate(lengths))
@@ -70,7 +70,7 @@ def test_the_mean_length_is_the_mean_of_the_lengths(prior):
 
 @given(st.floats(0.05, 0.95))
 def test_a_geometric_list(p):
-    process = Branching(LIST, StructurePrior(LIST, Scene=weights(p, 1 - p)))
+    process = Branching(LIST, StructurePrior(LIST, Scene=weights(p, 1 - p)).table)
     assert process.spectral_radius == pytest.approx(p, rel=1e-5) and process.longest() == math.inf
     assert process.expected_rules() == pytest.approx([p / (1 - p), 1], rel=1e-4)
     assert process.lengths(20)[1:] == pytest.approx([(1 - p) * p**n for n in range(20)], abs=1e-6)
@@ -78,7 +78,7 @@ def test_a_geometric_list(p):
 
 @given(st.floats(0.05, 0.45))
 def test_a_binary_tree(p):
-    process = Branching(TREE, StructurePrior(TREE, Scene=weights(p, 1 - p)))
+    process = Branching(TREE, StructurePrior(TREE, Scene=weights(p, 1 - p)).table)
     assert process.spectral_radius == pytest.approx(2 * p, rel=1e-5)
     assert process.expected_rules().sum() == pytest.approx(1 / (1 - 2 * p), rel=1e-4)
     lengths = process.lengths(21)
@@ -91,7 +91,7 @@ def test_a_binary_tree(p):
 @given(st.floats(0.1, 0.9), st.floats(0.1, 0.9))
 def test_two_that_derive_one_another(p, q):
     grammar = Grammar("A -> x B | ε\nB -> A A | y")
-    process = Branching(grammar, StructurePrior(grammar, A=weights(p, 1 - p), B=weights(q, 1 - q)))
+    process = Branching(grammar, StructurePrior(grammar, A=weights(p, 1 - p), B=weights(q, 1 - q)).table)
     assert process.spectral_radius == pytest.approx(math.sqrt(2 * p * q), rel=1e-5)
     if process.spectral_radius < CRITICAL:
         visits = 1 / (1 - 2 * p * q)

@@ -11,7 +11,7 @@ from pyro import poutine
 
 from probscene.derivation import Derivation
 from probscene.derive import derive, derive_complete
-from probscene.errors import GrammarError, SamplingError
+from probscene.errors import GrammarError, ModelError, SamplingError
 from probscene.grammar import Grammar
 from probscene.policy import Policy, rule_log_probs
 from probscene.structure import StructurePrior, counts, weights
@@ -100,6 +100,17 @@ def test_the_trace_scores_the_product_of_the_rules_probabilities(reference, poli
 
 
 @given(ANY_POLICY, SEED)
+def test_a_seed_draws_the_same_scenes_and_what_comes_after_where_nothing_listens(policy, seed):
+    _, heard = traced(policy, seed)
+    after = torch.rand(3)
+    pyro.set_rng_seed(seed)
+    assert same(program(policy), heard)
+    assert torch.equal(torch.rand(3), after)
+    pyro.set_rng_seed(seed)
+    assert same(derive(policy.grammar, policy, N, T), heard)
+
+
+@given(ANY_POLICY, SEED)
 def test_logits_at_once_are_those_step_by_step(policy, seed):
     _, derivation = traced(policy, seed)
     torch.testing.assert_close(policy.logits(derivation), Policy.logits(policy, derivation))
@@ -148,6 +159,25 @@ def test_derivation_of_refuses_rules_after_padding_and_rules_that_are_none():
         Derivation.of(LIST, torch.tensor([[0, 3]]))
     with pytest.raises(GrammarError, match="among 0..2"):
         Derivation.of(LIST, torch.tensor([[0, -2]]))
+
+
+def test_logits_that_are_not_finite_are_named():
+    class Broken(Policy):
+        grammar = Grammar("Scene -> sky | sea")
+
+        def step(self, memory, frontier, previous_rule):
+            return torch.full((len(frontier.symbol), 2), torch.nan), memory
+
+    for run in (program, poutine.trace(program)):
+        with pytest.raises(ModelError, match="finite logits of the rules"):
+            run(Broken())
+
+
+def test_rules_that_stop_early_derive_no_more():
+    grammar = Grammar("Scene -> sky Plates\nPlates -> plate Plates | ε")
+    derivation = Derivation.of(grammar, torch.tensor([[0, 1, -1, -1], [0, 1, 1, 2]]))
+    assert derivation.complete.tolist() == [False, True]
+    assert derivation.kind.tolist() == [[0, 1, -1], [0, 1, 1]]
 
 
 def test_incomplete_derivations_say_so():

@@ -69,7 +69,7 @@ def test_shortest_lengths_are_those_of_the_shortest_derivation(reference, gramma
 def test_what_the_enumeration_lacks_is_longer(prior):
     every = enumerated(prior.grammar, 8)
     total = prior.log_prob(every).double().exp().sum().item()
-    longer = 1 - Branching(prior.grammar, prior).lengths(8).sum()
+    longer = 1 - Branching(prior.grammar, prior.table).lengths(8).sum()
     assert total + longer == pytest.approx(1, abs=1e-5)
 
 

@@ -85,7 +85,7 @@ def test_the_program_registers_its_parameters_and_every_one_gets_a_gradient(kind
     torch.manual_seed(0)
     guide = make_guide(kind, LISTS, 12)
     pyro.clear_param_store()
-    _, derivation = derived(guide, 1, 50)
+    _, derivation = derived(guide, 1, 53)
     assert {f"guide$$${name}" for name, _ in guide.named_parameters()} == set(pyro.get_param_store().keys())
     guide.log_prob(derivation).sum().backward()
     choice = torch.tensor([len(LISTS.rules_of(rule.lhs)) > 1 for rule in LISTS.rules])

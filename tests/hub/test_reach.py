@@ -87,7 +87,7 @@ def test_list_bounds_are_those_of_the_lists_that_are_derived(pair):
     grammar, prior = pair
     every = enumerate_derivations(grammar, 16)
     found = every[prior.log_prob(every) > -torch.inf]
-    assume(len(found) and Branching(grammar, prior).longest() <= 16)
+    assume(len(found) and Branching(grammar, prior.table).longest() <= 16)
     for bounds in bounded_lists(grammar, prior, Support.of(grammar, [prior])):
         own = lengths(grammar, found, bounds.symbol).of(bounds, prior.table.shape[1])
         assert (own.min(), own.max()) == (bounds.shortest, bounds.prior) and bounds.prior == bounds.longest
@@ -104,7 +104,7 @@ def test_shares_of_lengths_are_those_of_samples():
     ]  # fmt: skip
     for bounds in every:
         found = lengths(NESTED, drawn, bounds.symbol).of(bounds, 2)
-        share = share_from(Branching(NESTED, prior), bounds, bounds.longest)
+        share = share_from(Branching(NESTED, prior.table), bounds, bounds.longest)
         assert abs((found >= bounds.longest).mean() - share) < 5 * (share * (1 - share) / len(found)) ** 0.5
 
 

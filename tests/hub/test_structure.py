@@ -9,7 +9,9 @@ from probscene.derivation import Derivation
 from probscene.enumeration import enumerate_derivations
 from probscene.errors import GrammarError
 from probscene.grammar import Grammar
+from probscene.inference.guides.lstm import LSTMGuide
 from probscene.structure import StructurePrior, counts, hazards, ranked, weights
+from probscene.support import Support
 
 LIST = Grammar("Scene -> bg Items\nItems -> x Items | y Items | ε")
 ROADS = Grammar("Scene -> Roads\nRoads -> Road Roads | ε\nRoad -> road(Cars)\nCars -> car Cars | ε")
@@ -180,3 +182,65 @@ def enumerate_derivations_or_skip(grammar):
         return enumerate_derivations(grammar, 8, limit=2000)
     except GrammarError:
         assume(False)
+
+
+def test_a_production_may_depend_on_how_far_its_list_is():
+    """No two of a kind in a row, by whether the repeat is even: exactly the derivations that a person would list."""
+    prior = StructurePrior(LIST, Items=counts(1, 1, 1, 1))
+
+    def legal(production, repeat, rank):
+        return production != ("Items -> y Items" if repeat % 2 == 0 else "Items -> x Items")
+
+    x, y = LIST.kind("x"), LIST.kind("y")
+    found = distribution(
+        prior.where(legal, repeats=4), 6, lambda some, i: tuple(some.kind[i][some.kind[i] > 0].tolist())
+    )
+    assert found == pytest.approx({(x, y, x)[:n]: 0.25 for n in range(4)}, abs=1e-6)
+
+
+def test_a_production_may_depend_on_the_rank_around():
+    prior = StructurePrior(ROADS, Roads=counts(0, 0, 1), Cars=counts(1, 1))
+    no_first = prior.where(lambda production, _, rank: rank > 0 or production != "Cars -> car Cars", ranks=2)
+    assert distribution(no_first, 12, times(ROADS.kind("car"))) == pytest.approx({0: 0.5, 1: 0.5}, abs=1e-6)
+    assert (distribution(prior, 12, times(ROADS.kind("car")))).keys() == {0, 1, 2}
+
+
+def test_a_guide_keeps_to_what_is_legal():
+    prior = StructurePrior(LIST, Items=counts(1, 1, 1))
+    first_is_x = prior.where(lambda production, repeat, _: repeat > 0 or "y" not in production, repeats=2)
+    support = Support.of(LIST, [first_is_x])
+    guide = LSTMGuide(LIST, 6)
+    guide.support = support
+    every = enumerate_derivations(LIST, 6)
+    possible = first_is_x.log_prob(every) > -torch.inf
+    with torch.no_grad():
+        q = guide.log_prob(every)
+    assert torch.equal(q > -torch.inf, possible)
+    assert float(q.exp().sum()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_what_leaves_nothing_or_says_nothing_is_named():
+    prior = StructurePrior(LIST, Items=counts(1, 1))
+    with pytest.raises(GrammarError, match="of Items that is legal after 1 repeats at rank 0"):
+        prior.where(lambda production, repeat, _: repeat < 1 or "ε" not in production, repeats=2)
+    with pytest.raises(GrammarError, match="not legal somewhere, actual all legal up to repeat 0"):
+        prior.where(lambda *_: True)
+
+
+@given(PROBS, st.integers(0, 2**31))
+def test_a_list_stays_as_long_where_one_production_that_goes_on_is_left(probs, seed):
+    prior = StructurePrior(LIST, Items=counts(*probs, weights=(1, 3)))
+    keep = torch.rand(len(probs), 2, generator=torch.Generator().manual_seed(seed)) < 0.6
+    keep[:, 0] |= ~keep.any(1)
+    assume(not keep.all())
+    names = ("Items -> x Items", "Items -> y Items")
+    legal = {name: keep[:, i].tolist() for i, name in enumerate(names)}
+    made = prior.where(lambda production, repeat, _: legal.get(production, [True] * 9)[repeat], repeats=len(probs))
+
+    def length(some, i):
+        return int((some.kind[i] > 0).sum())
+
+    same(distribution(made, len(probs) + 2, length), normalised(probs))
+    x = distribution(made, len(probs) + 2, lambda some, i: tuple(some.kind[i][some.kind[i] > 0].tolist()))
+    kinds = [LIST.kind("x"), LIST.kind("y")]
+    assert all(keep[place, kinds.index(kind)] for row in x for place, kind in enumerate(row))

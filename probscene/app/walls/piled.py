@@ -119,7 +119,7 @@ def piled(model: SceneModel, guide: Policy, read: Source | None, seed: int = 0) 
             parts = derive_complete(model.grammar, guide, SCENES, model.max_steps)[0]
     except SamplingError:  # a guide whose scenes hardly end says nothing of its lists
         return ()
-    before = [Branching(model.grammar, table) for table in (prior, policy)]
+    before = [Branching(model.grammar, one.table) for one in (prior, policy)]
     found = []
     for bounds in every:
         learnt = lengths(model.grammar, parts, bounds.symbol).of(bounds, support.possible.shape[1])

@@ -60,7 +60,7 @@ def steps_for(model: SceneModel, bounds: ListBounds, longest: int) -> int:
 @lru_cache(maxsize=4)
 def _longest_kept(grammar: Grammar, prior: StructurePrior, max_steps: int) -> int:
     """The fewest rules that nearly all of a prior's derivations keep to."""
-    process = Branching(grammar, prior)
+    process = Branching(grammar, prior.table)
     known = process.lengths(max_steps, KEPT, FOLLOWED if process.spectral_radius < 1 else 0)
     enough = (known.cumsum() >= KEPT).nonzero()[0]
     return int(enough[0]) if len(enough) else len(known) - 1
