@@ -1,8 +1,10 @@
 """Parameters from unlabelled images: a reader, maximum likelihood on what it reads, rounds of both, and refinement.
 
-1. A reader is trained on renders (``reader_training``), half of them arranged as the prior hardly arranges them.
+1. A reader is trained on renders (``reading.training``), half of them arranged as the prior hardly arranges them, and
+   then what it reads of whole scenes.
 2. It is tried on renders of the prior: sites that it can read are learnt, the others keep their prior (``skill``).
-3. It reads the target; a guide learns the values by maximum likelihood (``likelihood``).
+3. It reads the target; a guide learns the values by maximum likelihood (``likelihood``), in which objects that are
+   found less often count more (``reading.inclusion``).
 4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
    reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
 5. What is read in the guide's renders is brought to what is read in the target (``energy``).
@@ -31,7 +33,7 @@ from .reading.assembly import Assembly, along_the_widest, assembly
 from .reading.eyes import Eye
 from .reading.reader import Reader
 from .reading.skill import Skill
-from .reading.training import ReaderTraining, Valued
+from .reading.training import EACH, OverallTraining, ReaderTraining, Valued
 from .reading.tried import TriedReader, kinds_of, matched
 from .reading.valued import Label, ValuedRenders, joined
 from .schedule import ParameterSchedule
@@ -41,7 +43,7 @@ TRIED = 200  # renders that a reader is tried on
 OWN = 0.65  # of a round's renders are the guide's own
 AHEAD = 8  # steps for which they are drawn together
 ARRANGED = 0.5  # of the other renders are arranged
-READING, LIKELIHOOD, ENERGY = "reading", "likelihood", "energy"
+READING, SCENES, LIKELIHOOD, ENERGY = "reading", "scenes", "likelihood", "energy"
 
 
 class ParameterLearning:
@@ -87,14 +89,16 @@ class ParameterLearning:
         self.renders = ValuedRenders(model, label, self.node_sites, self.scene_sites)
         reader = Reader(eye, len(model.classes), len(self.node_sites), len(self.scene_sites))
         self.tried = TriedReader(model, reader, self.node_sites, self.scene_sites)
-        again = [(READING, schedule.round_reader_steps), (LIKELIHOOD, schedule.round_steps)]
-        phases = [(READING, schedule.reader_steps), (LIKELIHOOD, schedule.steps), *again * schedule.rounds]
-        phases += [(ENERGY, schedule.energy_steps)] if schedule.energy_steps else []
+        overall, again = schedule.scene_renders // EACH, schedule.round_scene_renders // EACH
+        phases = [(READING, schedule.reader_steps), (SCENES, overall), (LIKELIHOOD, schedule.steps)]
+        once_more = [(READING, schedule.round_reader_steps), (SCENES, again), (LIKELIHOOD, schedule.round_steps)]
+        phases += [*once_more * schedule.rounds, (ENERGY, schedule.energy_steps)]
+        phases = [(what, steps) for what, steps in phases if steps and (what != SCENES or self.scene_sites)]
         self.phases, self.lengths = [what for what, _ in phases], [steps for _, steps in phases]
         self.total, self.done, self.phase = sum(self.lengths), 0, 0
         self.guide: ParameterGuide | None = None
         self.inner: Training | None = None
-        self.ahead: tuple[tuple[int, int], Valued | None] = (-1, -1), None
+        self.ahead: tuple[tuple[int, int], list[Valued]] = (-1, -1), []
 
     @property
     def learnt(self) -> tuple[Site, ...]:
@@ -113,10 +117,12 @@ class ParameterLearning:
             ProbsceneError: a loss is no longer finite.
         """
         while self.phase < len(self.lengths):
-            if self.phase and not self.learnt:  # nothing can be read
+            if self.tried.skill is None and self.phases[self.phase] == LIKELIHOOD:
+                self._try()
+            if self.tried.skill is not None and not self.learnt:  # nothing can be read
                 self.phase, self.done = len(self.lengths), self.total
                 return
-            if self.phases[self.phase] == ENERGY and not self.tried.noisy.any():
+            if self._idle:
                 self.phase += 1
                 self.done = sum(self.lengths[: self.phase])
                 continue
@@ -131,12 +137,10 @@ class ParameterLearning:
 
             self.inner.run(heard)
             self.inner = None
-            if self.phases[self.phase] != READING and self.best is not None and self.guide is not None:
+            if self.phases[self.phase] in (LIKELIHOOD, ENERGY) and self.best is not None and self.guide is not None:
                 self.best.after(self.guide)
             self.phase += 1
             self.done = sum(self.lengths[: self.phase])
-            if self.phase == 1:
-                self._try()
 
     def summary(self) -> dict[str, Any]:
         """Nothing more for the log."""
@@ -178,10 +182,14 @@ class ParameterLearning:
     def _begun(self) -> Training:
         """The training of this phase, from its first step."""
         schedule, what, steps = self.schedule, self.phases[self.phase], self.lengths[self.phase]
-        first, seed = self.phase < 2, batch_seed(self.seed, 1, self.phase)
+        first = self.guide is None or self.phase == self.phases.index(LIKELIHOOD)
+        seed = batch_seed(self.seed, 1, self.phase)
         if what == READING:
             rate = schedule.reader_rate / (1 if first else 2)
             return ReaderTraining(self.tried.reader, self._drawn, steps, schedule.reader_images, rate, seed)
+        if what == SCENES:
+            rate = schedule.scene_rate / (1 if first else 2)
+            return OverallTraining(self.tried.reader.overall, self._entered, EACH * steps, rate, seed)
         guide = self.guide
         assert guide is not None
         values, made = self._read()
@@ -191,29 +199,44 @@ class ParameterLearning:
                 guide.net, values, partial(self._own, made), self.tried.noisy, steps, scenes, rate, seed
             )
         rate = schedule.rate if first else 0.6 * schedule.rate
+        values = values._replace(weight=self.tried.inclusion(self._own_scenes(TRIED)).weight(values.kind, values.nodes))
         return MaximumLikelihood(guide.net, values, steps, learning_rate=rate, seed=seed)
 
-    def _drawn(self, num: int) -> Valued:
-        """Renders for a step of the reader."""
-        own = 0 if self.guide is None else round(OWN * num)
-        first = [self._own_renders(own)] if own else []
-        others = self.renders.draw(num - own, self.model.pretraining_policy, arranged=ARRANGED)
-        return joined([others, *first])  # both in each step, as batch norm is of what a step looks at
+    @property
+    def _idle(self) -> bool:
+        """Whether there is nothing to do in this phase."""
+        what = self.phases[self.phase]
+        if what == SCENES:
+            return self.tried.skill is not None and not len(self.tried.columns[1])
+        return what == ENERGY and not self.tried.noisy.any()
 
-    def _own_renders(self, num: int) -> Valued:
-        """The guide's, for a step of the reader. Those of several steps are drawn together: a guide goes from node to
-        node, for many scenes as fast as for one."""
-        training, guide = cast(ReaderTraining, self.inner), self.guide
-        assert guide is not None
+    def _entered(self, num: int) -> tuple[Tensor, Tensor]:
+        """Renders for what is read of the whole scene."""
+        own = 0 if self.guide is None else round(OWN * num)
+        drawn = [self.renders.draw(num - own, self.model.pretraining_policy, arranged=ARRANGED)]
+        if own:
+            drawn.append(self._own_scenes(own))
+        entered = [self.tried.reader.eye.enter(some.drawn.image) for some in drawn]
+        return torch.cat(entered), torch.cat([some.overall for some in drawn])
+
+    def _drawn(self, num: int) -> Valued:
+        """Renders for a step of the reader. Those of several steps are drawn together, which takes hardly longer: a
+        program runs once, and a guide goes from node to node for many scenes as fast as for one."""
+        training, own = cast(ReaderTraining, self.inner), 0 if self.guide is None else round(OWN * num)
         part, place = divmod(training.done, AHEAD)
         if (self.phase, part) != self.ahead[0]:
             seed_everything(batch_seed(self.seed, 5, self.phase, part))
-            drawn = self.renders.draw(AHEAD * num, self.structure, guide.suited(self.model))
-            self.ahead = (self.phase, part), drawn
+            drawn = [self.renders.draw(AHEAD * (num - own), self.model.pretraining_policy, arranged=ARRANGED)]
+            self.ahead = (self.phase, part), [*drawn, self._own_scenes(AHEAD * own)] if own else drawn
             seed_everything(batch_seed(training.seed, training.done))  # as where they were drawn before
-        drawn = self.ahead[1]
-        assert drawn is not None
-        return drawn.of(slice(place * num, (place + 1) * num))
+        numbers = (num - own, own)
+        parts = [some.of(slice(place * n, (place + 1) * n)) for some, n in zip(self.ahead[1], numbers, strict=False)]
+        return joined(parts)  # both in each step, as batch norm is of what a step looks at
+
+    def _own_scenes(self, num: int) -> Valued:
+        """The guide's renders."""
+        assert self.guide is not None
+        return self.renders.draw(num, self.structure, self.guide.suited(self.model))
 
     def _try(self) -> None:
         """See what the reader can read in the prior's renders."""
@@ -250,13 +273,11 @@ class ParameterLearning:
     @torch.no_grad()
     def _own(self, made: Assembly, num: int) -> OwnReadings:
         """What it reads in renders of the guide."""
-        assert self.guide is not None
-        valued = self.renders.draw(num, self.structure, self.guide.suited(self.model))
+        valued = self._own_scenes(num)
         found = self.tried.reader.find(valued.drawn.image)
         read, which = self.tried.values(made, found, num, matched(found, valued))
         node, scene = self.tried.columns
-        u, kind = valued.u[..., node], kinds_of(self.model, valued.drawn.label)
-        return OwnReadings(kind, valued.parent, u, valued.overall[:, scene], read, which)
+        return OwnReadings(valued.kind, valued.parent, valued.u[..., node], valued.overall[:, scene], read, which)
 
     @cached_property
     def _assembly(self) -> Assembly:

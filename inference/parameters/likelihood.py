@@ -37,6 +37,7 @@ class Values(NamedTuple):
         nodes, nodes_sd: ``(L, M, S)`` u and its standard deviation.
         scene, scene_sd: ``(L, G)``.
         turns: ``(S + G,)`` bool, those read on a circle.
+        weight: ``(L, M)`` how much each node counts; all count 1 where None.
     """
 
     kind: Tensor
@@ -46,6 +47,7 @@ class Values(NamedTuple):
     scene: Tensor
     scene_sd: Tensor
     turns: Tensor
+    weight: Tensor | None = None
 
     def of(self, rows: Tensor) -> "Values":
         """Some images', without nodes that only pad."""
@@ -59,6 +61,7 @@ class Values(NamedTuple):
             self.scene[rows],
             self.scene_sd[rows],
             self.turns,
+            None if self.weight is None else self.weight[rows, :M],
         )
 
     def site(self, number: int) -> "Values":
@@ -74,6 +77,7 @@ class Values(NamedTuple):
             self.scene[:, scene],
             self.scene_sd[:, scene],
             self.turns[node],
+            self.weight,
         )
 
     def drawn(self) -> "Values":
@@ -119,12 +123,12 @@ def _taken(candidates: Tensor, log_weight: Tensor) -> Tensor:
 
 
 def log_density(net: ParameterNet, values: Values) -> Tensor:
-    """``(L, S + G)`` nats of the u of each site, summed over the nodes that have it."""
+    """``(L, S + G)`` nats of the u of each site, summed over the nodes that have it, as much as each counts."""
     graph = Graph.of(values.kind, values.parent)
-    parts = []
+    weight, parts = 1.0 if values.weight is None else values.weight, []
     for s in range(net.node_sites):
         u = values.nodes[..., s]
-        found = net.node_mixture(graph, values.scene, values.nodes, s).log_prob(u.nan_to_num(0.5))
+        found = weight * net.node_mixture(graph, values.scene, values.nodes, s).log_prob(u.nan_to_num(0.5))
         parts.append(found.where(~u.isnan(), 0.0).sum(1))
     for g in range(net.scene_sites):
         u = values.scene[:, g]

@@ -67,17 +67,16 @@ class Reader(nn.Module):
             bias.zero_()
             bias[0] = 3.0
 
-    def forward(self, entered: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, entered: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of what has entered the eye: logits ``(N, 1 + C, h, w)``; how many cells away an object's parent is ``(N, 2,
-        h, w)``; what is said of u of nodes ``(N, S, 2 + HARMONICS, h, w)`` and of scenes ``(N, G, 2 + HARMONICS)``."""
+        h, w)``; what is said of u of nodes ``(N, S, 2 + HARMONICS, h, w)``."""
         seen = self.eye(entered)
         h, w = seen.shape[-2:]
         y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
         place = torch.stack([x, y]).expand(len(seen), 2, h, w)
         hidden = F.relu(self.hidden(torch.cat([seen, place], 1)))
         parent, values = self.values(hidden).tensor_split([2], 1)
-        overall = self.overall(entered, seen)[:, : self.scene_sites]
-        return self.what(seen), parent, values.reshape(len(seen), self.sites, 2 + HARMONICS, h, w), overall
+        return self.what(seen), parent, values.reshape(len(seen), self.sites, 2 + HARMONICS, h, w)
 
     @torch.no_grad()
     def find(self, images: Tensor) -> Found:
@@ -86,7 +85,8 @@ class Reader(nn.Module):
         return Found(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
     def _find(self, images: Tensor, first: int) -> Found:
-        logits, parent, values, overall = self(self.eye.enter(images))
+        entered = self.eye.enter(images)
+        logits, parent, values = self(entered)
         mass = logits.softmax(1)[:, 1:]
         n, y, x = blocks(mass.sum(1))
         rows, columns = torch.stack([y, y, y + 1, y + 1], 1), torch.stack([x, x + 1, x, x + 1], 1)  # (K, 4)
@@ -102,7 +102,7 @@ class Reader(nn.Module):
             scale * (share * here).sum(1),
             scale * (share * (here + parent[image, :, rows, columns])).sum(1),
             (share.unsqueeze(-1) * values[image, :, :, rows, columns]).sum(1),
-            overall,
+            self.overall(entered)[:, : self.scene_sites],
         )
 
 

@@ -1,6 +1,8 @@
 """Training a ``Reader`` on renders, whose labels and values come free.
 
-Axis letters: N images, M nodes, S sites.
+What is of nodes is learnt from renders that are seen once each: they have many nodes. What is of the scene, one value a
+render, is learnt apart, from renders that are kept as the few numbers that it looks at, and seen many times. Axis
+letters: N images, M nodes, S sites of nodes, G sites of scenes, E numbers.
 """
 
 from collections.abc import Callable
@@ -10,21 +12,29 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from probscene.sampling import seed_everything
+
 from ...features.base import Examples
 from ...features.counting.batches import STRIDE as CELL
 from ...features.counting.batches import cells, shares
 from ...steps import StepTraining
+from ...training import batch_seed
+from .overall import NUMBERS, Overall, looks
 from .reader import Reader, value_loss
 
 MIN_VISIBLE = 0.25
 KEPT = 0.25  # of the rate, for convolutions that know the classes already
+SCENE_IMAGES = 64  # of a step on sites of scenes
+TOGETHER, APART = 256, 64  # renders that are drawn at once; steps from then until the next are
+EACH = 2  # renders for each step
 
 
 class Valued(NamedTuple):
     """Labelled renders and the values of their sites.
 
     Attributes:
-        drawn: the labels.
+        drawn: the labels, of what can be seen.
+        kind: ``(N, M)`` int64 the grammar's kind of each node that has a class, -1 for none.
         parent: ``(N, M)`` int64 node index of the nearest parent that has a class, -1 for none.
         group: ``(N, M)`` int64 node index in the derivation of the parent, whether that has a class or not.
         u: ``(N, M, S)``, NaN where a node has none.
@@ -32,6 +42,7 @@ class Valued(NamedTuple):
     """
 
     drawn: Examples
+    kind: Tensor
     parent: Tensor
     group: Tensor
     u: Tensor
@@ -78,10 +89,57 @@ class ReaderTraining(StepTraining):
         return reader_loss(self.reader, self.draw(self.images))
 
 
+class OverallTraining(StepTraining):
+    """Resumable training of an ``Overall``. In its first half renders are drawn, from all of which it learns.
+
+    Args:
+        overall: trained in place.
+        draw: so many images as they enter, and the u of their scenes' sites ``(N, G)``, NaN where there is none.
+        renders: in all.
+        learning_rate: the largest.
+        seed: of everything random.
+    """
+
+    what = "the reader of scenes"
+
+    def __init__(
+        self,
+        overall: Overall,
+        draw: Callable[[int], tuple[Tensor, Tensor]],
+        renders: int = 4096,
+        learning_rate: float = 2e-3,
+        seed: int = 0,
+    ):
+        adam = torch.optim.AdamW(overall.parameters(), lr=learning_rate, weight_decay=1e-2)
+        super().__init__(overall, adam, -(-renders // EACH), seed, warming=30)
+        self.overall, self.draw, self.drawn = overall, draw, 0
+        self.looks, self.u = torch.empty(renders, NUMBERS), torch.empty(renders, overall.sites)
+
+    def loss(self) -> Tensor:
+        """See ``StepTraining``."""
+        state = torch.get_rng_state()
+        while self.drawn < min(len(self.u), TOGETHER * (1 + self.done // APART)):  # again where it has been resumed
+            self._draw()
+        torch.set_rng_state(state)
+        rows = torch.randint(self.drawn, (SCENE_IMAGES,))
+        u = self.u[rows]
+        return value_loss(self.overall.said(self.looks[rows]), u.nan_to_num(0.5)).where(~u.isnan(), 0.0).sum(1).mean()
+
+    @torch.no_grad()
+    def _draw(self) -> None:
+        seed_everything(batch_seed(self.seed, self.total, self.drawn))
+        rows = slice(self.drawn, min(self.drawn + TOGETHER, len(self.u)))
+        images, self.u[rows] = self.draw(rows.stop - rows.start)
+        self.looks[rows] = looks(images)
+        if not self.drawn:
+            self.overall.follow(self.looks[rows])
+        self.drawn = rows.stop
+
+
 def reader_loss(reader: Reader, valued: Valued) -> Tensor:
     """Cross-entropy of the cells, the error of where parents are, and of u, summed over an image's objects."""
     drawn, scale = valued.drawn, reader.eye.cell
-    logits, parent, said, overall = reader(reader.eye.enter(drawn.image))
+    logits, parent, said = reader(reader.eye.enter(drawn.image))
     h, w = logits.shape[-2:]
     label = drawn.label.masked_fill(drawn.visible < MIN_VISIBLE, -1)
     target = cells(drawn.centre / scale * CELL, label, reader.classes, h, w)
@@ -90,9 +148,8 @@ def reader_loss(reader: Reader, valued: Valued) -> Tensor:
     n, m, i, j, share = (torch.cat(part) for part in parts)
     u = valued.u[n, m]
     of_values = value_loss(said[n, :, :, i, j], u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
-    of_scene = value_loss(overall, valued.overall.nan_to_num(0.5)).where(~valued.overall.isnan(), 0.0)
     has = (valued.parent[n, m] >= 0).float()
     at = drawn.centre[n, valued.parent[n, m].clamp(min=0)] / scale
     away = (torch.stack([j, i], -1) + 0.5 + parent[n, :, i, j] - at).abs().clamp(max=20.0).sum(-1)
-    of_nodes = (share * (of_values.sum(1) + has * away)).sum() + of_scene.sum()
+    of_nodes = (share * (of_values.sum(1) + has * away)).sum()
     return entropy + of_nodes / len(logits)

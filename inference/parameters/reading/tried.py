@@ -11,6 +11,7 @@ from probscene.model import SceneModel
 from ..likelihood import Values
 from ..sites import Site, having
 from .assembly import Assembly
+from .inclusion import Inclusion
 from .reader import Found, Reader
 from .skill import Skill
 from .training import MIN_VISIBLE, Valued
@@ -109,6 +110,17 @@ class TriedReader:
         turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
         mean, sd = (part.where(has, torch.nan) for part in (both[..., :-1], sd))
         return Values(kind, parent, mean, sd, scene_mean, scene_sd, turns), both[..., -1].nan_to_num(-1).long()
+
+    def inclusion(self, valued: Valued) -> Inclusion:
+        """How likely objects are found by their learnt values, from some renders."""
+        found = self.reader.find(valued.drawn.image)
+        which, kind = matched(found, valued), valued.kind
+        is_it = (which >= 0) & (found.label == valued.drawn.label[found.image, which])
+        there = torch.zeros_like(kind, dtype=torch.bool)
+        there[found.image[is_it], which[is_it]] = True
+        node, skills = self.columns[0], self._skills()[0]
+        some = kind >= 0
+        return Inclusion(kind[some], valued.u[..., node][some], there[some], skills.turns[node])
 
     def _skills(self) -> tuple[Skill, Skill]:
         """Of the sites of nodes, and of scenes."""

@@ -71,6 +71,7 @@ class ValuedRenders:
                 size=nodes(drawn.size, 0.0),
                 visible=nodes(drawn.visible, 0.0),
             ),
+            seen.kind,
             seen.parent,
             nodes(derivation.parent, -1),
             nodes(u, torch.nan),
@@ -100,7 +101,7 @@ def joined(parts: list[Valued]) -> Valued:
         **{name: all_of(name) for name in ("label", "centre", "size", "visible")},
     )
     overall = torch.cat([part.overall for part in parts])
-    return Valued(drawn, all_of("parent"), all_of("group"), all_of("u", torch.nan), overall)
+    return Valued(drawn, all_of("kind"), all_of("parent"), all_of("group"), all_of("u", torch.nan), overall)
 
 
 def _padded(part: Tensor, nodes: int, empty: float) -> Tensor:

@@ -55,6 +55,21 @@ def test_the_error_of_readings_is_taken_out():
     assert float(values.drawn().nodes.std(0).mean()) > 0.13 and float(spread) < 0.085
 
 
+def test_a_node_that_counts_double_is_as_good_as_two():
+    net, values = ParameterNet(1, 2, 0, hidden=8), rows(5, noise=0.1)
+    torch.nn.init.normal_(net.out[0].weight)
+    weight = torch.tensor([0.0, 1.0, 3.0]).expand(5, 3)
+    with torch.no_grad():
+        found = log_density(net, values._replace(weight=weight))
+        each = [log_density(net, values._replace(weight=1.0 * (torch.arange(3) == m).expand(5, 3))) for m in range(3)]
+        assert torch.allclose(log_density(net, values), sum(each), atol=1e-4)
+    assert torch.allclose(found, each[1] + 3 * each[2], atol=1e-4)
+    rows_of = torch.tensor([3, 1])
+    assert torch.equal(
+        values._replace(weight=weight * torch.arange(5)[:, None]).of(rows_of).weight[:, 1], rows_of.float()
+    )
+
+
 def test_learning_goes_on_to_the_same_bits():
     def learnt():
         torch.manual_seed(0)
