@@ -1,35 +1,49 @@
-"""Whether a fit to real street frames comes closer to them than the prior: numbers of cars, FID and KID.
+"""Whether a fit to real street frames comes closer to them than the prior: numbers of cars, FID and KID, looks.
 
     python benchmarks/learn_street.py FRAMES/ LABELS --out FOLDER [--seeds 0 1 2] [--min-height 25]
+        [--learn structure,parameters]
 
 Fits see the images alone. ``LABELS`` is KITTI's ``label_2``, or a CSV of counts, of the same images. Cars of scenes are
 counted as the labels count them, of 2,000 rendered scenes (``probscene evaluate``). Printed for each seed: total
 variation and Wasserstein-1 of the number of cars from the labels', FID and KID in EfficientNet's features, each for the
-prior, the start and what was learnt; FOLDER holds the runs, ``results.json`` and a histogram, ``cars.png``.
+prior, the start and what was learnt; FOLDER holds the runs, ``results.json`` and a histogram, ``cars.png``. Where
+parameters are learnt, too, the same distances of learnt structures with the prior's parameters follow as ``structure``,
+and of frames and of images of each source what a photographer would say: how bright they are, their contrast,
+saturation and noise, and the row of the horizon, each the mean with the interval of 95 % of bootstraps over images.
 """
 
 import argparse
 import json
+import math
 import time
+from copy import copy
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+import torch
+from learn_parameters import drawn
+from torch import Tensor
 
 from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import Evaluation, evaluate
 from probscene.app.evaluation.labels import read_labels
-from probscene.app.evaluation.sources import FITTED
+from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
-from probscene.app.fitting.presets import preset
+from probscene.app.fitting.presets import BOTH, STRUCTURE, preset
+from probscene.app.fitting.run import RunFolder
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
+from probscene.inference.features.pretrained import EfficientNetLite
+from probscene.inference.judging.image_metrics import fid, kid
 from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import MaxNLocator
+
+DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
 
 
 def cars(found: Evaluation) -> dict[str, np.ndarray]:
@@ -51,6 +65,49 @@ def row(found: Evaluation) -> dict:
         for distances in found.images.values():
             out[name] |= {figure.name: round(float(figure.value), 4) for figure in distances[name]}
     return out
+
+
+def said(images: Tensor) -> dict[str, list[float]]:
+    """Mean and interval of what is said of ``(N, 3, H, W)`` uint8 images, all in 0..1: brightness and contrast, the
+    mean and deviation of grey; saturation; noise, by the Laplacian [1]; and the horizon, the row at which the image
+    darkens most from above to below.
+
+    References:
+        [1] Immerkær, *Fast noise variance estimation*, Computer Vision and Image Understanding 1996.
+    """
+    x = images.double() / 255
+    grey, most = x.mean(1), x.amax(1)
+    kernel = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
+    rough = torch.nn.functional.conv2d(grey[:, None], kernel[None, None]).abs()
+    rows = torch.nn.functional.avg_pool1d(grey.mean(2)[:, None], SMOOTH, 1)[:, 0]
+    falls = (rows[:, :-SMOOTH] - rows[:, SMOOTH:]).argmax(1) + SMOOTH
+    each = {
+        "brightness": grey.mean((1, 2)),
+        "contrast": grey.std((1, 2)),
+        "saturation": ((most - x.amin(1)) / most.clamp(min=1 / 255)).mean((1, 2)),
+        "noise": math.sqrt(math.pi / 2) / 6 * rough.mean((1, 2, 3)),
+        "horizon": falls / grey.shape[1],
+    }
+    rng, found = np.random.default_rng(0), {}
+    for name, values in each.items():
+        means = values.numpy()[rng.integers(0, len(values), (RESAMPLES, len(values)))].mean(1)
+        found[name] = [round(float(number), 4) for number in (values.mean(), *np.quantile(means, (0.025, 0.975)))]
+    return found
+
+
+def looks(run: RunFolder, frames: ImageFolder, num: int) -> dict:
+    """What is said of frames and of each source's images, and how far structures alone are from the frames."""
+    real = torch.stack([frames.load(i) for i in range(len(frames))])
+    structure = copy(run.guide)
+    structure.suits = None
+    policies = {**before(run.model), "structure": structure, LEARNT: run.guide}
+    drawn_of = {name: drawn(run, policy, 1)[1][:num] for name, policy in policies.items()}
+    look = EfficientNetLite()
+    apart = [
+        kind(look.embed(real), look.embed(drawn_of["structure"][: len(real)]), "efficientnet") for kind in (fid, kid)
+    ]
+    both = {figure.name: round(float(figure.value), 4) for figure in apart}
+    return {"structure": both, "looks": {"frames": said(real), **{name: said(x) for name, x in drawn_of.items()}}}
 
 
 def picture(histograms: list[dict[str, np.ndarray]], path: Path) -> None:
@@ -77,6 +134,7 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--features", default="count=efficientnet", help="as of probscene fit")
     parser.add_argument("--set", action="append", default=[], dest="settings", help="as of probscene fit")
+    parser.add_argument("--learn", choices=(STRUCTURE, BOTH), default=STRUCTURE)
     parser.add_argument("--min-height", type=float, default=0.0, help="of KITTI's boxes that are counted, pixels")
     args = parser.parse_args()
     keep_freed_memory()
@@ -85,12 +143,14 @@ def main():
         path = args.out / f"run-{seed}"
         chosen = override(preset("street").with_features(args.features), args.settings)
         start = time.monotonic()
-        run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False)
+        run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False, learn=args.learn)
         seconds = round(time.monotonic() - start, 1)
         target = ImageFolder(args.images, run.model.canvas, run.model.channels)
         truth = read_labels(args.labels, run.model, target, False, args.min_height)
         found = evaluate(run, target, truth, lambda *_: None, num=2000, features=["efficientnet"])
         rows.append({"seed": seed, "seconds": seconds, **row(found)})
+        if run.parameters:
+            rows[-1] |= {"kept": run.parameters["kept"], **looks(run, target, DRAWN)}
         histograms.append(cars(found))
         print(json.dumps(rows[-1]), flush=True)
         write_json(args.out / "results.json", rows)
