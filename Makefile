@@ -46,8 +46,9 @@ test: export OMP_NUM_THREADS := 1
 test: lint docs
 	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile
 
+# An evening's worth. MNIST's files for the benchmarks that need them: make benchmark MNIST=FOLDER
 benchmark: install
-	@set -e; for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script"; done
+	@set -e; for script in $$(grep -l __main__ benchmarks/*.py); do echo "$$script"; $(BIN)/python "$$script"; done
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,6 +1,6 @@
 """Whether a fit learns structure that depends on context, on Aerial 2D, and what the baselines learn in the same time.
 
-    python benchmarks/learn_aerial.py --out FOLDER [--presets quick default] [--fits lstm pcfg grammar-vae mmd]
+    python benchmarks/learn_aerial.py [--out FOLDER] [--presets quick] [--fits lstm pcfg] [--seeds 0]
 
 The target's images are drawn by the model's own target program with its own sprites, as in the paper: well spaced cars,
 nine on the first road and three on the others, in the mean. Each seed has a target of its own, and fits see the folder
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from given import out_option
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
@@ -81,10 +82,10 @@ def fit_images(preset: str, name: str, seed: int, out: Path) -> tuple[Policy, di
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
-    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
-    parser.add_argument("--fits", nargs="+", choices=FITS, default=list(FITS[:4]))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    out_option(parser, __file__)
+    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=["quick"])
+    parser.add_argument("--fits", nargs="+", choices=FITS, default=["lstm", "pcfg"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=5000)
     args = parser.parse_args()
     rows = [{"fit": "prior", **judged(MODEL.prior)}, {"fit": "target", **judged(TARGET)}]

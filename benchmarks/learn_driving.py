@@ -1,6 +1,6 @@
 """Whether a fit finds a hidden distribution of street structures from images alone.
 
-    python benchmarks/learn_driving.py --out FOLDER [--seeds 0 1 2] [--preset street] [--model driving]
+    python benchmarks/learn_driving.py [--out FOLDER] [--seeds 0] [--preset street] [--model driving]
 
 Each seed's target is drawn by the driving models themselves with another, random distribution of structures
 (``SceneModel.target``); fits see its images. Printed for each seed is the total variation of the number of cars in a
@@ -11,9 +11,9 @@ fit took.
 import argparse
 import json
 import time
-from pathlib import Path
 
 import numpy as np
+from given import out_option
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
@@ -40,11 +40,11 @@ def counted(model: SceneModel, policy: Policy, num: int = 20_000) -> np.ndarray:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
+    out_option(parser, __file__)
     parser.add_argument("--model", default="driving")
     parser.add_argument("--preset", default="street")
     parser.add_argument("--set", action="append", default=[], dest="settings", help="as of probscene fit")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=3000)
     args = parser.parse_args()
     keep_freed_memory()

@@ -1,6 +1,6 @@
 """How close the layout of cars comes to the target's on Aerial 2D, learnt with structure from images alone.
 
-    python benchmarks/learn_lanes.py --out FOLDER [--seeds 0] [--images 2000] [--preset default] [--set key=value]
+    python benchmarks/learn_lanes.py [--out FOLDER] [--seeds 0] [--images 2000] [--preset quick] [--set key=value]
 
 The target's images are drawn by the model's own target program, as in ``learn_aerial.py``; its cars are spaced evenly
 in their lanes. Printed for the prior, the learnt structure alone, structure and parameters, and the target itself: how
@@ -19,6 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from given import out_option
 from learn_aerial import judged
 from learn_parameters import IMAGES, drawn, said
 from torch import Tensor
@@ -102,10 +103,10 @@ def measured(seed: int, args: argparse.Namespace) -> dict:
 
 def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
+    out_option(parser, __file__)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=2000)
-    parser.add_argument("--preset", default="default")
+    parser.add_argument("--preset", default="quick")
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
     args = parser.parse_args()
     rows = []

@@ -1,6 +1,6 @@
 """How close light, camera and cars come to a hidden street's, learnt with structure from images alone.
 
-    python benchmarks/learn_looks.py --out FOLDER [--seeds 0 1 2] [--images 2000] [--preset street] [--set key=value]
+    python benchmarks/learn_looks.py [--out FOLDER] [--seeds 0] [--images 2000] [--preset street] [--set key=value]
 
 Each seed's target is drawn by ``driving`` with a hidden distribution of structures (``SceneModel.target``), and with
 another camera pitch and height, light, weather, exposure, lateral place of the cars, makes and colours: of each of
@@ -22,6 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from given import out_option
 from learn_driving import counted
 from learn_parameters import IMAGES, drawn, said
 from pyro.poutine.messenger import Messenger
@@ -149,9 +150,9 @@ def picture(sources: list[Tensor], path: Path) -> None:
 
 def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
+    out_option(parser, __file__)
     parser.add_argument("--model", default="driving")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="street")
     parser.add_argument("--threads", type=int, default=1)

@@ -1,6 +1,6 @@
 """How far Meta-Sim's two losses come on Multi-MNIST where the structures are known.
 
-    python benchmarks/learn_meta_sim.py --mnist FOLDER --out FOLDER [--losses mmd task] [--target 0] [--set steps=100]
+    python benchmarks/learn_meta_sim.py --mnist FOLDER [--out FOLDER] [--losses mmd task] [--target 0] [--set steps=100]
 
 The target is that of ``learn_parameters.py``, and so are the figures that are printed as it learns: how far digits are
 from an upright, evenly spaced row. Structures are drawn from the target's own distributions, so that parameters are all
@@ -13,9 +13,9 @@ program draws. With both, the second goes on from the first. FOLDER holds the ta
 import argparse
 import json
 import time
-from pathlib import Path
 
 import torch
+from given import mnist_option, needed_mnist, out_option
 from learn_multi_mnist import distributions, draw_target
 from learn_parameters import SIDE, picture, row_errors
 from torch import Tensor
@@ -76,8 +76,8 @@ def learnt(name: str, training: Training, transform: ParameterTransform, structu
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--mnist", type=Path, required=True, help="folder of the original IDX files")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the target and the results")
+    mnist_option(parser)
+    out_option(parser, __file__)
     parser.add_argument("--target", type=int, default=0)
     parser.add_argument("--losses", nargs="+", choices=("mmd", "task"), default=["mmd", "task"])
     parser.add_argument("--set", action="append", default=[], help="key=value, of the schedule of mmd")
@@ -85,6 +85,7 @@ def main():
     parser.add_argument("--labelled", type=int, default=40, help="labelled images, of task")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    args.mnist = needed_mnist(args.mnist)
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
     folder = args.out / f"target-{args.target}"

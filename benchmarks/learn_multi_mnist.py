@@ -1,6 +1,6 @@
 """How close a fit comes to the truth on Multi-MNIST, from target images that another program drew.
 
-    python benchmarks/learn_multi_mnist.py --mnist FOLDER --out FOLDER [--presets quick default paper quick-mmd oracle]
+    python benchmarks/learn_multi_mnist.py --mnist FOLDER [--out FOLDER] [--presets quick oracle] [--targets 0]
 
 The images are drawn here with numpy and OpenCV from the digits of t10k (the original IDX files), which the model does
 not have; the fit sees the folder alone. Printed is the total variation of the number of digits and of their classes
@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from given import mnist_option, needed_mnist, out_option
 
 from probscene.app.api.fit import fit
 from probscene.app.files import write_json
@@ -119,13 +120,14 @@ def fit_counts(target: int, seed: int, images: int) -> tuple[LSTMGuide, dict[str
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--mnist", type=Path, required=True, help="folder of the original IDX files")
-    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
-    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
-    parser.add_argument("--targets", nargs="+", type=int, default=[0, 1, 2])
+    mnist_option(parser)
+    out_option(parser, __file__)
+    parser.add_argument("--presets", nargs="+", choices=PRESETS, default=["quick", "oracle"])
+    parser.add_argument("--targets", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=5000)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    args.mnist = needed_mnist(args.mnist)
     rows = []
     for name in args.presets:
         for target in args.targets:

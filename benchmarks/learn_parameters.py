@@ -1,7 +1,7 @@
 """How close layout comes to the target's on Multi-MNIST, learnt with structure from images of another program.
 
-    python benchmarks/learn_parameters.py --mnist FOLDER --out FOLDER [--targets 0 1 2] [--preset quick] [--seed 0]
-        [--parameters likelihood meta-sim]
+    python benchmarks/learn_parameters.py --mnist FOLDER [--out FOLDER] [--targets 0] [--preset quick] [--seed 0]
+        [--parameters likelihood]
 
 Targets are those of ``learn_multi_mnist.py``: upright digits of t10k in an evenly spaced row. Printed for the prior,
 the learnt structure alone, the learnt parameters alone (in the prior's structures), and both: how far digits are from
@@ -22,6 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from given import mnist_option, needed_mnist, out_option
 from learn_multi_mnist import distances, draw_target
 from torch import Tensor
 
@@ -30,7 +31,7 @@ from probscene.app.chunks import CHUNK, draw_chunk
 from probscene.app.files import write_json
 from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
 from probscene.app.fitting.learnt.structure import BEFORE
-from probscene.app.fitting.presets import LIKELIHOOD, META_SIM
+from probscene.app.fitting.presets import LIKELIHOOD
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.session import timing
 from probscene.app.loading import renderer_for
@@ -124,15 +125,16 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--mnist", type=Path, required=True, help="folder of the original IDX files")
-    parser.add_argument("--out", type=Path, required=True, help="folder for targets and runs")
-    parser.add_argument("--targets", nargs="+", type=int, default=[0, 1, 2])
+    mnist_option(parser)
+    out_option(parser, __file__)
+    parser.add_argument("--targets", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--parameters", nargs="+", default=[LIKELIHOOD, META_SIM], help="ways of learning them")
+    parser.add_argument("--parameters", nargs="+", default=[LIKELIHOOD], help="ways of learning them")
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
     args = parser.parse_args()
+    args.mnist = needed_mnist(args.mnist)
     rows = []
     for target in args.targets:
         for method in args.parameters:

@@ -1,6 +1,6 @@
 """Whether a fit to real street frames comes closer to them than the prior: numbers of cars, FID and KID, looks.
 
-    python benchmarks/learn_street.py FRAMES/ LABELS --out FOLDER [--seeds 0 1 2] [--min-height 25]
+    python benchmarks/learn_street.py FRAMES/ LABELS [--out FOLDER] [--seeds 0] [--min-height 25]
         [--learn structure,parameters]
 
 Fits see the images alone. ``LABELS`` is KITTI's ``label_2``, or a CSV of counts, of the same images. Cars of scenes are
@@ -22,6 +22,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
+from given import needed, out_option
 from learn_parameters import drawn
 from torch import Tensor
 
@@ -127,16 +128,18 @@ def picture(histograms: list[dict[str, np.ndarray]], path: Path) -> None:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("images", type=Path)
-    parser.add_argument("labels", type=Path)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the runs")
+    parser.add_argument("images", type=Path, nargs="?")
+    parser.add_argument("labels", type=Path, nargs="?")
+    out_option(parser, __file__)
     parser.add_argument("--model", default="driving_simple")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--features", default="count=efficientnet", help="as of probscene fit")
     parser.add_argument("--set", action="append", default=[], dest="settings", help="as of probscene fit")
     parser.add_argument("--learn", choices=(STRUCTURE, BOTH), default=STRUCTURE)
     parser.add_argument("--min-height", type=float, default=0.0, help="of KITTI's boxes that are counted, pixels")
     args = parser.parse_args()
+    args.images = needed(args.images, "a folder of street frames, and the file or folder of their labels")
+    args.labels = needed(args.labels, "the frames' labels, KITTI's label_2 or a CSV of counts, after their folder")
     keep_freed_memory()
     rows, histograms = [], []
     for seed in args.seeds:

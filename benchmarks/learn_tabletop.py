@@ -1,6 +1,6 @@
 """How close a site of a user's own model comes to the truth, learnt from images of another program.
 
-    python benchmarks/learn_tabletop.py --out FOLDER [--seeds 0 1 2] [--images 2000] [--preset quick]
+    python benchmarks/learn_tabletop.py [--out FOLDER] [--seeds 0] [--images 2000] [--preset quick]
 
 The model is that of ``examples/parameter_guide.py``: mugs stand anywhere around the middle of their plate. In the
 target, which numpy and OpenCV draw, they stand to the right of it. No line of the model says so. Printed are
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from given import out_option
 from scipy.stats import wasserstein_distance
 
 import probscene as ps
@@ -76,8 +77,8 @@ def distances(scenes: list[np.ndarray], true: np.ndarray) -> dict[str, list[floa
 
 def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for the target and the runs")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    out_option(parser, __file__)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="quick")
     args = parser.parse_args()

@@ -1,6 +1,6 @@
 """What learning is worth to a detector, on targets that the models draw themselves.
 
-    python benchmarks/trial_drawn.py --out FOLDER [--models multi_mnist aerial2d] [--presentations 1200] [--seeds 5]
+    python benchmarks/trial_drawn.py [--out FOLDER] [--models multi_mnist] [--presentations 1200] [--seeds 5]
 
 For each model a target of another structure and layout (``SceneModel.target``) is drawn, a fit sees its images alone,
 and ``probscene trial`` compares what is generated of the prior, of the start and of what was learnt, tested on 500 of
@@ -9,7 +9,8 @@ on.
 """
 
 import argparse
-from pathlib import Path
+
+from given import out_option
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
@@ -25,8 +26,8 @@ TESTED, RARE = 500, 0.02  # images; objects of a class in an image, of which few
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for targets, runs and trials")
-    parser.add_argument("--models", nargs="+", default=["multi_mnist", "aerial2d"])
+    out_option(parser, __file__)
+    parser.add_argument("--models", nargs="+", default=["multi_mnist"])
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--images", type=int, default=2000, help="of the target, for the fit")
     parser.add_argument("--generate", type=int, default=600)
