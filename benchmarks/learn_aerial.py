@@ -21,7 +21,8 @@ from given import out_option
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.presets import DEFAULT, QUICK, Preset
+from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.presets import DEFAULT, QUICK
 from probscene.app.fitting.session import timing
 from probscene.derive import derive_complete
 from probscene.inference.judging.metrics import total_variation

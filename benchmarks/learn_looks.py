@@ -33,7 +33,7 @@ from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
 from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
-from probscene.app.fitting.presets import BOTH
+from probscene.app.fitting.preset import BOTH
 from probscene.app.fitting.session import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory

@@ -31,7 +31,7 @@ from probscene.app.chunks import CHUNK, draw_chunk
 from probscene.app.files import write_json
 from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
 from probscene.app.fitting.learnt.structure import BEFORE
-from probscene.app.fitting.presets import LIKELIHOOD
+from probscene.app.fitting.preset import LIKELIHOOD
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.session import timing
 from probscene.app.loading import renderer_for

@@ -32,7 +32,8 @@ from probscene.app.evaluation.labels import read_labels
 from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
-from probscene.app.fitting.presets import BOTH, STRUCTURE, preset
+from probscene.app.fitting.preset import BOTH, STRUCTURE
+from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder

@@ -27,7 +27,7 @@ _HOME = {
     "api.label": ("label",),
     "api.run": ("Run",),
     "datasets.scene_dataset": ("SceneDataset",),
-    "fitting.presets": ("Preset",),
+    "fitting.preset": ("Preset",),
     "loading": ("load_model",),
 }
 _MODULES = {
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
     from probscene.app.datasets.scene_dataset import SceneDataset
-    from probscene.app.fitting.presets import Preset
+    from probscene.app.fitting.preset import Preset
     from probscene.app.loading import load_model
     from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
     from probscene.inference.features.base import FeatureNet, Features

@@ -1,12 +1,14 @@
-"""The paper's feature network: which classes an image shows (Meta-Sim2, supplement).
+"""The paper's feature networks: which classes an image shows, or how many objects of each (Meta-Sim2, supplement).
 
 Six residual blocks of two 3x3 convolutions with batch norm and leaky ReLU, average pooling, three fully connected
-layers; binary presences under sigmoid cross-entropy. The features are the average pool and the first two fully
-connected layers. Widths are not given in the paper and are arguments here; grey images are copied to three channels.
+layers; binary presences under sigmoid cross-entropy, for Aerial 2D one-hot counts under cross-entropy. The features are
+the average pool and the first two fully connected layers. Widths are not given in the paper and are arguments here;
+grey images are copied to three channels.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +20,8 @@ from probscene.sampling import seed_everything
 from ..training import Report, batch_seed, check_finite, restore_training, training_state
 from .base import Draw, Examples, Features, Photographs, Renders
 
+PRESENCE, PRESENCE_COUNTS = "presence", "presence=counts"
+WAYS = 25  # of the paper's counts
 LAST = torch.channels_last  # in memory; half as fast again on a CPU
 
 
@@ -28,25 +32,29 @@ class PresenceNet(nn.Module):
         classes: whose presence is learnt.
         width: channels of the first two blocks; the next two have twice, the last two four times as many.
         hidden: units of the first two fully connected layers.
+        ways: numbers that are told apart of each class, 0, 1, ... and so many or more; 0 for presence alone.
     """
 
-    def __init__(self, classes: tuple[str, ...], width: int = 8, hidden: int = 64):
+    def __init__(self, classes: tuple[str, ...], width: int = 8, hidden: int = 64, ways: int = 0):
         super().__init__()
+        self.ways = ways
         widths = [width, width, 2 * width, 2 * width, 4 * width, 4 * width]
         inner = [3, *widths[:-1]]
         self.blocks = nn.Sequential(*(_Block(i, o) for i, o in zip(inner, widths, strict=True)))
         self.fc1, self.fc2 = nn.Linear(widths[-1], hidden), nn.Linear(hidden, hidden)
-        self.out = nn.Linear(hidden, len(classes))
+        self.out = nn.Linear(hidden, len(classes) * max(ways, 1))
         self.names = tuple(
             [f"pool_{i}" for i in range(widths[-1])] + [f"fc{j}_{i}" for j in (1, 2) for i in range(hidden)]
         )
 
     def layers(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Features ``(N, D)`` and presence logits ``(N, classes)`` of uint8 images ``(N, 1 or 3, H, W)``."""
+        """Features ``(N, D)`` and logits, ``(N, classes)`` or ``(N, classes, ways)``, of uint8 images ``(N, 1 or 3, H,
+        W)``."""
         pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous(memory_format=LAST).float() / 255).mean((2, 3))
         first = F.leaky_relu(self.fc1(pool), 0.01)
         second = F.leaky_relu(self.fc2(first), 0.01)
-        return torch.cat([pool, first, second], 1), self.out(second)
+        logits = self.out(second)
+        return torch.cat([pool, first, second], 1), logits.unflatten(1, (-1, self.ways)) if self.ways else logits
 
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
@@ -76,16 +84,25 @@ class PresenceFeatures(Features):
 
     Args:
         images, epochs: of its training.
+        width, hidden: see ``PresenceNet``.
+        counts: it learns how many objects there are of each class, as for the paper's Aerial 2D.
     """
 
     images: int = 5000
     epochs: int = 10
+    width: int = 8
+    hidden: int = 64
+    counts: bool = False
 
-    name = "presence"
+    @property
+    def name(self) -> str:
+        """In records and messages."""
+        return PRESENCE_COUNTS if self.counts else PRESENCE
 
     def build(self, model: SceneModel) -> PresenceNet:
-        """Untrained."""
-        return PresenceNet(model.classes)
+        """Untrained. Counts go to 24, as in the paper, or to as many as a derivation has rules, where that is more."""
+        ways = max(WAYS, model.max_steps + 1) if self.counts else 0
+        return PresenceNet(model.classes, self.width, self.hidden, ways)
 
     def training(
         self, net: PresenceNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
@@ -95,7 +112,8 @@ class PresenceFeatures(Features):
 
 
 class PresenceTraining:
-    """Adam on one fixed set of prior renders until 75 % of the presences are right, at most ``epochs`` (supplement).
+    """Adam on one fixed set of prior renders until 75 % of the presences, or counts, are right, at most ``epochs``
+    (supplement).
 
     Args:
         net: trained in place.
@@ -131,37 +149,42 @@ class PresenceTraining:
             ProbsceneError: the loss, or a parameter, is no longer finite.
         """
         seed_everything(batch_seed(self.seed, 0))
-        classes = self.net.out.out_features
-        image, present = torch.empty(0), torch.zeros(self.images, classes)
+        ways = self.net.ways
+        classes = self.net.out.out_features // max(ways, 1)
+        image, number = torch.empty(0), torch.zeros(self.images, classes, dtype=torch.long)
         for start in range(0, self.images, 250):  # kept as bytes: 5,000 images of 256 x 256 are 1 GB
             part = self.draw(min(250, self.images - start))
             if start == 0:
                 image = torch.empty(self.images, *part.image.shape[1:], dtype=torch.uint8)
             image[start : start + 250] = part.image
-            present[start : start + 250] = _present(part, classes)
+            number[start : start + 250] = _number(part, classes).clamp(max=max(ways, 2) - 1)
         self.net.train()
         while self.done < self.total and self.reached < self.accuracy:
             seed_everything(batch_seed(self.seed, 1, self.done))
             total, right = 0.0, 0.0
             for rows in torch.randperm(len(image)).split(self.batch_size):
                 logits = self.net.layers(image[rows])[1]
-                loss = F.binary_cross_entropy_with_logits(logits, present[rows])
+                if ways:
+                    loss = F.cross_entropy(logits.flatten(0, 1), number[rows].flatten())
+                else:
+                    loss = F.binary_cross_entropy_with_logits(logits, number[rows].float())
                 self.optimiser.zero_grad()
                 loss.backward()
                 self.optimiser.step()
                 total += loss.item() * len(rows)
-                right += ((logits > 0) == (present[rows] > 0)).float().mean().item() * len(rows)
+                said = logits.argmax(-1) if ways else (logits > 0).long()
+                right += (said == number[rows]).float().mean().item() * len(rows)
             self.done += 1
             where = f"in epoch {self.done}"
             check_finite(total, self.net.parameters(), "the presence network", where, "begin again with features=count")
             self.reached = right / len(image)
             if each is not None:
-                each(self, {"loss": total / len(image)})
+                each(self, {"loss": total / len(image), "accuracy": self.reached, "demanded": self.accuracy})
         self.net.eval()
 
-    def summary(self) -> dict[str, float]:
-        """Nothing more for the log."""
-        return {}
+    def summary(self) -> dict[str, Any]:
+        """For the log: the share of presences, or counts, that were right in the last epoch, and what is demanded."""
+        return {"stage": "accuracy", "accuracy": self.reached, "demanded": self.accuracy}
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
@@ -173,8 +196,7 @@ class PresenceTraining:
         self.done, self.reached = int(numbers["done"]), numbers["reached"]
 
 
-def _present(part: Examples, classes: int) -> Tensor:
-    """``(N, classes)`` float, 1 where a class is visible."""
-    counts = torch.zeros(len(part.label), classes + 1)
-    counts.scatter_(1, part.label.where(part.label >= 0, classes), 1.0)
-    return counts[:, :classes]
+def _number(part: Examples, classes: int) -> Tensor:
+    """``(N, classes)`` int64 visible objects."""
+    seen = part.label.where(part.label >= 0, classes)
+    return F.one_hot(seen, classes + 1).sum(1)[:, :classes]

@@ -28,7 +28,7 @@ class ProjectedFeatures(Features):
     Args:
         network: one of ``names.CHOICES``.
         pairs: structures that are drawn twice.
-        directions: features.
+        directions: features; 0 for the network's own, as they are.
         scenes: in a batch of the fit, for which their unit is chosen.
     """
 
@@ -46,7 +46,7 @@ class ProjectedFeatures(Features):
         return f"{name}={Path(file).resolve()}" if file else name
 
     def build(self, model: SceneModel) -> Projected:
-        """The network with an empty projection."""
+        """The network with an empty projection, or none."""
         from .pretrained import pretrained, weights_file  # torchvision takes seconds to import
 
         net, file = pretrained(self.network), weights_file(self.network)
@@ -55,13 +55,15 @@ class ProjectedFeatures(Features):
 
     def training(
         self, net: Projected, renders: Renders, photographs: Callable[[], Photographs], seed: int
-    ) -> "ProjectionTraining":
-        """On renders alone; a minute or so."""
+    ) -> "ProjectionTraining | None":
+        """On renders alone; a minute or so. None where nothing is projected."""
+        if not self.directions:
+            return None
         return ProjectionTraining(net, renders, self.pairs, self.directions, self.scenes, batch_seed(seed, 1))
 
     def settings(self, preset: Any) -> dict[str, Any]:
-        """Those of a slow network."""
-        return slow_settings(preset)
+        """Those of a slow network; none where its features are taken as they are, as the paper's preset does."""
+        return slow_settings(preset) if self.directions else {}
 
 
 class ProjectionTraining:

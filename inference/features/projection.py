@@ -106,7 +106,7 @@ class Projected(nn.Module):
 
     Args:
         net: the frozen network.
-        directions: d.
+        directions: d; 0 for none, its features stay as they are.
         origin: of the net's weights, 32 bytes; another's state is not loaded.
     """
 
@@ -118,7 +118,7 @@ class Projected(nn.Module):
     def __init__(self, net: FeatureNet, directions: int, origin: bytes = bytes(32)):
         super().__init__()
         self.net = (net,)  # not a submodule: its weights are in no state
-        self.names = tuple(f"direction_{i}" for i in range(1, directions + 1))
+        self.names = tuple(f"direction_{i}" for i in range(1, directions + 1)) or tuple(net.names)
         self.register_buffer("mean", torch.zeros(len(net.names)))
         self.register_buffer("weight", torch.zeros(len(net.names), directions))
         self.register_buffer("ratio", torch.ones(directions))
@@ -153,4 +153,5 @@ class Projected(nn.Module):
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
         """``(N, d)`` features of ``(N, 1 or 3, H, W)`` uint8 images."""
-        return self.projection(self.pretrained.embed(images))
+        found = self.pretrained.embed(images)
+        return self.projection(found) if self.weight.shape[1] else found

@@ -25,7 +25,8 @@ from .evaluation.judge import judge
 from .evaluation.labels import counts_of_dataset, read_labels
 from .files import make_folder, write_json
 from .fitting import session
-from .fitting.presets import QUICK, Preset
+from .fitting.preset import Preset
+from .fitting.presets import QUICK
 from .fitting.run import RunFolder
 from .judging.looked import LEARNT, PRIOR, STRUCTURE, policies
 from .labelling.counts import write_counts

@@ -20,7 +20,8 @@ import probscene
 from probscene.app.cli.options import PresetName
 from probscene.app.fitting import fit
 from probscene.app.fitting.overrides import override
-from probscene.app.fitting.presets import OBJECTIVES, PRESETS, QUICK
+from probscene.app.fitting.preset import OBJECTIVES
+from probscene.app.fitting.presets import PRESETS, QUICK
 from probscene.app.fitting.run import RunFolder
 from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES

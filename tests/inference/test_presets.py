@@ -4,7 +4,8 @@ import json
 import pytest
 import torch
 
-from probscene.app.fitting.presets import PRESETS, QUICK, Preset, preset
+from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.presets import PRESETS, QUICK, preset
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import MMD, JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
@@ -23,6 +24,18 @@ def test_the_paper_preset_is_the_papers():
     assert (paper.hidden, paper.num_latents, paper.index) == (50, 1, False)
     assert (paper.num_scenes, paper.num_real, paper.learning_rate, paper.cosine) == (500, 500, 1e-4, False)
     assert (paper.baseline, paper.scale, paper.updates) == ("moving_average", 1e-2, 1)
+    assert (paper.pretrain_derivations, paper.pretrain_epochs, paper.pretrain_rate) == (5000, 10, 1e-3)
+    assert (paper.on_prior, paper.batches, paper.incompletion_weight) == (True, 200, 0.0)
+
+
+def test_each_of_the_papers_experiments_has_its_preset():
+    paper, aerial, driving = map(preset, ("paper", "paper-aerial", "paper-driving"))
+    assert dataclasses.replace(aerial, features=paper.features) == paper and aerial.features == "presence=counts"
+    assert driving.divergence() == paper.divergence() and driving.make_features().directions == 0
+    assert (driving.num_scenes, driving.num_real, driving.pretrain_derivations) == (300, 300, 6000)
+    assert driving.with_features("inception=FILE") == dataclasses.replace(
+        driving, features=driving.with_features("inception=FILE").features
+    )
 
 
 def test_a_shared_reward_keeps_a_gradient(small):

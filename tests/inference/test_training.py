@@ -54,6 +54,11 @@ def presence(dots, small):
     return PresenceTraining(net, Observer(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
 
 
+def counts_one_hot(dots, small):
+    net = PresenceNet(dots.classes, 4, 8, ways=5)
+    return PresenceTraining(net, Observer(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
+
+
 def pretrained_counting(dots, small):
     net = PretrainedCountNet(dots.classes, dots.canvas, held=8, sizes=(160, 160))
     return PretrainedCountTraining(net, Observer(dots, 1).draw_twice, 8, 2, 4, seed=1), net
@@ -78,6 +83,7 @@ def structure(dots, small, divergence=None, **options):
 ALL = {
     "count": (counting, "steps"),
     "presence": (presence, "epochs"),
+    "counts one-hot": (counts_one_hot, "epochs"),
     "pretrained count": (pretrained_counting, "epochs"),
     "projection": (projection, "structures"),
     "structure": (structure, "batches"),

@@ -18,7 +18,7 @@ from ..arguments import checked_seed
 from ..fitting import session
 from ..fitting.overrides import override
 from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
-from ..fitting.presets import BOTH, FOR_PHOTOGRAPHS, FOR_RENDERS, STRUCTURE, Preset
+from ..fitting.preset import BOTH, FOR_PHOTOGRAPHS, FOR_RENDERS, STRUCTURE, Preset
 from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
 from ..loading import load_model
@@ -55,7 +55,8 @@ def fit(
         model: a scene model, the name of a built-in one, or a Python file.
         target: a folder of PNG or JPEG files, a list of files, an array ``(L, H, W)`` or ``(L, H, W, 1 or 3)`` uint8,
             or a torch dataset of images; see ``ImageFolder`` and ``ImageArray``.
-        preset: how long and how to learn: ``"quick"``, ``"default"``, ``"street"``, ``"paper"``, or a ``Preset``.
+        preset: how long and how to learn: ``"quick"``, ``"default"``, ``"street"``, ``"paper"``, ``"paper-aerial"``,
+            ``"paper-driving"``, or a ``Preset``.
         seed: of everything random.
         features: the feature network: a word as on the command line, ``FILE.py:NAME``, or an object, see ``Features``
             and ``FeatureNet``. Where None, the preset's; of a target that looks unlike renders, or with labels,

@@ -26,4 +26,4 @@ Visible = Annotated[
         help="Count objects of rendered scenes of which at least this is visible, 0 to 1; many.",
     ),
 ]
-PresetName = StrEnum("PresetName", ["quick", "default", "paper", "street"])
+PresetName = StrEnum("PresetName", ["quick", "default", "street", "paper", "paper-aerial", "paper-driving"])

@@ -137,11 +137,11 @@ class _Network:
             load_state(net, cached.tensors)
             say(f"The feature network was trained before; it is in {kept.file}.")
         else:
-            lines = self._train(training)
+            lines = self._train(training, say)
             if kept is not None:
                 kept.save(state_of(net), lines)
 
-    def _train(self, training: Training) -> list[str]:
+    def _train(self, training: Training, say: Say) -> list[str]:
         keep = Keeper(self.run, "features", training)
         self._check_taught()
 
@@ -158,6 +158,8 @@ class _Network:
         summary = training.summary()
         if summary:
             keep.lines.append(json.dumps(summary))
+        if summary.get("accuracy", 1.0) < summary.get("demanded", 0.0):
+            say(f"The network is right in {summary['accuracy']:.0%}; the paper demands {summary['demanded']:.0%}.")
         keep.finish()
         return keep.lines
 

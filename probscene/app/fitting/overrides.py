@@ -9,7 +9,7 @@ from probscene.errors import ProbsceneError
 from probscene.inference.objective import BASELINES
 
 from .parts import lasting_word
-from .presets import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, Preset
+from .preset import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, Preset
 
 CHOICES = {
     "baseline": BASELINES,

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -33,7 +34,7 @@ from .parts import (
     load_part,
     part_file,
 )
-from .presets import Preset
+from .preset import Preset
 from .storage import FORMAT, Storage, check_free, load_state, read_record
 
 PRIOR_KEPT = "prior_kept"  # the only tensor of a guide that was given up
@@ -92,7 +93,7 @@ class RunFolder(Storage):
             digest = None if file is None else file_digest(file)
         make_folder(path)
         about: dict[str, Any] = {"format": FORMAT, "model": reference, "model_sha256": digest}
-        about |= {"assets": loaded.assets, "within_support": True}
+        about |= {"assets": loaded.assets, "within_support": not record.get("preset", {}).get("on_prior")}
         if assets is not None:
             about["assets_folder"] = os.path.abspath(assets)
         run = cls(path, record | about, loaded, parts)
@@ -132,6 +133,8 @@ class RunFolder(Storage):
                     f"{self.path} was begun, actual {model.assets or 'no assets'}; put them back, or fit again."
                 )
             self._model = model
+        if self.record.get("preset", {}).get("on_prior") and self._model.pretraining is not None:
+            self._model = replace(self._model, pretraining=None)
         return self._model
 
     def check_objects(self, *needed: str) -> None:
@@ -143,10 +146,8 @@ class RunFolder(Storage):
         Raises:
             RunError: one of them is not.
         """
-        objects = self.objects
-        given = {**vars(self.parts), "model": self._model}
-        missing = [name for name in objects if given[name] is None]
-        if set(missing) & set(needed):
+        objects, given = self.objects, {**vars(self.parts), "model": self._model}
+        if set(missing := [name for name in objects if given[name] is None]) & set(needed):
             named = ", ".join(f"{name} ({objects[name]})" for name in missing)
             again = ", ".join(f"{name}=..." for name in missing)
             raise RunError(
@@ -157,8 +158,7 @@ class RunFolder(Storage):
     @property
     def target(self) -> Path:
         """The folder of its target's images; of others what they are called."""
-        named = self.record["target"]
-        if named is None:
+        if (named := self.record["target"]) is None:
             return Path("images in memory")
         return Path(named) if isinstance(named, str) else Path(os.path.commonpath([Path(f).parent for f in named]))
 

@@ -28,7 +28,8 @@ from ..modules import file_digest
 from ..progress import Display
 from .fit import check_target, fit, open_target
 from .parts import Parts, in_memory, is_file_part, part_file
-from .presets import Preset, takers_of_labels
+from .preset import Preset
+from .presets import takers_of_labels
 from .run import RunFolder
 from .scene_features import UNLIKE, unlike
 from .storage import check_free

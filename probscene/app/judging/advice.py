@@ -4,7 +4,7 @@ from typing import Any
 
 from probscene.inference.judging.nearness import CLEARLY, Nearness, Word
 
-from ..fitting.presets import BOTH
+from ..fitting.preset import BOTH
 from ..fitting.run import RunFolder
 
 PHOTO = (

@@ -8,7 +8,7 @@ import torch
 
 from probscene.app.fitting import storage
 from probscene.app.fitting.learnt import judged
-from probscene.app.fitting.presets import Preset
+from probscene.app.fitting.preset import Preset
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.judging.farther import Farther
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning

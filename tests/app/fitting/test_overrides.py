@@ -3,7 +3,8 @@
 import pytest
 
 from probscene.app.fitting.overrides import override
-from probscene.app.fitting.presets import DEFAULT, PRESETS, QUICK, Preset
+from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.presets import DEFAULT, PRESETS, QUICK
 from probscene.errors import ProbsceneError
 
 

@@ -106,7 +106,7 @@ def test_further_views_of_the_target_are_learnt_from_and_not_judged(run, call, t
 
 @pytest.mark.parametrize(
     ("features", "part"),
-    [("vgg", "presence, efficientnet, inception, inception=FILE"), ("inception=", "inception=FILE"),
+    [("vgg", "presence, presence=counts, efficientnet, inception, inception=FILE"), ("inception=", "inception=FILE"),
      ("count=vgg", "count, count=efficientnet, presence"),
      ("inception=none.pth", "a file of weights"), ("resnet50=none.pth", "a file of weights"),
      ("efficientnet=x", "'efficientnet=x'")],

@@ -4,12 +4,13 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
+from probscene import load_model
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import enter
 from probscene.inference.features.counting.batches import FEWEST, FULL, CountBatches, CountSchedule, cells
 from probscene.inference.features.counting.net import STRIDE, CountNet, toward_whole
 from probscene.inference.features.counting.training import CountTraining, count_loss
-from probscene.inference.features.presence import PresenceNet, PresenceTraining
+from probscene.inference.features.presence import PresenceFeatures, PresenceNet, PresenceTraining
 from probscene.model import Groups
 
 
@@ -137,6 +138,26 @@ def test_presence_net_stops_at_its_accuracy(dots, draw_dots):
     assert training.done == 0
     features = net.embed(draw_dots(3).image)
     assert features.shape == (3, len(net.names))
+
+
+def test_counts_one_hot_are_learnt_and_what_is_more_is_the_last(dots, draw_dots):
+    """Of at most two of a class, told apart from none alone: two or more is one of the three ways."""
+    net = PresenceNet(dots.classes, 8, 32, ways=3)
+    training = PresenceTraining(net, draw_dots, 300, 30, 20, 3e-3, accuracy=0.9)
+    training.run()
+    assert training.summary() == {"stage": "accuracy", "accuracy": training.reached, "demanded": 0.9}
+    assert training.reached > 0.8
+    fresh = draw_dots(60)
+    true = torch.stack([(fresh.label == c).sum(1) for c in range(len(dots.classes))], 1).clamp(max=2)
+    said = net.layers(fresh.image)[1]
+    assert said.shape == (60, len(dots.classes), 3)
+    often = true.flatten().bincount().max() / true.numel()
+    assert (said.argmax(-1) == true).float().mean() > (1 + often) / 2
+
+
+def test_the_papers_counts_never_overflow():
+    aerial, digits = (PresenceFeatures(counts=True).build(load_model(name)) for name in ("aerial2d", "multi_mnist"))
+    assert aerial.ways == 65 and digits.ways == 33
 
 
 def test_small_objects_are_reduced_less(dots):

@@ -120,6 +120,12 @@ class Means:
         return images.float().mean((2, 3))
 
 
+def test_without_directions_features_are_the_networks_own():
+    images = torch.randint(0, 256, (3, 3, 8, 8), dtype=torch.uint8)
+    net = Projected(Means(), 0)
+    assert net.names == tuple(Means.names) and torch.equal(net.embed(images), Means().embed(images))
+
+
 def test_a_projected_network_keeps_its_projection_alone():
     images = torch.randint(0, 256, (60, 3, 8, 8), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     net = Projected(Means(), 2, b"a" * 32)

@@ -27,7 +27,7 @@ from probscene.scenarios import JointGrammar
 from ...progress import Progress
 from ..observer import Observer
 from ..parts import inner
-from ..presets import META_SIM
+from ..preset import META_SIM
 from ..storage import Keeper
 from .judged import held_out, judged
 from .meta_sim import meta_sim_learning, sites_record

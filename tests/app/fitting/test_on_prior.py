@@ -1,0 +1,39 @@
+"""The paper's presets pretrain on the prior, and let the guide take whatever the grammar has."""
+
+import dataclasses
+
+import torch
+
+from probscene import load_model
+from probscene.app.evaluation.sources import PRIOR, START, before
+from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL
+from probscene.app.fitting.run import RunFolder
+from probscene.derive import derive
+
+
+def begun(preset, folder):
+    model = load_model("aerial2d")
+    record = {"preset": dataclasses.asdict(preset), "guide": preset.guide_settings()}
+    return RunFolder.create(folder / "run", "aerial2d", record, loaded=model)
+
+
+def test_the_prior_is_where_it_starts(tmp_path):
+    run = begun(PAPER_AERIAL, tmp_path)
+    for opened in (run, RunFolder.at(run.path)):
+        assert opened.model.pretraining_policy is opened.model.prior and list(before(opened.model)) == [PRIOR]
+        assert opened.new_guide().support is None
+    other = begun(DEFAULT, tmp_path / "other")
+    assert list(before(other.model)) == [PRIOR, START] and other.new_guide().support is not None
+
+
+def test_its_guide_reaches_lists_that_the_prior_never_has(tmp_path):
+    """At most eight cars are on a road of the prior; an untrained guide derives more."""
+    model = begun(PAPER_AERIAL, tmp_path).model
+    cars = model.grammar.kind("car")
+    torch.manual_seed(0)
+    guide = RunFolder.at(tmp_path / "run").new_guide()
+    with torch.no_grad():
+        guide.out.bias[[i for i, r in enumerate(model.grammar.rules) if str(r) == "Cars -> car Cars"]] += 5
+        drawn = derive(model.grammar, guide, 50, model.max_steps)
+    longest = (drawn.kind == cars).sum(1).max()
+    assert longest > 4 * 8  # on four roads at most
