@@ -34,7 +34,7 @@ def test_tabletop_is_fitted_and_generated(call, discs, photos, tmp_path):
     "words",
     [
         ["--preset", "paper", "--set", "presence_images=40", "--set", "presence_epochs=1", "--set", "num_real=10"],
-        ["--preset", "paper-aerial", "--set", "presence_images=40", "--set", "presence_epochs=1", "--set", "num_real=10"],
+        ["--preset", "paper-aerial", "--set", "presence_images=40", "--set", "presence_epochs=1"],
         ["--preset", "paper-driving", "--features", "efficientnet", "--set", "num_real=10"],
         ["--preset", "quick", "--objective", "mmd", "--set", "count.steps=16", "--set", "width=4,8,8"],
         ["--preset", "quick", "--set", "num_latents=3", "--set", "count.steps=16", "--set", "width=4,8,8"],
