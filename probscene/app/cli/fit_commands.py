@@ -31,7 +31,8 @@ def fit(
         str | None,
         typer.Option(
             metavar="NET",
-            help="count, count=efficientnet, presence, presence=counts, efficientnet, inception[=FILE], resnet50[=FILE], FILE.py:NAME.",
+            help="count, count=efficientnet, presence[=counts], efficientnet, inception[=FILE], resnet50[=FILE], "
+            "FILE.py:NAME.",
         ),
     ] = None,
     learn: Annotated[
