@@ -12,6 +12,7 @@ own log p. The fits of one preset and seed share their feature network, whose tr
 import argparse
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,8 @@ from given import out_option
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.preset import Preset
-from probscene.app.fitting.presets import DEFAULT, QUICK
+from probscene.app.fitting.preset import STRUCTURE, Preset
+from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL, QUICK
 from probscene.app.fitting.session import timing
 from probscene.derive import derive_complete
 from probscene.inference.judging.metrics import total_variation
@@ -31,14 +32,14 @@ from probscene.policy import Policy
 from probscene.relations import per_parent
 from probscene.sampling import seed_everything
 
-PRESETS = {"quick": QUICK, "default": DEFAULT}
+PRESETS = {"quick": QUICK, "default": DEFAULT, "paper": PAPER_AERIAL}
 FITS = ("lstm", "pcfg", "grammar-vae", "mmd", "witness", "js")
 COLUMNS = ("roads", "first", "others", "mean_first", "mean_others", "log_q")
 
 
 def chosen(preset: str, fit: str) -> Preset:
-    """The preset with another guide or objective."""
-    base = PRESETS[preset]
+    """The preset with another guide or objective, for structure alone."""
+    base = replace(PRESETS[preset], learn=STRUCTURE)
     if fit in ("lstm", "pcfg", "grammar-vae"):
         return base.with_guide(fit)
     return base.with_objective(fit)

@@ -17,7 +17,7 @@ from given import out_option
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.sources import LEARNT, before
+from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import preset
@@ -60,7 +60,7 @@ def main():
         run = fit(args.model, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
         truth = counted(model, target.prior)
         row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
-        for name, policy in {**before(model), LEARNT: run.guide}.items():
+        for name, policy in {**before(run.model), LEARNT: run.guide}.items():
             found = counted(model, policy)
             each = {
                 c: round(total_variation(histogram(found[:, i]), histogram(truth[:, i])), 4)
@@ -71,7 +71,7 @@ def main():
         rows.append(row)
         print(json.dumps(row), flush=True)
         write_json(args.out / "results.json", rows)
-    for name in (*before(model), LEARNT):
+    for name in (name for name in FITTED if name in rows[0]):
         cars = [row[name]["total_variation"]["car"] for row in rows]
         print(f"{name:8} cars, total variation: mean {np.mean(cars):.3f}, {min(cars):.3f} to {max(cars):.3f}")
 

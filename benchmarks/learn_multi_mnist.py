@@ -13,6 +13,7 @@ import gzip
 import json
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,7 @@ from given import mnist_option, needed_mnist, out_option
 
 from probscene.app.api.fit import fit
 from probscene.app.files import write_json
+from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
 from probscene.app.fitting.session import timing
 from probscene.derive import derive_complete
@@ -88,7 +90,8 @@ def distances(policy, target: int) -> tuple[float, float]:
 def fit_images(name: str, target: int, seed: int, args) -> tuple[LSTMGuide, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
     images, out = args.out / f"target-{target}", args.out / f"{name}-{target}"
-    run = fit("multi_mnist", images, PRESETS[name], seed, out=out, resume=True, cache=args.out / "cache")
+    preset = replace(PRESETS[name], learn=STRUCTURE)
+    run = fit("multi_mnist", images, preset, seed, out=out, resume=True, cache=args.out / "cache")
     return run.guide, timing(run)
 
 
