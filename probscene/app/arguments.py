@@ -26,3 +26,19 @@ def positive(number: int, what: str) -> int:
     if number < 1:
         raise ProbsceneError(f"Expected a positive number of {what}, actual {number}.")
     return number
+
+
+def number_or_all(text: str, what: str) -> int | None:
+    """A number that was typed, or None for the word ``all``.
+
+    Args:
+        what: is counted, for the message.
+
+    Raises:
+        ProbsceneError: it is neither.
+    """
+    if text == "all":
+        return None
+    if not text.isascii() or not text.isdigit():
+        raise ProbsceneError(f"Expected a number of {what}, or all, actual {text!r}.")
+    return int(text)

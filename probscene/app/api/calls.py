@@ -89,7 +89,7 @@ def evaluate(
     labels: Path | str | Labels | None = None,
     num: int = 10000,
     features: Sequence[str] = (),
-    images: int = 1000,
+    images: int | None = 1000,
     some_labels: bool = False,
     min_height: float = 0.0,
     progress: bool = True,
@@ -101,8 +101,8 @@ def evaluate(
         target: the images to judge by; the run's own where None.
         labels: ``counts.csv``, COCO's ``.json``, ``provenance.jsonl`` or KITTI's folder ``label_2``.
         num: structures a source.
-        features: networks for FID and KID, such as ``["efficientnet"]``.
-        images: at most so many a side for them.
+        features: networks for KID and FID, such as ``["efficientnet"]``.
+        images: at most so many a side for them; all of the target's where None.
         some_labels: labels need not cover all images.
         min_height: of objects that labels with boxes count, pixels.
         visible: least visible share of objects that are counted in rendered scenes, 0 to 1: one, or one for each class

@@ -53,9 +53,11 @@ def evaluate(
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
     features: Annotated[
         list[str] | None,
-        typer.Option(metavar="NET", help="FID and KID by run, efficientnet, inception[=FILE], resnet50[=FILE]; many."),
+        typer.Option(metavar="NET", help="KID and FID by run, efficientnet, inception[=FILE], resnet50[=FILE]; many."),
     ] = None,
-    num_images: Annotated[int, typer.Option("--images", help="At most so many a side for FID and KID.")] = 1000,
+    num_images: Annotated[
+        str, typer.Option("--images", metavar="N", help="At most so many a side for KID and FID, or all.")
+    ] = "1000",
     scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
     some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
@@ -64,6 +66,7 @@ def evaluate(
     """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
     from rich.console import Console
 
+    from ..arguments import number_or_all
     from ..evaluation import judge as verdict
     from ..evaluation.evaluate import evaluate
     from ..evaluation.labels import read_labels
@@ -75,12 +78,13 @@ def evaluate(
 
     opened = RunFolder.at(run)
     opened.check_finished()
+    most = number_or_all(num_images, "images to compare")
     if json is not None:
         make_folder(json.parent)
     with Display() as show:
         images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
-        found = evaluate(opened, images, truth, show, num, features=features or (), images=num_images, visible=visible)
+        found = evaluate(opened, images, truth, show, num, features=features or (), images=most, visible=visible)
         judged = verdict.judge(opened, images, show, scenes, found) if scenes else None
     console = Console(highlight=False)
     if judged is not None:

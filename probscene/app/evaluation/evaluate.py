@@ -48,7 +48,7 @@ class Evaluation:
         classes: the C names; only those that are labelled, where there are labels.
         sources: ``FITTED``, then ``truth`` and ``estimate``, where they are known.
         likelihoods: of the truth's structures under each of ``FITTED``, where they are known.
-        images: FID and KID by the features' name; see ``image_distances``.
+        images: KID and FID by the features' name; see ``image_distances``.
         notes: of the labels.
         piled: the lists that are too short for what was learnt.
         inexpressible: the images that the model cannot have, by the labels, else by the estimate.
@@ -181,7 +181,7 @@ def evaluate(
     num: int = 10000,
     seed: int = 0,
     features: Sequence[str] = (),
-    images: int = IMAGES,
+    images: int | None = IMAGES,
     visible: Visible | None = None,
 ) -> Evaluation:
     """Sample structures of the prior and of the guide and count, beside the truth and the network's estimate.
@@ -191,7 +191,7 @@ def evaluate(
         truth: the labels of the target's images.
         num: structures a source; see ``visible.SHOWN`` where they are rendered for it.
         features: networks to compare images by, see ``seen.network``; none, as it renders.
-        images: how many are compared at most, where they are.
+        images: how many are compared at most, where they are; all where None.
         visible: least visible shares of what is counted in rendered scenes; those of the run where this is None.
 
     Raises:

@@ -1,12 +1,17 @@
-"""FID and KID of a run's scenes to the target's images, beside the floor: two halves of the target.
+"""KID and FID of a run's scenes to the target's images, beside the floor: two halves of the target.
 
 FID depends on the number of images, so every figure here is of as many on either side: no more than half of the
-target, and than were asked for. Generated images are compared with one half, and that half with the other. Axis
+target, and than were asked for. Generated images are compared with one half, and that half with the other. Where all
+images are asked for, as many generated ones are compared with all of them, and the floor is what the halves tell of as
+many: KID has no bias and stays, FID of two samples of one distribution falls as one over their number [1]. Axis
 letters: L images, m images a side.
+
+References:
+    [1] Chong, Forsyth, *Effectively Unbiased FID and Inception Score*, 2020.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -17,9 +22,12 @@ from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, features_of, network
 from .sources import LEARNT, before
 
+if TYPE_CHECKING:
+    from probscene.inference.judging.image_metrics import Figure
+
 IMAGES = 1000
 Distances = dict[str, tuple[Any, ...]]
-"""By ``prior``, ``start`` where it is another policy, ``learnt`` and ``floor``: the ``Figure`` of FID and of KID."""
+"""By ``prior``, ``start`` where it is another policy, ``learnt`` and ``floor``: the ``Figure`` of KID and of FID."""
 
 
 def image_distances(
@@ -27,14 +35,14 @@ def image_distances(
     target: Images,
     choices: Sequence[str],
     progress: Callable[[str, int, int, str], None],
-    num: int = IMAGES,
+    num: int | None = IMAGES,
     seed: int = 0,
 ) -> dict[str, Distances]:
     """The distances by the name of the network that sees the images.
 
     Args:
         choices: networks, see ``seen.network``.
-        num: m at most.
+        num: m at most; all images where None.
 
     Raises:
         ProbsceneError: fewer than 2 images asked for, a network that there is not; see ``features_of``.
@@ -42,14 +50,15 @@ def image_distances(
     """
     if not choices:
         return {}
-    if num < 2:
+    if num is not None and num < 2:
         raise ProbsceneError(f"Expected at least 2 images to compare, actual {num}.")
     if len(target) < 4:
-        raise DataError(f"Expected at least 4 images in {target.path} for FID and KID, actual {len(target)}.")
+        raise DataError(f"Expected at least 4 images in {target.path} for KID and FID, actual {len(target)}.")
     from probscene.inference.judging.image_metrics import fid, kid  # torchmetrics takes seconds to import
 
     nets = [network(choice, run) for choice in choices]
-    m = min(num, len(target) // 2)
+    half = len(target) // 2
+    m = len(target) if num is None else min(num, half)
     order = torch.randperm(len(target), generator=torch.Generator().manual_seed(seed))
     policies = {**before(run.model), LEARNT: run.guide}
     done, total = 0, len(nets) * (len(target) + len(policies) * m)
@@ -62,11 +71,20 @@ def image_distances(
     found = {}
     for name, net in nets:
         real = features_in(run, target, net, each)[order]
-        sides = {source: features_of(run, policy, m, net, seed, each) for source, policy in policies.items()} | {
-            "floor": real[m : 2 * m]
-        }
+        sides = {source: features_of(run, policy, m, net, seed, each) for source, policy in policies.items()}
         found[name] = {
-            source: (fid(real[:m], side, name, seed=seed), kid(real[:m], side, name, seed=seed))
+            source: tuple(distance(real[:m], side, name, seed=seed) for distance in (kid, fid))
             for source, side in sides.items()
         }
+        h = min(m, half)
+        floor, biased = (distance(real[:h], real[h : 2 * h], name, seed=seed) for distance in (kid, fid))
+        found[name]["floor"] = floor, biased if h == m else as_of(biased, m)
     return found
+
+
+def as_of(figure: "Figure", images: int) -> "Figure":
+    """An estimate of what FID of two samples of one distribution would be with another number of images a side."""
+    share = figure.images / images
+    value, low, high = (share * number for number in (figure.value, figure.low, figure.high))
+    note = f"estimated from {figure.images} images a side"
+    return figure._replace(value=value, low=low, high=high, images=images, note=note)

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from probscene.app.evaluation.image_distances import image_distances
+from probscene.app.evaluation.image_distances import as_of, image_distances
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import features_in, features_of, own_net
 from probscene.dataset import ImageFolder
@@ -37,10 +37,33 @@ def test_figures_are_those_of_the_features(run, images):
         "floor": real[15:30],
     }
     for source, side in sides.items():
-        for figure, distance in zip(found["run"][source], (fid, kid), strict=True):
+        for figure, distance in zip(found["run"][source], (kid, fid), strict=True):
             expected = distance(real[:15], side, "run", seed=2)
             assert figure.value == pytest.approx(expected.value, rel=1e-3) and figure.images == 15
             assert figure[:2] == expected[:2] and figure.low <= figure.value <= figure.high
+
+
+def test_all_images_where_asked(run, images):
+    """As many generated ones beside them; the floor is of the halves, and FID's an estimate for all."""
+    found = image_distances(run, images, ["run"], lambda *_: None, None, seed=2)["run"]
+    net = own_net(run)
+    real = features_in(run, images, net)[torch.randperm(40, generator=torch.Generator().manual_seed(2))]
+    learnt = features_of(run, run.guide, 40, net, 2)
+    for figure, distance in zip(found["learnt"], (kid, fid), strict=True):
+        assert figure.value == pytest.approx(distance(real, learnt, "run", seed=2).value, rel=1e-3)
+        assert figure.images == 40
+    floor, biased = found["floor"]
+    halves = [distance(real[:20], real[20:], "run", seed=2) for distance in (kid, fid)]
+    assert floor.value == pytest.approx(halves[0].value, rel=1e-3, abs=1e-6) and floor.images == 20
+    assert biased.value == pytest.approx(halves[1].value / 2, rel=1e-3) and biased.images == 40
+    assert "estimated from 20 images" in biased.note
+
+
+def test_fid_of_two_samples_of_one_distribution_falls_as_one_over_their_number():
+    sampled = torch.randn(4, 2000, 6, generator=torch.Generator().manual_seed(0))
+    few = [fid(one[:400], one[400:800], "noise", size=2) for one in sampled]
+    many = sum(fid(one[:1000], one[1000:], "noise", size=2).value for one in sampled) / 4
+    assert sum(as_of(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
 
 
 def test_no_more_than_half_of_the_target(run, images):
@@ -77,7 +100,9 @@ def test_the_command_prints_and_writes_them(call, fitted, target, tmp_path):
                 assert figure["features"] == name and figure["images"] == 10 and math.isfinite(figure["value"])
                 assert f"{figure['value']:.4g} ±" in shown.out
     said = "".join(shown.out.split())  # a title may be wider than its table
-    assert "inthefeaturesofefficientnet-lite0" in said and "FID, 10" in shown.out
+    assert "inthefeaturesofefficientnet-lite0" in said and shown.out.index("KID, 10") < shown.out.index("FID, 10")
+    refused = call(*words[:-4], "--images", "many", "--features", "run")
+    assert refused.code == 2 and "number of images to compare, or all, actual 'many'" in refused.err
     assert "FID of 10 images in 1280 dimensions" in shown.out and "two halves of the target" in shown.out
     wrong = call(*words, "--features", "resnet", "--json", tmp_path / "f.json")
     assert wrong.code == 2 and "actual 'resnet'" in wrong.err and not (tmp_path / "f.json").exists()
