@@ -11,13 +11,14 @@ own log p. The fits of one preset and seed share their feature network, whose tr
 
 import argparse
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from given import out_option
+from torch import Tensor
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
@@ -27,10 +28,11 @@ from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL, QUICK
 from probscene.app.fitting.session import timing
 from probscene.derive import derive_complete
 from probscene.inference.judging.metrics import total_variation
-from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
+from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET, poisson
 from probscene.policy import Policy
 from probscene.relations import per_parent
 from probscene.sampling import seed_everything
+from probscene.structure import StructurePrior, counts, ranked
 
 PRESETS = {"quick": QUICK, "default": DEFAULT, "paper": PAPER_AERIAL}
 FITS = ("lstm", "pcfg", "grammar-vae", "mmd", "witness", "js")
@@ -45,30 +47,44 @@ def chosen(preset: str, fit: str) -> Preset:
     return base.with_objective(fit)
 
 
-def poisson(mean: float) -> np.ndarray:
-    """Cars on a road of the target, cut at 20."""
-    p = np.array([mean**n / math.factorial(n) for n in range(21)])
-    return p / p.sum()
+class Truth(NamedTuple):
+    """What structures are drawn from: P(0, 1, ... roads), and mean cars on the first road and on each other."""
+
+    roads: tuple[float, ...] = (0, 0.05, 0.15, 0.4, 0.4)
+    first: float = 9.0
+    others: float = 3.0
+
+    @property
+    def policy(self) -> StructurePrior:
+        return StructurePrior(
+            GRAMMAR, Roads=counts(*self.roads), Cars=ranked(poisson(self.first), poisson(self.others))
+        )
 
 
-def judged(policy: Policy) -> dict[str, float]:
+def shares(mean: float) -> np.ndarray:
+    """Cars on a road, cut where it is full."""
+    probs = np.array(poisson(mean).probs)
+    return probs / probs.sum()
+
+
+def judged(policy: Policy, truth: Truth) -> dict[str, float]:
     """How far a policy's structures are from the target's."""
     seed_everything(99)
     derivation, _ = derive_complete(GRAMMAR, policy, 20_000, MODEL.max_steps)
     found = per_parent(derivation, GRAMMAR.kind("road"), GRAMMAR.kind("car"))
     first, others = found.count[found.rank == 0], found.count[found.rank > 0]
     roads = derivation.counts(len(GRAMMAR.kinds))[:, GRAMMAR.kind("road")]
-    held_out, _ = derive_complete(GRAMMAR, TARGET, 5_000, MODEL.max_steps)
+    held_out, _ = derive_complete(GRAMMAR, truth.policy, 5_000, MODEL.max_steps)
     with torch.no_grad():
         log_q = policy.log_prob(held_out).mean().item()
 
-    def apart(counts, truth):
-        return total_variation(np.bincount(counts.numpy()) / len(counts), truth)
+    def apart(found: Tensor, expected: np.ndarray) -> float:
+        return total_variation(np.bincount(found.numpy()) / len(found), expected)
 
     return {
-        "roads": apart(roads, np.array([0, 0.05, 0.15, 0.4, 0.4])),
-        "first": apart(first, poisson(9)),
-        "others": apart(others, poisson(3)),
+        "roads": apart(roads, np.array(truth.roads)),
+        "first": apart(first, shares(truth.first)),
+        "others": apart(others, shares(truth.others)),
         "mean_first": first.double().mean().item(),
         "mean_others": others.double().mean().item(),
         "log_q": log_q,
@@ -90,7 +106,7 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=5000)
     args = parser.parse_args()
-    rows = [{"fit": "prior", **judged(MODEL.prior)}, {"fit": "target", **judged(TARGET)}]
+    rows = [{"fit": "prior", **judged(MODEL.prior, Truth())}, {"fit": "target", **judged(TARGET, Truth())}]
     for seed in args.seeds:
         target = MODEL.target(0)
         images = args.out / f"target-{seed}"
@@ -98,7 +114,7 @@ def main():
         for preset in args.presets:
             for name in args.fits:
                 guide, took = fit_images(preset, name, seed, args.out)
-                rows.append({"preset": preset, "fit": name, "seed": seed, **judged(guide), "seconds": took})
+                rows.append({"preset": preset, "fit": name, "seed": seed, **judged(guide, Truth()), "seconds": took})
                 print(json.dumps(rows[-1]), flush=True)
                 write_json(args.out / "results.json", rows)
     print(f"\n{'':20}" + "".join(f"{column:>22}" for column in COLUMNS))

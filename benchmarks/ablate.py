@@ -1,0 +1,188 @@
+"""What each part of the method is worth: a fit with one thing changed at a time, on targets with hidden structures.
+
+    python benchmarks/ablate.py [--model multi_mnist] [--preset quick] [--seeds 0] [--only NAME ...] [--out FOLDER]
+
+Each seed's target is drawn by the model itself with another distribution of structures (``SceneModel.target``), and
+fits see its images alone. Figures are of 20,000 learnt structures against 20,000 of the target's: the total variation
+of the number of objects of each class, averaged over classes, and log q of 5,000 held-out structures, nats a scene,
+with the share of them that the guide cannot derive. Beside the fits are the prior, the start and the floor: as many
+structures of the target as it has images. FOLDER holds the runs, ``results.json``, ``results.csv`` and a figure,
+``ablation.png``. An interrupted run goes on.
+"""
+
+import argparse
+import csv
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+import torch
+from given import out_option
+from learn_driving import counted
+
+from probscene.app.api.fit import fit
+from probscene.app.datasets.generate import generate_scenes
+from probscene.app.evaluation.sources import PRIOR, START, before
+from probscene.app.files import write_json
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.preset import STRUCTURE
+from probscene.app.fitting.presets import preset
+from probscene.app.loading import load_model
+from probscene.app.memory import keep_freed_memory
+from probscene.derivation import Derivation
+from probscene.derive import derive_complete
+from probscene.inference.judging.metrics import histogram, total_variation
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import seed_everything
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+AS_IT_IS, FLOOR = "as it is", "floor"
+HELD_OUT = 5000
+COLUMNS = ("variant", "settings", "seed", "total_variation", "log_q", "impossible", "seconds")
+
+
+class Variant(NamedTuple):
+    """A change.
+
+    Attributes:
+        settings: of the preset, as of ``probscene fit --set``.
+        model: another model, or none.
+        ungrouped: counts are of the whole image and not by group.
+    """
+
+    settings: tuple[str, ...] = ()
+    model: str | None = None
+    ungrouped: bool = False
+
+
+VARIANTS = {
+    AS_IT_IS: Variant(),
+    "4 latent vectors": Variant(("num_latents=4",)),
+    "no index": Variant(("index=false",)),
+    "presence features": Variant(("features=presence",)),
+    "EfficientNet features": Variant(("features=efficientnet",)),
+    "objective js": Variant(("objective=js",)),
+    "objective witness": Variant(("objective=witness",)),
+    "objective mmd": Variant(("objective=mmd",)),
+    "no marginals": Variant(("marginal_variance=none",)),
+    "the paper's bandwidth": Variant(("variance=none",)),
+    "a scene in its own density": Variant(("leave_one_out=false",)),
+    "one drawing a structure": Variant(("draws_per_structure=1",)),
+    "one update a batch": Variant(("updates=1",)),
+    "moving average as baseline": Variant(("baseline=moving_average",)),
+    "guide pcfg": Variant(("guide=pcfg",)),
+    "guide grammar-vae": Variant(("guide=grammar-vae",)),
+    "pretrained on the prior": Variant(("on_prior=true",)),
+    "no counts by group": Variant(ungrouped=True),
+    "simple prior": Variant(model="driving_simple"),
+}
+
+
+def variants(model: SceneModel, only: list[str]) -> dict[str, Variant]:
+    """Those that make a difference to a model: the first, and ``only`` some of the others where any is named."""
+    drop = set() if model.groups is not None else {"no counts by group"}
+    drop |= set() if model.name == "driving" else {"simple prior"}
+    drop |= set() if model.pretraining is not None else {"pretrained on the prior"}
+    return {n: v for n, v in VARIANTS.items() if n not in drop and (not only or n in (AS_IT_IS, *only))}
+
+
+def changed(model: SceneModel, name: str, variant: Variant) -> str | SceneModel:
+    """The model of a variant."""
+    return replace(model, groups=None) if variant.ungrouped else variant.model or name
+
+
+def figures(model: SceneModel, policy: Policy, truth: np.ndarray, held_out: Derivation) -> dict[str, float]:
+    """How far a policy's structures are from the target's."""
+    found = counted(model, policy)
+    each = [total_variation(histogram(found[:, i]), histogram(truth[:, i])) for i in range(len(model.classes))]
+    with torch.no_grad():
+        log_q = policy.log_prob(held_out)
+    possible = torch.isfinite(log_q)
+    return {
+        "total_variation": round(float(np.mean(each)), 4),
+        "log_q": round(float(log_q[possible].mean()), 3) if possible.any() else float("nan"),
+        "impossible": round(float((~possible).double().mean()), 4),
+    }
+
+
+def of_seed(args, seed: int) -> list[dict]:
+    """The rows of a seed, one for each variant."""
+    model = load_model(args.model)
+    target = model.target(seed)
+    images = args.out / f"target-{seed}"
+    generate_scenes(target, target.prior, args.images, images, seed=1000 + seed, format="images")
+    truth = counted(target, target.prior)
+    seed_everything(98)
+    held_out, _ = derive_complete(target.grammar, target.prior, HELD_OUT, target.max_steps)
+    sample = counted(target, target.prior, args.images + len(truth))[len(truth) :]
+    floor = [total_variation(histogram(sample[:, i]), histogram(truth[:, i])) for i in range(len(model.classes))]
+    own = figures(model, target.prior, truth, held_out) | {"total_variation": round(float(np.mean(floor)), 4)}
+    rows = [{"variant": FLOOR, "settings": "", "seed": seed, **own, "seconds": 0.0}]
+    for name, policy in before(model).items():
+        rows.append(
+            {"variant": name, "settings": "", "seed": seed, **figures(model, policy, truth, held_out), "seconds": 0.0}
+        )
+    base = replace(preset(args.preset), learn=STRUCTURE, prior_if_worse=False)
+    for name, variant in variants(model, args.only).items():
+        start, path = time.monotonic(), args.out / f"{name.replace(' ', '-')}-{seed}"
+        chosen = override(base, list(variant.settings))
+        other = changed(model, args.model, variant)
+        run = fit(other, images / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
+        found = figures(run.model, run.guide, truth, held_out)
+        settings = " ".join(variant.settings)
+        took = round(time.monotonic() - start, 1)
+        rows.append({"variant": name, "settings": settings, "seed": seed, **found, "seconds": took})
+        print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def picture(rows: list[dict], path: Path) -> None:
+    """Mean and range over the seeds, a line for each variant."""
+    names = list(dict.fromkeys(row["variant"] for row in rows))
+    plt.figure(figsize=(7, 0.3 * len(names) + 1))
+    for i, name in enumerate(names):
+        each = [row["total_variation"] for row in rows if row["variant"] == name]
+        colour = "tab:grey" if name in (FLOOR, PRIOR, START) else "tab:blue"
+        plt.plot([min(each), max(each)], [i, i], color=colour)
+        plt.plot(np.mean(each), i, "o", color=colour)
+    plt.yticks(range(len(names)), names)
+    plt.gca().invert_yaxis()
+    plt.xlim(left=0)
+    plt.grid(axis="x", alpha=0.3)
+    plt.xlabel("total variation of the number of objects, mean of the classes")
+    plt.tight_layout()
+    plt.savefig(path, dpi=120)
+    plt.close()
+
+
+def main():
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    out_option(parser, __file__)
+    parser.add_argument("--model", default="multi_mnist")
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--images", type=int, default=5000)
+    parser.add_argument("--only", nargs="*", default=[], choices=VARIANTS, help="of the variants")
+    args = parser.parse_args()
+    args.out /= args.model
+    keep_freed_memory()
+    rows = []
+    for seed in args.seeds:
+        rows += of_seed(args, seed)
+        write_json(args.out / "results.json", rows)
+        with (args.out / "results.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(rows)
+        picture(rows, args.out / "ablation.png")
+
+
+if __name__ == "__main__":
+    main()
