@@ -6,11 +6,11 @@ Structures of Aerial 2D, with true counts of roads and of cars by road instead o
 distribution is learnt, and not how images are read. The search draws step size, steps a batch, baseline and number of
 batches, the same for all fits, with each one's default among them. All are tried on one target with half the batches,
 the better third on another with all of them; both have other distributions than the paper's target, on which the
-winner and the default settings are then fitted. Printed are the total variation of 20,000 structures
-from the target's distributions, and log q of 5,000 others, nats; the row ``best-pcfg`` has the rule frequencies of the
-target's own structures, which no context-free grammar beats in likelihood, and ``best-pcfg, bounded`` the weights of
-maximum likelihood where lists end at the longest that the model declares, as they do in all fits. FOLDER holds ``results.json``, every fit;
-an interrupted search goes on.
+winner and the default settings are then fitted. Printed are the total variation of 20,000 structures from the target's
+distributions, and log q of 5,000 others, nats. The row ``best-pcfg`` has the rule frequencies of the target's own
+structures, which no context-free grammar beats in likelihood, and ``best-pcfg, bounded`` the weights of maximum
+likelihood where lists end at the longest that the model declares, as they do in all fits. FOLDER holds
+``results.json``, every fit; an interrupted search goes on.
 """
 
 import argparse
