@@ -94,7 +94,8 @@ def main():
     images = torch.stack([real.load(i) for i in range(IMAGES)])
     number, share = distributions(args.target)
     structure = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
-    schedule = override(QUICK, [f"meta_sim.{setting}" for setting in args.set]).meta_sim
+    settings = ["parameter_method=meta-sim", *(f"meta_sim.{setting}" for setting in args.set)]
+    schedule = override(QUICK, settings).meta_sim
     look = EfficientNetLite(schedule.feature_size)
     seen = Observer(MODEL, 1).observe(look)
     matching = MetaSimLearning(MODEL, structure, seen, look.embed(images), schedule, args.seed)

@@ -145,9 +145,9 @@ def main():
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = override(preset("street").with_features(args.features), args.settings)
+        chosen = override(preset("street").with_features(args.features), [*args.settings, f"learn={args.learn}"])
         start = time.monotonic()
-        run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False, learn=args.learn)
+        run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False)
         seconds = round(time.monotonic() - start, 1)
         target = ImageFolder(args.images, run.model.canvas, run.model.channels)
         truth = read_labels(args.labels, run.model, target, False, args.min_height)
