@@ -15,7 +15,7 @@ DEFAULT = replace(
     QUICK,
     count=CountSchedule(steps=12000),
     batches=120,
-    parameters=ParameterSchedule(reader_steps=800),
+    parameters=ParameterSchedule(reader_steps=800, rounds=3, round_steps=500),
 )
 # Streets have ten counts, some of which spread over tens: kernels of variance 1 would leave most of 500 scenes alone.
 # Objects behind others are counted as far as they can be seen at all; the prior holds what cannot.
