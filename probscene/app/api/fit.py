@@ -140,14 +140,9 @@ def chosen_preset(
     divergence: str | Divergence | None,
     guide: str | GuideMaker | None,
     settings: Mapping[str, Any] | Sequence[str],
-    automatic: bool = False,
 ) -> tuple[Preset, Parts]:
     """The preset with all that was chosen beside it, and the user's own parts of it, of objects and of files; arguments
-    as of ``fit``.
-
-    Args:
-        automatic: the target's looks have chosen the features, and not the user.
-    """
+    as of ``fit``."""
     chosen = preset if isinstance(preset, Preset) else preset_of(preset)
     imported: dict[Path, ModuleType] = {}
     given = (features, divergence, guide)
@@ -165,7 +160,7 @@ def chosen_preset(
         chosen = chosen.with_features_of(own.features, of_features or in_memory(own.features.name))
     elif of_features:
         chosen = chosen.with_features(of_features)
-    return override(chosen, with_learn(settings, None), automatic), own
+    return override(chosen, with_learn(settings, None)), own
 
 
 def with_learn(
@@ -199,7 +194,7 @@ def preset_for_photographs(
     chosen = preset if isinstance(preset, Preset) else preset_of(preset)
     if features is not None or chosen.features != FOR_RENDERS:
         return None
-    made = chosen_preset(preset, FOR_PHOTOGRAPHS, divergence, guide, settings, automatic=True)[0]
+    made = chosen_preset(preset, FOR_PHOTOGRAPHS, divergence, guide, settings)[0]
     return made if made.features == FOR_PHOTOGRAPHS else None
 
 

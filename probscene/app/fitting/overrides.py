@@ -21,19 +21,15 @@ FIRST = {"objective": Preset.with_objective, "guide": Preset.with_guide, "featur
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate", "difference")
 
 
-def override(preset: Preset, settings: list[str], automatic: bool = False) -> Preset:
+def override(preset: Preset, settings: list[str]) -> Preset:
     """A preset with ``settings`` such as ``"batches=2"``, ``"count.steps=32"`` or ``"width=8,16,32"``.
 
     ``none`` stands for no value, ``true`` and ``false`` for themselves. Objective, guide and features come first, with
     all that suits them, as by ``Preset.with_objective`` and the like.
 
-    Args:
-        automatic: features, and with them what is learnt, are chosen by the target's looks; a setting that goes with
-            another choice is then none that does nothing.
-
     Raises:
-        ProbsceneError: no ``=``, an unknown field, a value of another type or out of range, a setting that nothing
-            that was chosen reads, or one that leaves nothing to learn.
+        ProbsceneError: no ``=``, an unknown field, a value of another type or out of range, a setting that the chosen
+            guide or objective does not read, or one that leaves nothing to learn.
     """
     pairs = []
     for setting in settings:
@@ -46,11 +42,10 @@ def override(preset: Preset, settings: list[str], automatic: bool = False) -> Pr
             preset = FIRST[key](preset, lasting_word(text))
         else:
             preset = _replaced(preset, key.split("."), text, key)
-    unread = {} if automatic else preset.unread()
     for key, _ in pairs:
-        if (name := key.partition(".")[0]) in unread:
+        if key in (unread := preset.unread()):
             raise ProbsceneError(
-                f"Expected settings that are read, actual --set {key}=...: {unread[name]}; leave it out."
+                f"Expected settings that are read, actual --set {key}=...: {unread[key]}; leave it out."
             )
     if preset.objective == "mmd" and preset.baseline == "leave_one_out":
         raise ProbsceneError(

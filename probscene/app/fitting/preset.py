@@ -212,8 +212,8 @@ class Preset:
         return replace(self, guide=kind)
 
     def unread(self) -> dict[str, str]:
-        """Settings that the chosen guide, objective and learning do not read, and why."""
-        guide, found = set(self.guide_settings()), self._unread_by_learning()
+        """Settings that the chosen guide or objective does not read, and why."""
+        guide, found = set(self.guide_settings()), {}
         for name in ("hidden", "num_latents", "index"):
             if name not in guide:
                 found[name] = f"the guide {self.guide!r} has no such setting"
@@ -223,13 +223,6 @@ class Preset:
             if because:
                 found[name] = because
         return found
-
-    def _unread_by_learning(self) -> dict[str, str]:
-        if "parameters" not in self.learn:
-            why = f"learn={STRUCTURE} learns no parameters; learn={BOTH} does"
-            return dict.fromkeys(("parameters", "meta_sim", "batches_again", "parameter_method"), why)
-        other = "meta_sim" if self.parameter_method == LIKELIHOOD else "parameters"
-        return {other: f"parameter_method={self.parameter_method} has settings of its own"}
 
     def guide_settings(self) -> dict[str, Any]:
         """The arguments of ``make_guide`` that a run keeps."""

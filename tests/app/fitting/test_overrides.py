@@ -36,10 +36,6 @@ def test_what_is_set_beside_a_choice_wins_whatever_comes_first():
         (["guide=pcfg", "hidden=20"], "--set hidden=...: the guide 'pcfg' has no such setting; leave it out"),
         (["num_latents=2", "guide=pcfg"], "the guide 'pcfg' has no such setting"),
         (["guide=grammar-vae", "index=false"], "the guide 'grammar-vae' has no such setting"),
-        (["learn=structure", "parameters.rounds=1"], "learns no parameters; learn=structure,parameters does"),
-        (["learn=structure", "batches_again=3"], "--set batches_again=...: learn=structure learns no parameters"),
-        (["meta_sim.steps=9"], "--set meta_sim.steps=...: parameter_method=likelihood has settings of its own"),
-        (["parameter_method=meta-sim", "parameters.rounds=1"], "parameter_method=meta-sim has settings of its own"),
         (["objective=mmd", "marginal_variance=1"], "only the objectives kde and js estimate densities"),
         (["objective=witness", "leave_one_out=true"], "only the objectives kde and js estimate densities"),
         (
@@ -52,12 +48,6 @@ def test_settings_that_do_nothing_are_errors(settings, because):
     with pytest.raises(ProbsceneError) as caught:
         override(DEFAULT, settings)
     assert because in str(caught.value)
-
-
-def test_what_the_target_decides_is_no_fault_of_a_setting():
-    assert (
-        override(DEFAULT, ["features=count=efficientnet", "parameters.rounds=1"], automatic=True).learn == "structure"
-    )
 
 
 def test_settings_that_are_read_are_none():
