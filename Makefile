@@ -48,6 +48,7 @@ test: lint docs
 
 # An evening's worth. MNIST's files for the benchmarks that need them: make benchmark MNIST=FOLDER
 benchmark: install
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[test,benchmark]'
 	@set -e; for script in $$(grep -l __main__ benchmarks/*.py); do echo "$$script"; $(BIN)/python "$$script"; done
 
 clean:
