@@ -172,8 +172,7 @@ class StructurePrior(Policy):
         table[0, :, :, : len(priors)] = _normalised(tuple(weights), len(priors), "weights of scenarios").log().float()
         table[V, :, :, 0] = 0.0
         for prior, v, k in zip(priors, first_symbol, first_rule, strict=True):
-            own = prior.table[:-1]
-            own = own[:, torch.arange(P).clamp(max=own.shape[1] - 1)][:, :, torch.arange(C).clamp(max=own.shape[2] - 1)]
+            own = grown(prior.table[:-1], P, C)
             table[v : v + own.shape[0], :, :, k : k + own.shape[3]] = own
         return StructurePrior.of_table(grammar, table)
 
