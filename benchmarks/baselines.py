@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from given import out_option
-from learn_aerial import COLUMNS, Truth, judged
+from learn_aerial import Truth, judged, show
 from torch import Tensor
 
 from probscene.app.files import write_json
@@ -195,13 +195,7 @@ def main():
         "target": TARGET,
     }
     table |= {name: [judged(policy, Truth())] for name, policy in others.items()}
-    print(f"\n{'':22}" + "".join(f"{column:>22}" for column in COLUMNS))
-    for name, rows in table.items():
-        cells = []
-        for column in COLUMNS:
-            each = [row[column] for row in rows]
-            cells.append(f"{np.mean(each):7.3f} {min(each):6.3f}..{max(each):6.3f}")
-        print(f"{name:22}" + "".join(f"{cell:>22}" for cell in cells))
+    show(table)
 
 
 if __name__ == "__main__":

@@ -91,6 +91,17 @@ def judged(policy: Policy, truth: Truth) -> dict[str, float]:
     }
 
 
+def show(table: dict[str, list[dict]]) -> None:
+    """Print a line for each name: the mean and range of each column over its rows."""
+    print(f"\n{'':22}" + "".join(f"{column:>22}" for column in COLUMNS))
+    for name, rows in table.items():
+        cells = []
+        for column in COLUMNS:
+            each = [row[column] for row in rows]
+            cells.append(f"{np.mean(each):7.3f} {min(each):6.3f}..{max(each):6.3f}")
+        print(f"{name:22}" + "".join(f"{cell:>22}" for cell in cells))
+
+
 def fit_images(preset: str, name: str, seed: int, out: Path) -> tuple[Policy, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
     images, path = out / f"target-{seed}" / "images", out / f"{preset}-{name}-{seed}"
@@ -117,14 +128,10 @@ def main():
                 rows.append({"preset": preset, "fit": name, "seed": seed, **judged(guide, Truth()), "seconds": took})
                 print(json.dumps(rows[-1]), flush=True)
                 write_json(args.out / "results.json", rows)
-    print(f"\n{'':20}" + "".join(f"{column:>22}" for column in COLUMNS))
-    for preset, name in [("", "prior"), ("", "target"), *((p, f) for p in args.presets for f in args.fits)]:
-        mine = [row for row in rows if (row.get("preset", ""), row["fit"]) == (preset, name)]
-        cells = []
-        for column in COLUMNS:
-            each = [row[column] for row in mine]
-            cells.append(f"{np.mean(each):7.3f} {min(each):6.3f}..{max(each):6.3f}")
-        print(f"{preset:8}{name:12}" + "".join(f"{cell:>22}" for cell in cells))
+    table: dict[str, list[dict]] = {}
+    for row in rows:
+        table.setdefault(f"{row.get('preset', ''):8}{row['fit']}", []).append(row)
+    show(table)
 
 
 if __name__ == "__main__":
