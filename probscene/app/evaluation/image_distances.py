@@ -83,7 +83,12 @@ def image_distances(
 
 
 def as_of(figure: "Figure", images: int) -> "Figure":
-    """An estimate of what FID of two samples of one distribution would be with another number of images a side."""
+    """An estimate of what FID of two samples of one distribution would be with another number of images a side [1].
+
+    Args:
+        figure: FID of two such samples; it is taken to fall as one over their number.
+        images: a side, of the estimate.
+    """
     share = figure.images / images
     value, low, high = (share * number for number in (figure.value, figure.low, figure.high))
     note = f"estimated from {figure.images} images a side"
