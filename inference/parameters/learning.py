@@ -3,8 +3,8 @@
 1. A reader is trained on renders (``reading.training``), half of them arranged as the prior hardly arranges them, and
    then what it reads of whole scenes.
 2. It is tried on renders of the prior: sites that it can read are learnt, the others keep their prior (``skill``).
-3. It reads the target; a guide learns the values by maximum likelihood (``likelihood``), in which objects that are
-   found less often count more (``reading.inclusion``).
+3. It reads the target; a guide learns the values by maximum likelihood (``likelihood``), beside objects that are not
+   found there (``reading.missing``).
 4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
    reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
 5. What is read in the guide's renders is brought to what is read in the target (``energy``).
@@ -26,20 +26,21 @@ from probscene.sampling import seed_everything
 from ..training import Report, Training, batch_seed
 from .best import Best, HeldOut
 from .energy import EnergyDistance, OwnReadings, energy_distance
-from .graph import Graph
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
-from .reading.assembly import Assembly, along_the_widest, assembly
+from .reading.assembly import Assembly, along_the_widest
 from .reading.eyes import Eye
+from .reading.missing import Missing
 from .reading.reader import Reader
 from .reading.skill import Skill
 from .reading.training import EACH, OverallTraining, ReaderTraining, Valued
-from .reading.tried import TriedReader, kinds_of, matched
+from .reading.tried import TriedReader, matched
 from .reading.valued import Label, ValuedRenders, joined
 from .schedule import ParameterSchedule
 from .sites import Site, find_sites
 
 TRIED = 200  # renders that a reader is tried on
+MISSED = 400  # renders in which it is seen what is not found
 OWN = 0.65  # of a round's renders are the guide's own
 AHEAD = 8  # steps for which they are drawn together
 ARRANGED = 0.5  # of the other renders are arranged
@@ -97,6 +98,7 @@ class ParameterLearning:
         self.phases, self.lengths = [what for what, _ in phases], [steps for _, steps in phases]
         self.total, self.done, self.phase = sum(self.lengths), 0, 0
         self.guide: ParameterGuide | None = None
+        self.missing: Missing | None = None  # while likelihood is gone up
         self.inner: Training | None = None
         self.ahead: tuple[tuple[int, int], list[Valued]] = (-1, -1), []
 
@@ -136,7 +138,7 @@ class ParameterLearning:
                     each(self, told)
 
             self.inner.run(heard)
-            self.inner = None
+            self.inner = self.missing = None
             if self.phases[self.phase] in (LIKELIHOOD, ENERGY) and self.best is not None and self.guide is not None:
                 self.best.after(self.guide)
             self.phase += 1
@@ -156,6 +158,8 @@ class ParameterLearning:
         if self.guide is not None:
             tensors |= {f"guide.{key}": value for key, value in self.guide.net.state_dict().items()}
             tensors |= {f"best.{key}": value for key, value in (self.best.weights if self.best else {}).items()}
+        if self.missing is not None:
+            tensors |= {f"missing.{key}": torch.as_tensor(part) for key, part in self.missing._asdict().items()}
         if self.inner is not None:
             tensors |= {f"inner.{key}": value for key, value in self.inner.state().items()}
         return {key: value.clone() for key, value in tensors.items()}  # the reader is also its training's
@@ -173,7 +177,9 @@ class ParameterLearning:
             self.guide.net.load_state_dict(_within(tensors, "guide."))
             if self.best is not None:
                 self.best.weights = _within(tensors, "best.")
-        inner = _within(tensors, "inner.")
+        missing, inner = _within(tensors, "missing."), _within(tensors, "inner.")
+        if missing:
+            self.missing = Missing(**missing)
         if inner:
             self.inner = self._begun()
             self.inner.restore(inner)
@@ -192,6 +198,9 @@ class ParameterLearning:
             return OverallTraining(self.tried.reader.overall, self._entered, EACH * steps, rate, seed)
         guide = self.guide
         assert guide is not None
+        if what == LIKELIHOOD and self.missing is None:
+            seed_everything(batch_seed(self.seed, 7, self.phase))
+            self.missing = self.tried.missing(self._own_scenes(MISSED))
         values, made = self._read()
         if what == ENERGY:
             scenes, rate = schedule.energy_scenes, schedule.energy_rate
@@ -199,7 +208,6 @@ class ParameterLearning:
                 guide.net, values, partial(self._own, made), self.tried.noisy, steps, scenes, rate, seed
             )
         rate = schedule.rate if first else 0.6 * schedule.rate
-        values = values._replace(weight=self.tried.inclusion(self._own_scenes(TRIED)).weight(values.kind, values.nodes))
         return MaximumLikelihood(guide.net, values, steps, learning_rate=rate, seed=seed)
 
     @property
@@ -249,12 +257,12 @@ class ParameterLearning:
         return ParameterGuide(self.model, self.learnt, self.structure) if self.learnt else None
 
     def _read(self) -> tuple[Values, Assembly]:
-        """What the reader reads in the target, and how objects of a scene go together there."""
+        """What the reader reads in the target, with what is missing there, and how objects of a scene go together."""
         made, images = self._assembly, self.images()
         seed_everything(batch_seed(self.seed, 3, self.phase))
         found = self.tried.reader.find(images)
         made = along_the_widest(made, found)
-        return self.tried.values(made, found, len(images))[0], made
+        return self.tried.values(made, found, len(images), missing=self.missing)[0], made
 
     @torch.no_grad()
     def apart(self, images: Tensor, target: Tensor) -> dict[str, float]:
@@ -283,11 +291,7 @@ class ParameterLearning:
     def _assembly(self) -> Assembly:
         """What the prior's scenes have in common; the same in every phase."""
         seed_everything(batch_seed(self.seed, 4))
-        valued = self.renders.draw(TRIED, self.model.pretraining_policy)
-        label = valued.drawn.label
-        centre = valued.drawn.centre.where((label >= 0).unsqueeze(-1), torch.nan)
-        graph = Graph.of(kinds_of(self.model, label), valued.parent)
-        return assembly(self.model.grammar, self.model.classes, graph, centre, valued.group)
+        return self.tried.assembly(self.renders.draw(TRIED, self.model.pretraining_policy))
 
 
 def _within(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -58,8 +58,8 @@ class Reader(nn.Module):
         super().__init__()
         self.eye, self.classes, self.sites, self.scene_sites = eye, classes, sites, scene_sites
         self.what = nn.Conv2d(WIDTH, 1 + classes, 1)
-        self.hidden = nn.Conv2d(WIDTH + 2, HIDDEN, 1)
-        self.values = nn.Conv2d(HIDDEN, 2 + sites * (2 + HARMONICS), 1)
+        self.hidden = nn.Linear(WIDTH + 2, HIDDEN)
+        self.values = nn.Linear(HIDDEN, 2 + sites * (2 + HARMONICS))
         self.overall = Overall(max(1, scene_sites), 2 + HARMONICS)
         with torch.no_grad():  # nearly every cell holds nothing
             self.what.weight.mul_(0.3)
@@ -67,16 +67,19 @@ class Reader(nn.Module):
             bias.zero_()
             bias[0] = 3.0
 
-    def forward(self, entered: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of what has entered the eye: logits ``(N, 1 + C, h, w)``; how many cells away an object's parent is ``(N, 2,
-        h, w)``; what is said of u of nodes ``(N, S, 2 + HARMONICS, h, w)``."""
+    def forward(self, entered: Tensor) -> tuple[Tensor, Tensor]:
+        """Of what has entered the eye: what it sees ``(N, WIDTH, h, w)``, and logits ``(N, 1 + C, h, w)``."""
         seen = self.eye(entered)
+        return seen, self.what(seen)
+
+    def at(self, seen: Tensor, image: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+        """Of cells ``(...)``, as few hold an object: how many cells away its parent is ``(..., 2)``; what is said of u
+        ``(..., S, 2 + HARMONICS)``."""
         h, w = seen.shape[-2:]
-        y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
-        place = torch.stack([x, y]).expand(len(seen), 2, h, w)
-        hidden = F.relu(self.hidden(torch.cat([seen, place], 1)))
-        parent, values = self.values(hidden).tensor_split([2], 1)
-        return self.what(seen), parent, values.reshape(len(seen), self.sites, 2 + HARMONICS, h, w)
+        place = torch.stack([2 * column / max(1, w - 1) - 1, 2 * row / max(1, h - 1) - 1], -1)
+        hidden = F.relu(self.hidden(torch.cat([seen[image, :, row, column], place], -1)))
+        parent, values = self.values(hidden).tensor_split([2], -1)
+        return parent, values.unflatten(-1, (self.sites, 2 + HARMONICS))
 
     @torch.no_grad()
     def find(self, images: Tensor) -> Found:
@@ -86,7 +89,7 @@ class Reader(nn.Module):
 
     def _find(self, images: Tensor, first: int) -> Found:
         entered = self.eye.enter(images)
-        logits, parent, values = self(entered)
+        seen, logits = self(entered)
         mass = logits.softmax(1)[:, 1:]
         n, y, x = blocks(mass.sum(1))
         rows, columns = torch.stack([y, y, y + 1, y + 1], 1), torch.stack([x, x + 1, x, x + 1], 1)  # (K, 4)
@@ -94,14 +97,15 @@ class Reader(nn.Module):
         label = mass[image, :, rows, columns].sum(1).argmax(1)
         share = mass[image, label[:, None], rows, columns]
         share = (share / share.sum(1, keepdim=True).clamp(min=1e-6)).unsqueeze(-1)  # of what each of the cells says
+        parent, values = self.at(seen, image, rows, columns)
         here = torch.stack([columns, rows], -1) + 0.5
         scale = self.eye.cell
         return Found(
             n + first,
             label,
             scale * (share * here).sum(1),
-            scale * (share * (here + parent[image, :, rows, columns])).sum(1),
-            (share.unsqueeze(-1) * values[image, :, :, rows, columns]).sum(1),
+            scale * (share * (here + parent)).sum(1),
+            (share.unsqueeze(-1) * values).sum(1),
             self.overall(entered)[:, : self.scene_sites],
         )
 

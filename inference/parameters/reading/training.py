@@ -139,17 +139,18 @@ class OverallTraining(StepTraining):
 def reader_loss(reader: Reader, valued: Valued) -> Tensor:
     """Cross-entropy of the cells, the error of where parents are, and of u, summed over an image's objects."""
     drawn, scale = valued.drawn, reader.eye.cell
-    logits, parent, said = reader(reader.eye.enter(drawn.image))
+    seen, logits = reader(reader.eye.enter(drawn.image))
     h, w = logits.shape[-2:]
     label = drawn.label.masked_fill(drawn.visible < MIN_VISIBLE, -1)
     target = cells(drawn.centre / scale * CELL, label, reader.classes, h, w)
     entropy = -(target * F.log_softmax(logits, 1)).sum((1, 2, 3)).mean()
     parts = zip(*shares(drawn.centre / scale * CELL, label, h, w), strict=True)
     n, m, i, j, share = (torch.cat(part) for part in parts)
+    parent, said = reader.at(seen, n, i, j)
     u = valued.u[n, m]
-    of_values = value_loss(said[n, :, :, i, j], u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
+    of_values = value_loss(said, u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
     has = (valued.parent[n, m] >= 0).float()
     at = drawn.centre[n, valued.parent[n, m].clamp(min=0)] / scale
-    away = (torch.stack([j, i], -1) + 0.5 + parent[n, :, i, j] - at).abs().clamp(max=20.0).sum(-1)
+    away = (torch.stack([j, i], -1) + 0.5 + parent - at).abs().clamp(max=20.0).sum(-1)
     of_nodes = (share * (of_values.sum(1) + has * away)).sum()
     return entropy + of_nodes / len(logits)

@@ -8,12 +8,13 @@ from torch import Tensor
 
 from probscene.model import SceneModel
 
+from ..graph import Graph
 from ..likelihood import Values
 from ..sites import Site, having
-from .assembly import Assembly
-from .inclusion import Inclusion
+from .assembly import Assembly, assembly
+from .missing import Missing
 from .reader import Found, Reader
-from .skill import Skill
+from .skill import LEAST_SD, Skill
 from .training import MIN_VISIBLE, Valued
 
 ENOUGH = 20  # readings of a site in the target, from which it is learnt
@@ -97,30 +98,41 @@ class TriedReader:
         columns = zip(sites, [*each, *scenes.read(found.overall)[0].unbind(1)], strict=True)
         return {site.name: u.clamp(0, 1) for site, u in columns if site in self.good_sites}
 
-    def values(self, made: Assembly, found: Found, number: int, of: Tensor | None = None) -> tuple[Values, Tensor]:
-        """Scene graphs of what was found in so many images, with the learnt sites; and what ``of (K,)`` says of each
-        object, ``(L, M)`` int64, -1 where there is none."""
+    def values(
+        self, made: Assembly, found: Found, number: int, of: Tensor | None = None, missing: Missing | None = None
+    ) -> tuple[Values, Tensor]:
+        """Scene graphs of what was found in so many images, with the learnt sites, and of what is missing there; and
+        what ``of (K,)`` says of each object, ``(L, M)`` int64, -1 where there is none."""
         skills, (node, scene) = self._skills(), self.columns
         mean, sd = (part[:, node] for part in skills[0].read(found.raw))
         scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
-        of = torch.full((len(mean),), -1) if of is None else of
-        both = torch.cat([mean, of[:, None].to(mean.dtype)], 1)
+        of, weight = torch.full((len(mean),), -1) if of is None else of, torch.ones(len(mean))
+        if missing is not None:
+            found, u, weight = missing.beside(found, number)
+            mean, sd = torch.cat([mean, u]), torch.cat([sd, torch.full_like(u, LEAST_SD)])
+            of = torch.cat([of, of.new_full((len(u),), -1)])
+        both = torch.cat([mean, of[:, None].to(mean.dtype), weight[:, None]], 1)
         kind, parent, both, sd = made.values(found, number, both, sd)
         has = having(self.model.grammar, tuple(self.node_sites[i] for i in node.tolist()), kind)
         turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
-        mean, sd = (part.where(has, torch.nan) for part in (both[..., :-1], sd))
-        return Values(kind, parent, mean, sd, scene_mean, scene_sd, turns), both[..., -1].nan_to_num(-1).long()
+        mean, sd = (part.where(has, torch.nan) for part in (both[..., :-2], sd))
+        values = Values(kind, parent, mean, sd, scene_mean, scene_sd, turns, both[..., -1].nan_to_num(0.0))
+        return values, both[..., -2].nan_to_num(-1).long()
 
-    def inclusion(self, valued: Valued) -> Inclusion:
-        """How likely objects are found by their learnt values, from some renders."""
+    def assembly(self, valued: Valued) -> Assembly:
+        """What some scenes of the prior have in common."""
+        label, kind = valued.drawn.label, kinds_of(self.model, valued.drawn.label)
+        centre = valued.drawn.centre.where((label >= 0).unsqueeze(-1), torch.nan)
+        graph = Graph.of(kind, valued.parent)
+        return assembly(self.model.grammar, self.model.classes, graph, centre, valued.group)
+
+    def missing(self, valued: Valued) -> Missing:
+        """Objects that it does not find in some renders."""
         found = self.reader.find(valued.drawn.image)
-        which, kind = matched(found, valued), valued.kind
+        which, there = matched(found, valued), torch.zeros_like(valued.kind, dtype=torch.bool)
         is_it = (which >= 0) & (found.label == valued.drawn.label[found.image, which])
-        there = torch.zeros_like(kind, dtype=torch.bool)
         there[found.image[is_it], which[is_it]] = True
-        node, skills = self.columns[0], self._skills()[0]
-        some = kind >= 0
-        return Inclusion(kind[some], valued.u[..., node][some], there[some], skills.turns[node])
+        return Missing.of(valued, kinds_of(self.model, torch.arange(len(self.model.classes))), there, self.columns[0])
 
     def _skills(self) -> tuple[Skill, Skill]:
         """Of the sites of nodes, and of scenes."""

@@ -11,8 +11,9 @@ from probscene.inference.parameters.graph import Graph
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, log_density, posterior_draws
 from probscene.inference.parameters.net import ParameterNet
-from probscene.inference.parameters.reading import reader
+from probscene.inference.parameters.reading import missing, reader
 from probscene.inference.parameters.reading.eyes import RenderEye
+from probscene.inference.parameters.reading.skill import Skill
 from probscene.inference.parameters.schedule import ParameterSchedule
 from probscene.renderers.sprites import SpriteRenderer
 
@@ -115,6 +116,40 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     site = next(site for site in learning.sites if site.name == "ball.away")
     assert [site.name for site in learning.learnt] == ["scene.bright", "floor.turn"]
     assert learning.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
+
+
+def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
+    """In the middle of likelihood, which looks at objects that the guide of before was missing."""
+    monkeypatch.setattr(reader, "LEAST_MASS", 0.1)  # an untrained reader finds something
+    monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
+    monkeypatch.setattr(missing, "FEWEST", 1)
+    monkeypatch.setattr(missing, "TOLD", 0.0)
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    few = {"scene_renders": 4, "round_scene_renders": 4, "energy_steps": 0}
+    schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=1, round_reader_steps=1, round_steps=30, **few)
+    images = torch.randint(256, (30, 3, 64, 64), dtype=torch.uint8)
+
+    def begun():
+        torch.manual_seed(0)
+        counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
+        return ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule)
+
+    class Interrupted(Exception):
+        pass
+
+    def interrupt(training, _):
+        if training.done >= training.total - 20:
+            assert len(training.missing.label)
+            raise Interrupted
+
+    whole, first, second = begun(), begun(), begun()
+    whole.run()
+    with pytest.raises(Interrupted):
+        first.run(interrupt)
+    second.restore(first.state())
+    second.run()
+    for one, other in zip(whole.guide.net.parameters(), second.guide.net.parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 def _labels(render, classes, scenes):
