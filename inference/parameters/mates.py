@@ -48,12 +48,19 @@ class Mates(nn.Module):
             together: ``(N, M, M)`` bool, who is whose sibling, itself included.
             own: ``(N, M, S)`` u, NaN where they are not known.
         """
-        at_once = max(1, PAIRS // max(1, own.shape[1] ** 2 * max(1, own.shape[2])))
-        parts = [self._ties(*some) for some in zip(together.split(at_once), own.split(at_once), strict=True)]
-        return parts[0] if len(parts) == 1 else Ties(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        ways, (N, M, S) = 2 * max(1, own.shape[2]), own.shape
+        place, last = own.new_zeros(N, M, ways, 4), torch.full((N, M, ways), -1)
+        sites = (~own.isnan()).any(1).any(0).nonzero().flatten()  # of the others nothing is known
+        at_once = max(1, PAIRS // max(1, M**2 * max(1, len(sites))))
+        parts = zip(together.split(at_once), own[..., sites].split(at_once), strict=True)
+        columns = torch.cat([sites, sites + S])
+        if len(sites):
+            found = [self._ties(*some) for some in parts]
+            place[:, :, columns], last[:, :, columns] = (torch.cat(part) for part in zip(*found, strict=True))
+        return Ties(place.flatten(2), last)
 
-    def _ties(self, together: Tensor, own: Tensor) -> Ties:
-        u = own if own.shape[2] else own.new_full((*own.shape[:2], 1), torch.nan)
+    def _ties(self, together: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the ways of some sites, ``(N, M, W, 4)`` and ``(N, M, W)``."""
         known = ~u.isnan()
         one, other = u.unsqueeze(2), u.unsqueeze(1)
         alike = torch.cat([(one > 0.5) == (other > 0.5), (one - other).abs() < CLOSE], -1)
@@ -64,7 +71,7 @@ class Mates(nn.Module):
         part = (earlier.sum(2) + 0.5) / number
         place = torch.stack([2 * part - 1, part.logit() / LOGITS, 1 / number, known.to(part.dtype)], -1)
         last = torch.arange(M).view(1, 1, M, 1).where(earlier, -1).amax(2)
-        return Ties((place * known.unsqueeze(-1)).flatten(2).to(own.dtype), last)
+        return (place * known.unsqueeze(-1)).to(u.dtype), last
 
     def forward(self, place: Tensor, last: Tensor, u: Tensor) -> Tensor:
         """``(N, M', H)`` of some of the nodes.

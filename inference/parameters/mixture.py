@@ -4,6 +4,7 @@ A logistic distribution of location 0 and scale 1 is the logit of a uniform numb
 distribution, exactly. Axis letters: K components; all else is batch.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -45,23 +46,28 @@ class LogisticMixture(NamedTuple):
 
     def cdf(self, logit: Tensor) -> Tensor:
         """``(...)`` probability of less than the sigmoid of ``logit (...)``."""
-        z = (logit.unsqueeze(-1) - self.location) * (-self.log_scale).exp()
-        return (self.weight.softmax(-1) * z.sigmoid()).sum(-1)
+        return self._below()(logit)
+
+    def _below(self) -> Callable[[Tensor], Tensor]:
+        """``cdf``, with what does not go by the value computed once."""
+        weight, rate = self.weight.softmax(-1), (-self.log_scale).exp()
+        return lambda logit: (weight * ((logit.unsqueeze(-1) - self.location) * rate).sigmoid()).sum(-1)
 
     def icdf(self, v: Tensor) -> Tensor:
         """``(...)`` the u below which a probability of ``v (...)`` lies; its gradient by the parameters is that of the
         implicit function."""
         with torch.no_grad():
+            cdf = self._below()
             low = torch.full_like(v, -FARTHEST)
             high = torch.full_like(v, FARTHEST)
             for _ in range(HALVINGS):
                 middle = (low + high) / 2
-                below = self.cdf(middle) < v
+                below = cdf(middle) < v
                 low, high = torch.where(below, middle, low), torch.where(below, high, middle)
             logit, slack = (low + high) / 2, high - low  # the root may be an end of the interval
             for _ in range(STEPS):
                 slope = (self.log_prob(logit.sigmoid()) + F.logsigmoid(logit) + F.logsigmoid(-logit)).exp()
-                newton = logit - (self.cdf(logit) - v) / slope
+                newton = logit - (cdf(logit) - v) / slope
                 logit = torch.where((newton > low - slack) & (newton < high + slack), newton, logit)
             u = logit.sigmoid().clamp(NEAR, 1 - NEAR)
         return self.through(u)

@@ -1,21 +1,22 @@
 """The network of a parameter guide: what each site's mixture depends on.
 
-Sites come in the order of the program. Within a site, nodes come in the order of their derivation, parents before
-children. A node's mixture depends on the scene's sites and the number of nodes of each kind, its kind, its place among
-its siblings, its own earlier sites and the mean of its siblings', its parent and its sibling before with all that is
-known of them, the siblings that are like it (``mates``), and, through a GRU, on all nodes before it. Axis letters: N
-scenes, M nodes, S sites of nodes, G sites of scenes, H units.
+Sites come in the order of the program. Within a site, the nodes that have it come in the order of their derivation,
+parents before children. A node's mixture depends on the scene's sites and the number of nodes of each kind, its kind,
+its place among its siblings, its own earlier sites and the mean of its siblings', its parent and its sibling before
+with all that is known of them, the siblings that have the site and are like it (``mates``), and, through a GRU, on the
+nodes before it that have the site. Axis letters: N scenes, M nodes, R nodes that have a site, S sites of nodes, G sites
+of scenes, H units.
 """
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .graph import Graph
-from .mates import LOGITS, Mates
+from .mates import LOGITS, Mates, Ties
 from .mixture import LogisticMixture
 
 COMPONENTS = 6
@@ -78,21 +79,20 @@ class ParameterNet(nn.Module):
         return LogisticMixture.of(self.scene_out[g](self.scene_join[g](F.silu(self._scene(graph, known)))).unsqueeze(1))
 
     def node_mixture(self, graph: Graph, scene: Tensor, values: Tensor, s: int) -> LogisticMixture:
-        """Of the nodes' site number ``s``, ``(N, M)``, given all before it.
+        """Of the nodes' site number ``s``, ``(N, M)``, given all before it; the uniform one where a node's is NaN.
 
         Args:
             scene: ``(N, G)`` u, NaN where they are not known.
             values: ``(N, M, S)`` u, NaN where there are none; those of later sites are not looked at.
         """
-        known = values.where(torch.arange(self.node_sites) <= s, torch.nan)
-        states, _ = self.cell(self._entering(graph, known, s))
-        memory = F.pad(states, (0, 0, 1, 0))[:, :-1]
-        own = known.where(torch.arange(self.node_sites) < s, torch.nan)
-        around = [own, gathered(known, graph.parent), gathered(known, graph.before)]
-        ties = self.mates.ties(graph.together, own)
-        place = self._place(graph, scene, s) + self._siblings(graph, own)
-        place = place + self.mates(ties.place, ties.last, known[..., s])
-        return self._mixture(place, torch.cat([code(x) for x in around], -1), memory, s)
+        some = Chosen.of(~values[..., s].isnan())
+        given = self._given(graph, scene, values, s, some)
+        u = some.taken(values[..., s : s + 1]).where(some.there.unsqueeze(-1), torch.nan)
+        place = given.place + self.mates(given.ties.place, given.ties.last, u[..., 0])
+        for number, index in enumerate((given.parent, given.before)):
+            place = place + self._of_one(self.of_values, number + 1, gathered(u, index), s)
+        states, _ = self.cell(F.silu(given.entering + self._of_one(self.read, 0, u, s)))
+        return LogisticMixture.of(some.put(self._raw(place, F.pad(states, (0, 0, 1, 0))[:, :-1], s)))
 
     def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
         """u of the nodes' site number ``s``, ``(N, M)``, at the quantiles ``v (N, M)``, one node after the other.
@@ -101,27 +101,22 @@ class ParameterNet(nn.Module):
             scene, values: as of ``node_mixture``, without site ``s``.
             has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
         """
-        N, M = v.shape
-        earlier = torch.arange(self.node_sites) < s
-        rows, columns = torch.arange(N), list(values.where(earlier, torch.nan).unbind(1))
-        own = torch.stack(columns, 1)
-        place, ties = self._place(graph, scene, s) + self._siblings(graph, own), self.mates.ties(graph.together, own)
-        memory, found = v.new_zeros(N, self.cell.hidden_size), []
+        some = Chosen.of(has)
+        given = self._given(graph, scene, values, s, some)
+        u = v.new_full((*some.index.shape, 1), torch.nan)  # parents and siblings before come earlier
+        at, memory = v.gather(1, some.index), v.new_zeros(len(v), self.cell.hidden_size)
         w: Any = self.cell  # torch names its weights as it makes them
-        for m in range(M):
-            around = [columns[m]]
-            table = torch.stack(columns[: m + 1], 1)  # parents and siblings before come earlier
-            for index in (graph.parent[:, m], graph.before[:, m]):
-                around.append(table[rows, index.clamp(0, m)].where((index >= 0)[:, None], torch.nan))
-            known = torch.cat([code(x) for x in around], -1)
-            here = place[:, m] + self.mates(ties.place[:, m : m + 1], ties.last[:, m : m + 1], table[..., s])[:, 0]
-            u = self._mixture(here, known, memory, s).icdf(v[:, m]).where(has[:, m], v[:, m])
-            found.append(u)
-            at_s = torch.arange(self.node_sites) == s
-            columns[m] = torch.where(at_s, u.where(has[:, m], torch.nan)[:, None], columns[m])
-            x = self._entering_one(graph.kind[:, m], columns[m], s)
+        for r in range(some.index.shape[1]):
+            here = slice(r, r + 1)
+            place = given.place[:, here] + self.mates(given.ties.place[:, here], given.ties.last[:, here], u[..., 0])
+            for number, index in enumerate((given.parent, given.before)):
+                place = place + self._of_one(self.of_values, number + 1, gathered(u, index[:, here]), s)
+            found = LogisticMixture.of(self._raw(place[:, 0], memory, s)).icdf(at[:, r])
+            found = found.where(some.there[:, r], torch.nan)[:, None, None]
+            u = torch.cat([u[:, :r], found, u[:, r + 1 :]], 1)
+            x = F.silu(given.entering[:, r] + self._of_one(self.read, 0, found, s)[:, 0])
             memory = torch.gru_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
-        return torch.stack(found, 1)
+        return some.put(u)[..., 0].where(has, v)
 
     def moving(self, graph: Graph, scene: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """``scene (N, G)`` and ``values (N, M, S)`` of a sample, each with the gradient that it has as a quantile of
@@ -143,16 +138,34 @@ class ParameterNet(nn.Module):
             torch.stack(nodes, 2).where(~values.isnan(), torch.nan) if nodes else values,
         )
 
-    def _mixture(self, place: Tensor, known: Tensor, memory: Tensor, s: int) -> LogisticMixture:
-        x = torch.cat([place + self.of_values(known), memory], -1)
-        return LogisticMixture.of(self.out[s](self.join(F.silu(x))))
+    def _given(self, graph: Graph, scene: Tensor, values: Tensor, s: int, some: "Chosen") -> "Given":
+        """What some nodes' mixtures depend on, without the values of site ``s`` itself."""
+        known = values.where(torch.arange(self.node_sites) < s, torch.nan)
+        own, kind = some.taken(known), graph.kind.gather(1, some.index)
+        nodes = (graph.parent.gather(1, some.index), graph.before.gather(1, some.index))
+        around = torch.cat([code(part) for part in (own, *(gathered(known, node) for node in nodes))], -1)
+        share = some.taken(graph.together) / graph.number.gather(1, some.index).clamp(min=1).unsqueeze(-1)
+        place = self.of_values(around) + self.of_siblings(share.to(own.dtype) @ code(known))
+        start = self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s]
+        together = some.taken(graph.together).gather(2, some.index.unsqueeze(1).expand(-1, some.index.shape[1], -1))
+        together = together & (some.there.unsqueeze(1) & some.there.unsqueeze(2))
+        return Given(
+            some.taken(self._place(graph, scene, s)) + place,
+            self.read(torch.cat([start, code(own)], -1)),
+            some.number(nodes[0]),
+            some.number(nodes[1]),
+            self.mates.ties(together, own),
+        )
 
-    def _entering(self, graph: Graph, known: Tensor, s: int) -> Tensor:
-        return self._entering_one(graph.kind, known, s)
+    def _of_one(self, layer: nn.Linear, part: int, u: Tensor, s: int) -> Tensor:
+        """What a layer adds for the values ``u (N, R, 1)`` of site ``s`` in one part of its ``code``."""
+        S = max(1, self.node_sites)
+        first = layer.in_features - 9 * S if layer is self.of_values else layer.in_features - 3 * S
+        columns = [first + 3 * S * part + s + S * i for i in range(3)]
+        return F.linear(code(u), layer.weight[:, columns])
 
-    def _entering_one(self, kind: Tensor, known: Tensor, s: int) -> Tensor:
-        x = torch.cat([self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s], code(known)], -1)
-        return F.silu(self.read(x))
+    def _raw(self, place: Tensor, memory: Tensor, s: int) -> Tensor:
+        return self.out[s](self.join(F.silu(torch.cat([place, memory], -1))))
 
     def _place(self, graph: Graph, scene: Tensor, s: int) -> Tensor:
         """``(N, M, H)``, what does not change from node to node."""
@@ -171,14 +184,61 @@ class ParameterNet(nn.Module):
             + self._scene(graph, scene).unsqueeze(1)
         )
 
-    def _siblings(self, graph: Graph, own: Tensor) -> Tensor:
-        """``(N, M, H)``, the mean of what is known of a node's siblings and itself, of all sites before."""
-        share = graph.together.to(own.dtype) / graph.number.clamp(min=1).unsqueeze(-1)
-        return self.of_siblings(share @ code(own))
-
     def _scene(self, graph: Graph, scene: Tensor) -> Tensor:
         counts = F.one_hot(graph.kind.remainder(self.kinds + 1), self.kinds + 1).sum(1)[:, : self.kinds]
         return self.of_scene(torch.cat([counts.to(scene.dtype).log1p(), code(scene)], -1))
+
+
+class Chosen(NamedTuple):
+    """Some of a scene's nodes, in their order: R at most, those of a scene first.
+
+    Attributes:
+        index: ``(N, R)`` int64 which nodes.
+        there: ``(N, R)`` bool, False where a scene has fewer.
+        has: ``(N, M)`` bool, which are chosen.
+    """
+
+    index: Tensor
+    there: Tensor
+    has: Tensor
+
+    @staticmethod
+    def of(has: Tensor) -> "Chosen":
+        """Those that have something, ``(N, M)`` bool; at least one is looked at in each scene."""
+        R = max(1, int(has.sum(1).max()) if len(has) else 1)
+        index = (~has).long().argsort(dim=1, stable=True)[:, :R]
+        return Chosen(index, has.gather(1, index), has)
+
+    def taken(self, part: Tensor) -> Tensor:
+        """``(N, R, ...)`` of ``(N, M, ...)``."""
+        return part.gather(1, self.index.unsqueeze(-1).expand(-1, -1, part.shape[2]))
+
+    def number(self, node: Tensor) -> Tensor:
+        """``(N, R)`` where among those chosen each of the nodes ``(N, R)`` is; -1 where it is none of them."""
+        place = (self.has.cumsum(1) - 1).where(self.has, -1).gather(1, node.clamp(min=0))
+        return place.where((node >= 0) & self.there, -1)
+
+    def put(self, part: Tensor) -> Tensor:
+        """``(N, M, D)`` of ``(N, R, D)``; 0 for the others."""
+        place = (self.has.cumsum(1) - 1).clamp(min=0).unsqueeze(-1).expand(-1, -1, part.shape[2])
+        return part.gather(1, place).where(self.has.unsqueeze(-1), 0.0)
+
+
+class Given(NamedTuple):
+    """Of the nodes that have a site.
+
+    Attributes:
+        place: ``(N, R, H)`` of the mixture.
+        entering: ``(N, R, H)`` of the GRU.
+        parent, before: ``(N, R)`` int64 which of them; -1 for none.
+        ties: see ``Mates``.
+    """
+
+    place: Tensor
+    entering: Tensor
+    parent: Tensor
+    before: Tensor
+    ties: Ties
 
 
 def code(u: Tensor) -> Tensor:

@@ -73,7 +73,7 @@ def test_the_gradient_is_that_of_finite_differences(seed):
 
     with torch.no_grad():
         _, at = quantiles_of(net, graph, scene, nodes)
-    away = 1e-5
+    away = 1e-6  # a distance of two rows has a kink where they meet
     expected = float(found(away) - found(-away)) / (2 * away)
     read = values_of(nodes, scene)
     own = OwnReadings(read.kind, read.parent, nodes, scene, read, torch.arange(3).expand(30, 3))
