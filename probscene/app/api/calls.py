@@ -55,6 +55,7 @@ def generate(
     progress: bool = True,
     policy: Policy | None = None,
     min_visible: float = 0.0,
+    shard: str | None = None,
 ) -> Dataset:
     """Write a labelled dataset; the same call goes on after an interruption.
 
@@ -67,6 +68,7 @@ def generate(
             script calls this under ``if __name__ == "__main__":``.
         policy: other structures for a model.
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
+        shard: ``"I/N"``, I from 0: one of N calls that make the dataset together, see ``generate_run``.
 
     Raises:
         ProbsceneError: see ``generate_run``.
@@ -78,9 +80,9 @@ def generate(
         if isinstance(source, SceneModel):
             if workers != 1:
                 raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
-            return generate_scenes(source, policy or source.prior, num, out, seed, format, said, min_visible)
+            return generate_scenes(source, policy or source.prior, num, out, seed, format, said, min_visible, shard)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
-        return generate_run(run, num, out, seed, workers, format, said, min_visible)
+        return generate_run(run, num, out, seed, workers, format, said, min_visible, shard)
 
 
 def evaluate(

@@ -76,9 +76,10 @@ class Run(RunFolder):
         workers: int = 1,
         progress: bool = True,
         min_visible: float = 0.0,
+        shard: str | None = None,
     ) -> Dataset:
         """Write a labelled dataset of the learnt structures, see ``generate``."""
-        return calls.generate(self, num, out, format, seed, workers, progress, min_visible=min_visible)
+        return calls.generate(self, num, out, format, seed, workers, progress, min_visible=min_visible, shard=shard)
 
     def evaluate(
         self, target: Target | None = None, labels: Path | str | Labels | None = None, **options: Any

@@ -26,6 +26,10 @@ def generate(
     min_visible: Annotated[
         float, typer.Option(metavar="FRACTION", help="No label for objects of which less is visible, 0 to 1.")
     ] = 0.0,
+    shard: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="One of N commands, I from 0, that make it together; none finishes it."),
+    ] = None,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
     from ..datasets.generate import generate
@@ -34,8 +38,10 @@ def generate(
 
     with Display() as show:
         said = show.stage("generating")
-        dataset = generate(RunFolder.at(run), num, out, seed, workers, format or "coco", said, min_visible)
-    print(f"{num} images in {dataset.path}, {dataset.made} of them made now")
+        dataset = generate(RunFolder.at(run), num, out, seed, workers, format or "coco", said, min_visible, shard)
+    print(f"{dataset.num} images in {dataset.path}, {dataset.made} of them made now")
+    if not dataset.finished:
+        print("When all shards are done, the same command without --shard writes the files of labels.")
 
 
 @app.command()

@@ -6,19 +6,23 @@
     .parts/images           the images where they stay in shards alone
     provenance.jsonl        and the other files of labels: written, whole, when every chunk is there; then .parts goes
 
-``provenance.jsonl`` comes last: it says that the dataset is finished, and each of its lines names the settings.
+``provenance.jsonl`` comes last: it says that the dataset is finished, and each of its lines names the settings. Several
+processes, of several hosts, may write chunks of their own to one folder at once.
 """
 
 import json
 import os
 import shutil
+import socket
+import uuid
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from probscene.errors import DataError
+from probscene.errors import DataError, MachineError, ProbsceneError
 
 from ..chunks import CHUNK
 from ..files import machine_error, make_folder, write_json, write_text, write_whole
@@ -28,6 +32,28 @@ from .provenance import image_name
 LINES = "provenance.jsonl"
 UNSAID = {"min_visible": 0.0}
 """Settings that are recorded only where they have another value than this."""
+
+
+class Shard(NamedTuple):
+    """One of ``shards`` processes that make a dataset together, each every ``shards``-th chunk; numbers begin at 0."""
+
+    number: int
+    shards: int
+
+    @staticmethod
+    def of(text: str) -> "Shard":
+        """Of ``"I/N"``.
+
+        Raises:
+            ProbsceneError: another text, or I is not in 0..N-1.
+        """
+        number, _, shards = text.partition("/")
+        if not (number.isdecimal() and shards.isdecimal() and int(number) < int(shards)):
+            raise ProbsceneError(f"Expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8, actual {text!r}.")
+        return Shard(int(number), int(shards))
+
+
+WHOLE = Shard(0, 1)
 
 
 class DatasetFolder:
@@ -46,8 +72,8 @@ class DatasetFolder:
         self._kept = formats != ("webdataset",)
         self._origin, self._parts = origin, self.out / ".parts"
 
-    def missing(self) -> list[int]:
-        """Make the folder ready; the chunks that it lacks, none where the dataset is finished.
+    def missing(self, shard: Shard = WHOLE) -> list[int]:
+        """Make the folder ready; the chunks of a shard that it lacks, none where the dataset is finished.
 
         Raises:
             DataError: other files, or a dataset of other settings.
@@ -58,18 +84,23 @@ class DatasetFolder:
             self._compare(self._finished_settings())
             return []
         record = self._parts / "settings.json"
-        if record.exists():
+        others = sorted(entry.name for entry in self.out.iterdir() if not entry.name.startswith("."))
+        if others and not record.exists():  # in this order: what else is there may be what another process has begun
+            raise DataError(
+                f"Expected a new or empty folder for the dataset, actual {self.out} with {', '.join(others[:5])} in "
+                "it; name another folder."
+            )
+        make_folder(self._parts)
+        self._begin(record)
+        try:
             self._compare(json.loads(record.read_text(encoding="utf-8")))
-        else:
-            others = sorted(entry.name for entry in self.out.iterdir() if not entry.name.startswith("."))
-            if others:
-                raise DataError(
-                    f"Expected a new or empty folder for the dataset, actual {self.out} with {', '.join(others[:5])} "
-                    "in it; name another folder."
-                )
-            make_folder(self._parts)
-            write_json(record, self.settings)
-        return [chunk for chunk in self._chunks() if not self._done(chunk)]
+        except FileNotFoundError:  # another process has finished the dataset
+            return self.missing(shard)
+        return [chunk for chunk in self.of(shard) if not self._done(chunk)]
+
+    def of(self, shard: Shard) -> range:
+        """The chunks of a shard."""
+        return range(shard.number, len(self._chunks()), shard.shards)
 
     @property
     def finished(self) -> bool:
@@ -94,14 +125,13 @@ class DatasetFolder:
         Raises:
             MachineError: the disk is full.
         """
-        for folder in {(self.out / name).parent for name in (*files, *links)}:
-            make_folder(folder)
-        for name, data in files.items():
-            self._put(name, lambda temporary, data=data: temporary.write_bytes(data))
-        for name, other in links.items():
-            self._put(name, partial(_link, self.out / other))
-        sizes = {name: len(files[links.get(name, name)]) for name in (*files, *links)}
-        write_text(self._part(chunk), json.dumps({"bytes": sizes, **record}))
+        try:
+            self._write(chunk, files, links, record)
+        except MachineError:
+            if not self.finished:
+                raise
+        if self.finished:  # by another process, which has made this chunk, too
+            shutil.rmtree(self._parts, ignore_errors=True)
 
     def records(self, chunks: range | None = None) -> Iterator[dict[str, Any]]:
         """The chunks' records in order, one at a time; of all chunks where not said otherwise."""
@@ -132,24 +162,53 @@ class DatasetFolder:
     def _part(self, chunk: int) -> Path:
         return self._parts / f"{chunk:06d}.json"
 
+    def _write(self, chunk: int, files: dict[str, bytes], links: dict[str, str], record: dict[str, Any]) -> None:
+        for folder in {(self.out / name).parent for name in (*files, *links)}:
+            make_folder(folder)
+        for name, data in files.items():
+            self._put(name, lambda temporary, data=data: temporary.write_bytes(data))
+        for name, other in links.items():
+            self._put(name, partial(_link, self.out / other))
+        sums = {name: zlib.crc32(files[links.get(name, name)]) for name in (*files, *links)}
+        write_text(self._part(chunk), json.dumps({"crc32": sums, **record}))
+
     def _done(self, chunk: int) -> bool:
-        """Whether a chunk's record is there and its files are as long as it says."""
+        """Whether a chunk's record is there and its files hold what it says."""
         try:
-            sizes = json.loads(self._part(chunk).read_text(encoding="utf-8"))["bytes"]
-            return all((self.out / name).stat().st_size == size for name, size in sizes.items())
+            sums = json.loads(self._part(chunk).read_text(encoding="utf-8"))["crc32"]
+            return all(zlib.crc32((self.out / name).read_bytes()) == found for name, found in sums.items())
         except (OSError, ValueError, KeyError, AttributeError):
             return False
+
+    def _begin(self, record: Path) -> None:
+        """Write the settings, unless another process has done so."""
+        if record.exists():
+            return
+        temporary = self._aside(record.name)
+        write_json(temporary, self.settings)
+        try:
+            os.link(temporary, record)
+        except FileExistsError:
+            pass
+        except (OSError, AttributeError):  # the file system has no second names: the last process's stay
+            _move(temporary, record)
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def _put(self, name: str, write: Callable[[Path], Any]) -> None:
         """A file of an image by ``write(temporary path)``."""
         path = self.out / name
-        temporary = self._parts / f"{path.name}.{os.getpid()}"
+        temporary = self._aside(path.name)
         try:
-            temporary.unlink(missing_ok=True)  # an interrupted call's may be a link to a file that must not change
             write(temporary)
+            os.replace(temporary, path)
         except OSError as error:
+            temporary.unlink(missing_ok=True)
             raise machine_error(error, path) from error
-        _move(temporary, path)
+
+    def _aside(self, name: str) -> Path:
+        """A path that no other process takes, of any host."""
+        return self._parts / f"{name}.{socket.gethostname()}.{uuid.uuid4().hex}"
 
     def _finished_settings(self) -> dict[str, Any]:
         try:

@@ -29,7 +29,7 @@ from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder
 from ..loading import renderer_for
 from . import coco, kitti, shards, yolo
-from .folder import LINES, UNSAID, DatasetFolder
+from .folder import LINES, UNSAID, WHOLE, DatasetFolder, Shard
 from .formats import chosen
 from .provenance import provenance
 from .workers import spread
@@ -39,10 +39,19 @@ Done = Callable[[int, int], None]
 
 
 class Dataset(NamedTuple):
-    """A finished dataset: its folder, and how many images this call made; 0 where it was finished before."""
+    """A dataset, or a shard of it.
+
+    Attributes:
+        path: the folder.
+        made: how many images this call made; 0 where they were there before.
+        num: how many images there are, of the shard or of all.
+        finished: whether the files of labels are written.
+    """
 
     path: Path
     made: int
+    num: int
+    finished: bool
 
 
 def generate(
@@ -54,6 +63,7 @@ def generate(
     format: str | Iterable[str] = "coco",
     progress: Done | None = None,
     min_visible: float = 0.0,
+    shard: str | None = None,
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
 
@@ -63,26 +73,29 @@ def generate(
             for no labels.
         progress: called with the number of images there are and ``num``; first with what an interrupted call left.
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
+        shard: ``"I/N"``, I from 0: makes every N-th chunk alone, and no files of labels for the whole. Several shards
+            may write to one folder at once; the same call without ``shard`` makes what is missing and finishes.
 
     Raises:
         ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
-            format, more classes or objects than KITTI's masks can number.
+            format, more classes or objects than KITTI's masks can number, another text for a shard.
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped.
     """
     if workers < 1:
         raise ProbsceneError(f"Expected a positive number of workers, actual {workers}.")
+    part = WHOLE if shard is None else Shard.of(shard)
     job = Job(run.model, run.guide, num, Path(out), seed, chosen(format), run.guide_hash(), min_visible)
     if workers == 1:
-        return job.run(job.each, progress)
+        return job.run(job.each, progress, part)
     if run.objects:
         raise ProbsceneError(
             f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual {workers}; "
             "fit a model and parts in files for more."
         )
     task = (run.path, num, Path(out), seed, job.formats, min_visible)
-    return job.run(partial(spread, _worker, task, workers), progress)
+    return job.run(partial(spread, _worker, task, workers), progress, part)
 
 
 def generate_scenes(
@@ -94,13 +107,14 @@ def generate_scenes(
     format: str | Iterable[str] = "coco",
     progress: Done | None = None,
     min_visible: float = 0.0,
+    shard: str | None = None,
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
 
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
     job = Job(model, policy, num, out, seed, format, min_visible=min_visible)
-    return job.run(job.each, progress)
+    return job.run(job.each, progress, WHOLE if shard is None else Shard.of(shard))
 
 
 def png(image: Tensor) -> bytes:
@@ -149,22 +163,25 @@ class Job:
         self.folder = DatasetFolder(out, self.origin, num, self.formats)
         self._renderer = renderer_for(model, threads=1)
 
-    def run(self, work: Callable[[list[int], Callable[[int], None]], None], progress: Done | None) -> Dataset:
-        """Do what is missing by ``work(chunks, done)``, then write the labels."""
+    def run(
+        self, work: Callable[[list[int], Callable[[int], None]], None], progress: Done | None, shard: Shard = WHOLE
+    ) -> Dataset:
+        """Do what is missing of a shard by ``work(chunks, done)``; of the whole, then write the labels."""
         folder, made = self.folder, 0
-        chunks = folder.missing()
-        before = folder.num - sum(map(folder.size, chunks))
+        chunks, num = folder.missing(shard), sum(map(folder.size, folder.of(shard)))
+        before = num - sum(map(folder.size, chunks))
 
         def done(chunk: int | None) -> None:
             nonlocal made
             made += 0 if chunk is None else folder.size(chunk)
             if progress is not None:
-                progress(before + made, folder.num)
+                progress(before + made, num)
 
         done(None)
         work(chunks, done)
-        folder.finish(self._labels())
-        return Dataset(folder.out, made)
+        if shard == WHOLE:
+            folder.finish(self._labels())
+        return Dataset(folder.out, made, num, folder.finished)
 
     def each(self, chunks: list[int], done: Callable[[int], None]) -> None:
         """Make chunks one after the other."""

@@ -1,0 +1,121 @@
+"""Shards: several calls, of several machines, make one dataset; its bytes are those of one process."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import probscene
+from probscene.app.datasets import folder
+from probscene.app.datasets.generate import generate
+from probscene.errors import DataError, ProbsceneError
+
+from .conftest import contents
+
+
+@pytest.mark.parametrize("shards", [1, 2, 5])
+@pytest.mark.parametrize("format", ["coco,kitti", "webdataset"])
+def test_shards_make_what_one_process_makes(run, tmp_path, shards, format):
+    generate(run, 130, tmp_path / "whole", seed=3, format=format)
+    out, made = tmp_path / "out", []
+    for number in reversed(range(shards)):
+        found = generate(run, 130, out, seed=3, format=format, shard=f"{number}/{shards}")
+        made.append(found.made)
+        assert found.num == found.made and found.finished == (shards == 1)
+        assert generate(run, 130, out, seed=3, format=format, shard=f"{number}/{shards}").made == 0
+    assert sum(made) == 130
+    assert (out / "provenance.jsonl").exists() == (shards == 1)
+    last = generate(run, 130, out, seed=3, format=format)
+    assert last.made == 0 and last.finished
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_the_whole_makes_what_shards_lack(run, undisturbed, tmp_path):
+    generate(run, 130, tmp_path / "out", seed=3, shard="1/3")
+    told = []
+    assert generate(run, 130, tmp_path / "out", seed=3, progress=lambda *now: told.append(now)).made == 66
+    assert told[0] == (64, 130) and told[-1] == (130, 130)
+    assert contents(tmp_path / "out") == contents(undisturbed)
+
+
+def test_shards_at_once_two_of_them_killed_and_run_again(run, tmp_path):
+    out, num, shards = tmp_path / "out", 1000, 8
+    environment = {**os.environ, "PYTHONPATH": str(Path(probscene.__file__).parents[1])}
+    command = [sys.executable, "-m", "probscene.app.cli", "generate", run.path, "--num", num, "--out", out]
+
+    def start(number):
+        shard = [*map(str, command), "--seed", "3", "--shard", f"{number}/{shards}"]
+        return subprocess.Popen(shard, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    crew = [start(number) for number in range(shards)]
+    for number in (2, 5):
+        while crew[number].poll() is None and not list(out.glob(f"images/{64 * number:06d}.png")):
+            time.sleep(0.01)
+        crew[number].send_signal(signal.SIGKILL)
+    for number, process in enumerate(crew):
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == (-signal.SIGKILL if number in (2, 5) else 0), said
+    again = [start(number) for number in (2, 5)]
+    for process in again:
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == 0 and "without --shard" in said
+    assert generate(run, num, out, seed=3).made == 0
+    generate(run, num, tmp_path / "whole", seed=3)
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_a_dataset_may_be_finished_while_a_shard_is_at_work(run, undisturbed, tmp_path):
+    out = tmp_path / "out"
+
+    def finish(done, num):
+        if done:
+            generate(run, 130, out, seed=3)
+
+    assert generate(run, 130, out, seed=3, progress=finish, shard="0/2").finished
+    assert contents(out) == contents(undisturbed)
+    assert generate(run, 130, out, seed=3, shard="1/2").made == 0
+
+
+def test_files_that_another_shard_writes_are_not_foreign(run, undisturbed, tmp_path, monkeypatch):
+    """The folder is empty when a shard looks, and another one has begun when it writes its settings."""
+    out, make_folder = tmp_path / "out", folder.make_folder
+
+    def other_first(path):
+        monkeypatch.setattr(folder, "make_folder", make_folder)
+        if path.name == ".parts":
+            generate(run, 130, out, seed=3, shard="1/2")
+        else:
+            monkeypatch.setattr(folder, "make_folder", other_first)
+        return make_folder(path)
+
+    monkeypatch.setattr(folder, "make_folder", other_first)
+    assert generate(run, 130, out, seed=3, shard="0/2").made == 66
+    generate(run, 130, out, seed=3)
+    assert contents(out) == contents(undisturbed)
+
+
+def test_shards_have_the_same_settings(run, tmp_path):
+    generate(run, 130, tmp_path / "out", seed=3, shard="0/2")
+    with pytest.raises(DataError, match=r"begun with \(seed 3\), actual seed 4; give the same"):
+        generate(run, 130, tmp_path / "out", seed=4, shard="1/2")
+
+
+def test_a_shard_that_no_chunk_is_left_for(run, undisturbed, tmp_path):
+    told = []
+    found = generate(run, 130, tmp_path / "out", seed=3, shard="7/8", progress=lambda *now: told.append(now))
+    assert found.made == found.num == 0 and told == [(0, 0)]
+    assert generate(run, 130, tmp_path / "out", seed=3).made == 130
+    assert contents(tmp_path / "out") == contents(undisturbed)
+
+
+@pytest.mark.parametrize("text", ["8/8", "-1/8", "1", "", "a/b", "1/0", "1/2/3", "1 / 2"])
+def test_what_is_no_shard_is_refused(run, tmp_path, text):
+    with pytest.raises(
+        ProbsceneError, match="Expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8"
+    ) as error:
+        generate(run, 130, tmp_path / "out", shard=text)
+    assert error.value.exit_code == 2 and not (tmp_path / "out").exists()
