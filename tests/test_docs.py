@@ -59,6 +59,13 @@ def test_files_that_pages_name_are_there(page):
         assert (ROOT / name).is_file() or (ROOT / "docs" / name).is_file(), name
 
 
+def test_tables_say_what_their_result_files_say():
+    found = subprocess.run(
+        [sys.executable, ROOT / "benchmarks" / "tables.py", "--check"], capture_output=True, text=True
+    )
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
 def test_the_page_on_extending_names_what_there_is():
     page = text("extending.md")
     named = dict(re.findall(r"`(own_\w+\.py):(\w+)`", page))

@@ -33,21 +33,40 @@ class Farther(NamedTuple):
         return self.one > self.other and self.share >= SURE
 
 
-def farther(one: Features, other: Features, real: Features, seed: int = 0) -> Farther:
-    """Energy distances of two samples ``(N, D)`` and ``(P, D)`` from ``real (L, D)``, and the bootstrap's doubt."""
+def farther(
+    one: Features, other: Features, real: Features, seed: int = 0, images: tuple[Features, ...] | None = None
+) -> Farther:
+    """Energy distances of two samples ``(N, D)`` and ``(P, D)`` from ``real (L, D)``, and the bootstrap's doubt.
+
+    Args:
+        images: of each of the three, which image each row is of: whole images are resampled. A row is an image where
+            not said otherwise.
+    """
     rng = np.random.default_rng(seed)
-    one, other, real = (x if len(x) <= EXAMINED else x[rng.permutation(len(x))[:EXAMINED]] for x in (one, other, real))
+    of = [np.arange(len(x)) for x in (one, other, real)] if images is None else list(images)
+    chosen = [
+        rng.permutation(len(x))[:EXAMINED] if len(x) > EXAMINED else np.arange(len(x)) for x in (one, other, real)
+    ]
+    one, other, real = (x[rows] for x, rows in zip((one, other, real), chosen, strict=True))
+    of = [np.unique(x[rows], return_inverse=True)[1] for x, rows in zip(of, chosen, strict=True)]
     kernels = [(cdist(x, real), cdist(x, x)) for x in (one, other)]
     within = cdist(real, real)
     whole = [np.ones(len(x)) / len(x) for x in (one, other, real)]
     found = [_energy(*kernels[i], within, whole[i], whole[2]) for i in (0, 1)]
     larger = 0
     for _ in range(RESAMPLES):
-        weights = [rng.multinomial(len(x), x) / len(x) for x in whole]
+        weights = [_resampled(rng, image) for image in of]
         drawn = [_energy(*kernels[i], within, weights[i], weights[2]) for i in (0, 1)]
         larger += drawn[0] > drawn[1]
     distance, of_other = (float(np.sqrt(max(0.0, value))) for value in found)
     return Farther(distance, of_other, larger / RESAMPLES)
+
+
+def _resampled(rng: np.random.Generator, image: NDArray[np.integer]) -> NDArray[np.floating]:
+    """Weights of rows, each as often as its image is drawn."""
+    number = int(image.max()) + 1
+    weight = rng.multinomial(number, np.full(number, 1 / number))[image]
+    return weight / weight.sum() if weight.any() else np.ones(len(image)) / len(image)
 
 
 def _energy(

@@ -131,6 +131,17 @@ def energy_distance(one: Values, other: Values) -> Tensor:
     return total / max(weight, 1.0)
 
 
+def site_rows(values: Values) -> tuple[Tensor, Tensor]:
+    """``(R, D)`` what was read of the only site there is, with that of the sibling before where it is of nodes; and the
+    image of each ``(R,)``."""
+    if values.scene.shape[1]:
+        return _placed(values.scene, values.turns), torch.arange(len(values.scene))
+    own = _placed(values.nodes, values.turns)
+    before = gathered(own, Graph.of(values.kind, values.parent).before).nan_to_num(0.0)
+    image, node = (~values.nodes[..., 0].isnan()).nonzero(as_tuple=True)
+    return torch.cat([own, before], -1)[image, node], image
+
+
 def _rows(values: Values) -> Tensor:
     """``(N, M, D)`` each object with its sibling before it, its place and their number."""
     graph = Graph.of(values.kind, values.parent)

@@ -25,7 +25,7 @@ from probscene.sampling import seed_everything
 
 from ..training import Report, Training, batch_seed
 from .best import Best, HeldOut
-from .energy import EnergyDistance, OwnReadings, energy_distance
+from .energy import EnergyDistance, OwnReadings, site_rows
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
 from .reading.assembly import Assembly, along_the_widest
@@ -265,18 +265,18 @@ class ParameterLearning:
         return self.tried.values(made, found, len(images), missing=self.missing)[0], made
 
     @torch.no_grad()
-    def apart(self, images: Tensor, target: Tensor) -> dict[str, float]:
-        """Squared energy distance of what is read of each learnt site in ``(L, C, H, W)`` uint8 images from what is
-        read in others, with its siblings'."""
-        found = [self.tried.reader.find(some) for some in (images, target)]
-        made = along_the_widest(self._assembly, found[1])
+    def site_rows(self, images: dict[str, Tensor]) -> dict[str, dict[str, tuple[Tensor, Tensor]]]:
+        """What is read of each learnt site in images ``(L, C, H, W)`` uint8 of several sources, ``"target"`` among
+        them: by site and source, see ``energy.site_rows``."""
+        found = {name: self.tried.reader.find(some) for name, some in images.items()}
+        made = along_the_widest(self._assembly, found["target"])
         seed_everything(batch_seed(self.seed, 6))
-        one, other = (
-            self.tried.values(made, objects, len(some))[0]
-            for objects, some in zip(found, (images, target), strict=True)
-        )
+        read = {name: self.tried.values(made, objects, len(images[name]))[0] for name, objects in found.items()}
         sites = [site for site in (*self.node_sites, *self.scene_sites) if site in self.tried.good_sites]
-        return {site.name: float(energy_distance(one.site(i), other.site(i))) for i, site in enumerate(sites)}
+        return {
+            site.name: {name: site_rows(values.site(i)) for name, values in read.items()}
+            for i, site in enumerate(sites)
+        }
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int) -> OwnReadings:

@@ -199,13 +199,31 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
 
 
 def test_sites_whose_readings_come_no_nearer_keep_the_prior():
-    class Learning:
-        def apart(self, images, target):
-            assert target == "target"
-            return {"learnt": {"x": 0.1, "y": 0.3, "z": 0.2}, "prior": {"x": 0.5, "y": 0.2, "z": 0.2}}[images]
+    """The target's has the prior's values in all sites but ``x``; of ``z`` nothing is read in it."""
 
-    images = {name: name for name in ("learnt", "prior", "target")}
-    assert judged.not_nearer(Learning(), images) == {"y", "z"}
+    class Learning:
+        def site_rows(self, images):
+            assert set(images) == {"learnt", "prior", "target"}
+            torch.manual_seed(0)
+            where = {
+                "learnt": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0},
+                "prior": {"x": 1.0, "y": 0.0, "z": 0.0, "w": -2.0},
+            }
+            where["target"] = {"x": 0.2, "y": 0.0, "z": 0.0, "w": -1.5}
+            number = {"learnt": 120, "prior": 120, "target": 120}
+            return {
+                site: {
+                    name: rows(where[name][site], 0 if (name, site) == ("target", "z") else number[name])
+                    for name in images
+                }
+                for site in "xyzw"
+            }
+
+    def rows(mean, number):
+        return mean + torch.randn(number, 2), torch.arange(number) // 3
+
+    images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
+    assert judged.not_nearer(Learning(), images) == {"y", "z", "w"}
 
 
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])

@@ -22,3 +22,13 @@ def test_only_what_is_farther_beyond_chance_is_sure(shift, sure):
     real = rng.normal(0, 1, (200, 2))
     other = rng.normal(0.5, 1, (200, 2))
     assert farther(rng.normal(0.5 + shift, 1, (200, 2)), other, real).sure == sure
+
+
+def test_whole_images_are_resampled():
+    """Rows that are copies of one another say no more than one."""
+    rng = np.random.default_rng(3)
+    one, other, real = rng.normal(0.4, 1, (40, 1)), rng.normal(0, 1, (40, 1)), rng.normal(0, 1, (40, 1))
+    copies, image = [np.repeat(x, 20, 0) for x in (one, other, real)], np.repeat(np.arange(40), 20)
+    single, together = farther(one, other, real), farther(*copies, images=(image,) * 3)
+    assert together.one == pytest.approx(single.one) and abs(together.share - single.share) < 0.1
+    assert farther(*copies).share > together.share

@@ -34,11 +34,10 @@ class Judged(NamedTuple):
     """For JSON.
 
     Attributes:
-        distances: ``kept``, ``"learnt"`` where renders with learnt parameters are nearer to the images than those with
-            the prior's, else ``"prior"``; and both energy distances. Where they are no nearer, the guide passes sites
-            of which what is read in its renders is no nearer to what is read in the images; where they are surely
-            farther all the same, all but those that bring them nearer alone. With the others it is kept, unless its
-            renders are surely farther then.
+        distances: ``kept``, ``"learnt"`` or ``"prior"``, and the energy distances of renders with learnt parameters
+            and with the prior's from the images. The guide passes sites of which what is read in its renders is not
+            surely nearer to what is read in the images; where renders are surely farther all the same, all but those
+            that bring them nearer alone. With the others it is kept, unless its renders are surely farther then.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -66,9 +65,8 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
     def compared() -> Farther:
         return farther(drawn("learnt", learnt.suited(run.model)), of_prior, real)
 
-    apart = compared()
-    kept = "learnt" if apart.one < apart.other else "prior"
-    if kept == "prior" and isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
+    if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
+        drawn("learnt", learnt.suited(run.model))
         learnt.passed = not_nearer(learning, images)
         apart = compared()
         if apart.sure and judge is not None:
@@ -77,6 +75,9 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
         if kept == "prior":
             learnt.passed = frozenset()
+    else:
+        apart = compared()
+        kept = "learnt" if apart.one < apart.other else "prior"
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if isinstance(learning, MetaSimLearning):  # which reads nothing
         return Judged(distances, {})
@@ -94,10 +95,20 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
 
 
 def not_nearer(learning: ParameterLearning, images: dict[str, Tensor]) -> frozenset[str]:
-    """Sites of which what is read in learnt renders is no nearer to what is read in the target than with the prior's
-    parameters."""
-    away = {name: learning.apart(images[name], images["target"]) for name in ("learnt", "prior")}
-    return frozenset(site for site, far in away["learnt"].items() if far >= away["prior"][site])
+    """Sites of which what is read in learnt renders is not surely nearer to what is read in the target than with the
+    prior's parameters: there is nothing to be learnt of them, or it was not."""
+    return frozenset(
+        name
+        for name, of in learning.site_rows(images).items()
+        if not _surely_nearer(of["learnt"], of["prior"], of["target"])
+    )
+
+
+def _surely_nearer(*sources: tuple[Tensor, Tensor]) -> bool:
+    """Whether the first rows are surely nearer to the last ones than the second are."""
+    learnt, prior, target = (rows.double().numpy() for rows, _ in sources)
+    of = tuple(image.numpy() for _, image in sources)
+    return min(map(len, of)) > 0 and farther(prior, learnt, target, images=(of[1], of[0], of[2])).sure
 
 
 def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
