@@ -21,7 +21,7 @@ from typing import NamedTuple
 import matplotlib
 import numpy as np
 import torch
-from given import out_option
+from given import command, out_option
 from learn_driving import counted
 
 from probscene.app.api.fit import fit
@@ -176,7 +176,7 @@ def main():
     rows = []
     for seed in args.seeds:
         rows += of_seed(args, seed)
-        write_json(args.out / "results.json", rows)
+        write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
         with (args.out / "results.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()

@@ -2,11 +2,13 @@
 
 import argparse
 import os
+import shlex
 import sys
 from pathlib import Path
 
 RUNS = Path("runs", "benchmarks")
 MNIST = "MNIST"
+FOLDERS = ("--out", "--mnist")
 
 
 def out_option(parser: argparse.ArgumentParser, benchmark: str) -> None:
@@ -40,3 +42,15 @@ def needed(given: Path | None, what: str) -> Path:
 def needed_mnist(given: Path | None) -> Path:
     """The folder of MNIST, whose digits draw targets that the model does not have."""
     return needed(given, f"the folder of MNIST's original IDX files by --mnist FOLDER or {MNIST}=FOLDER")
+
+
+def command(benchmark: str) -> str:
+    """How a benchmark was called, as its results say it; without its folders, which differ from machine to machine."""
+    given, said = iter(sys.argv[1:]), ["python", f"benchmarks/{Path(benchmark).name}"]
+    for word in given:
+        if word.partition("=")[0] in FOLDERS:
+            if "=" not in word:
+                next(given, None)
+        else:
+            said.append(word)
+    return shlex.join(said)

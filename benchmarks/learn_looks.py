@@ -22,7 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from given import out_option
+from given import command, out_option
 from learn_driving import counted
 from learn_parameters import IMAGES, drawn, said
 from pyro.poutine.messenger import Messenger
@@ -120,7 +120,7 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
     named = [name for name, site in of_site.items() if site["learnt"] or name in HIDDEN]
     row: dict = {"seed": seed, "kept": run.parameters["kept"], "seconds": timing(run), "sites": {}, "kid": {}}
     for name in named:
-        about = {"hidden": name in HIDDEN, "skill": of_site[name].get("skill"), "learnt": of_site[name]["learnt"]}
+        about = {"hidden": name in HIDDEN, "skill": of_site[name].get("skill"), "is_learnt": of_site[name]["learnt"]}
         row["sites"][name] = about | {source: distance(u[name], true[name]) for source, u in others.items()}
     cars = {name: histogram(counted(model, policy)[:, 0]) for name, policy in (
         ("truth", truth.prior), ("prior", model.prior), ("start", model.pretraining_policy), ("learnt", structure)
@@ -163,7 +163,7 @@ def main():
     for seed in args.seeds:
         rows.append(measured(model, seed, args))
         print(json.dumps(rows[-1]), flush=True)
-        write_json(args.out / "results.json", rows)
+        write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
 
 
 if __name__ == "__main__":

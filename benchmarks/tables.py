@@ -1,0 +1,121 @@
+"""Writes the tables of README and docs from results that benchmarks have left, so that a command makes each figure.
+
+    python benchmarks/tables.py [--check]
+    python benchmarks/tables.py --take runs/benchmarks/ablate/multi_mnist/results.json --as ablate-multi_mnist
+
+A page has a table, and the command of its figures, between ``<!-- table: NAME -->`` and ``<!-- end of table -->``. They
+come from ``docs/figures/NAME.json``; the part of NAME before its first ``-`` is the benchmark that wrote the file. With
+``--take`` a result file becomes NAME's. With ``--check`` nothing is written; the exit status is 1 where a page differs.
+"""
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from probscene.app.files import write_text
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+FIGURES = ROOT / "docs" / "figures"
+BLOCK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+Rows = list[list[str]]
+
+
+def ablate(result: dict) -> Rows:
+    """A row for each variant."""
+    rows: Rows = [["", "settings", "total variation", "log q", "cannot derive"]]
+    for variant in dict.fromkeys(row["variant"] for row in result["rows"]):
+        each = [row for row in result["rows"] if row["variant"] == variant]
+        settings, impossible = each[0]["settings"], spread([row["impossible"] for row in each], 2)
+        log_q = spread([row["log_q"] for row in each], 2)
+        rows.append([variant, f"`{settings}`" if settings else "", spread([row["total_variation"] for row in each], 3)])
+        rows[-1] += [log_q, impossible if any(row["impossible"] for row in each) else "none"]
+    return rows
+
+
+def learn_looks(result: dict) -> Rows:
+    """A row for each hidden site, then the cars and KID; a column for each target."""
+    targets = result["rows"]
+    rows: Rows = [["", *(f"target {row['seed']}" for row in targets)]]
+    for name in dict.fromkeys(name for row in targets for name, site in row["sites"].items() if site["hidden"]):
+        rows.append([f"`{name}`", *(_of_site(row["sites"].get(name)) for row in targets)])
+    others = [[site for site in row["sites"].values() if not site["hidden"]] for row in targets]
+    rows.append(["others that are learnt, farthest", *(_farthest(some) for some in others)])
+    rows.append(["number of cars, TV, start", *(f"{row['cars']['start']:.2f}" for row in targets)])
+    rows.append(["number of cars, TV, learnt", *(f"{row['cars']['learnt']:.2f}" for row in targets)])
+    for source in ("prior", "start", "structure", "both", "floor"):
+        said = "learnt structure alone" if source == "structure" else source
+        rows.append([f"KID, {said}", *(_figure(row["kid"][source]) for row in targets)])
+    return rows
+
+
+def _of_site(site: dict | None) -> str:
+    if site is None:
+        return ""
+    prior, (learnt, low, high) = site["prior"][0], site["learnt"]
+    skill = "not read" if site["skill"] is None else f"skill {site['skill']:.2f}"
+    if not site["is_learnt"]:
+        return f"{skill}; {prior:.3f}, kept"
+    return f"{skill}; {prior:.3f} to {learnt:.3f} ({low:.3f} to {high:.3f})"
+
+
+def _farthest(sites: list[dict]) -> str:
+    return f"{max(site['learnt'][0] for site in sites):.3f}" if sites else "none"
+
+
+def _figure(figure: dict) -> str:
+    return f"{figure['value']:.3f} ({figure['low']:.3f} to {figure['high']:.3f})"
+
+
+TABLES: dict[str, Callable[[dict], Rows]] = {"ablate": ablate, "learn_looks": learn_looks}
+
+
+def spread(values: list[float], digits: int) -> str:
+    """Mean and range."""
+    known = [value for value in values if value is not None and np.isfinite(value)]
+    if not known:
+        return ""
+    low, mean, high = (f"{value:.{digits}f}" for value in (min(known), float(np.mean(known)), max(known)))
+    return mean if low == high else f"{mean} ({low} to {high})"
+
+
+def table(name: str) -> str:
+    """What stands in a page between the marks."""
+    path = FIGURES / f"{name}.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    head, *rows = (f"| {' | '.join(row)} |" for row in TABLES[name.partition("-")[0]](result))
+    ruled = "|" + "---|" * (head.count("|") - 1)
+    return "\n".join(["", f"    {result['command']}", "", head.replace("|  |", "| |"), ruled, *rows, ""])
+
+
+def written(text: str) -> str:
+    """A page with its tables as the result files say."""
+    return BLOCK.sub(lambda found: f"{found[1]}{table(found[2])}\n{found[3]}", text)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 where a page differs")
+    parser.add_argument("--take", type=Path, metavar="FILE", help="a benchmark's results.json")
+    parser.add_argument("--as", dest="name", help="the table that it is of")
+    args = parser.parse_args()
+    if bool(args.take) != bool(args.name) or (args.name and args.name.partition("-")[0] not in TABLES):
+        parser.error(f"expected --take FILE with --as NAME, its first part one of {', '.join(TABLES)}.")
+    if args.take:
+        FIGURES.mkdir(exist_ok=True)
+        write_text(FIGURES / f"{args.name}.json", args.take.read_text(encoding="utf-8"))
+    stale = {page: text for page in PAGES if (text := written(before := page.read_text(encoding="utf-8"))) != before}
+    for page, text in stale.items():
+        print(f"{page.relative_to(ROOT)}: {'differs' if args.check else 'written'}")
+        if not args.check:
+            write_text(page, text)
+    sys.exit(1 if args.check and stale else 0)
+
+
+if __name__ == "__main__":
+    main()
