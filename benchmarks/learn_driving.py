@@ -11,6 +11,7 @@ fit took.
 import argparse
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 from given import out_option
@@ -20,6 +21,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
+from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.session import timing
 from probscene.app.loading import load_model
@@ -53,7 +55,7 @@ def main():
         target = model.target(seed)
         folder = args.out / f"target-{seed}"
         generate_scenes(target, target.prior, args.images, folder, seed=1000 + seed, format="images")
-        chosen = override(preset(args.preset), args.settings)
+        chosen = override(replace(preset(args.preset), learn=STRUCTURE), args.settings)
         path = args.out / f"run-{seed}"
         began = path.exists()
         start = time.monotonic()

@@ -44,8 +44,7 @@ def learn_looks(result: dict) -> Rows:
     rows: Rows = [["", *(f"target {row['seed']}" for row in targets)]]
     for name in dict.fromkeys(name for row in targets for name, site in row["sites"].items() if site["hidden"]):
         rows.append([f"`{name}`", *(_of_site(row["sites"].get(name)) for row in targets)])
-    others = [[site for site in row["sites"].values() if not site["hidden"]] for row in targets]
-    rows.append(["others that are learnt, farthest", *(_farthest(some) for some in others)])
+    rows.append(["others that are learnt", *(_others(row["sites"]) for row in targets)])
     rows.append(["number of cars, TV, start", *(f"{row['cars']['start']:.2f}" for row in targets)])
     rows.append(["number of cars, TV, learnt", *(f"{row['cars']['learnt']:.2f}" for row in targets)])
     for source in ("prior", "start", "structure", "both", "floor"):
@@ -64,8 +63,13 @@ def _of_site(site: dict | None) -> str:
     return f"{skill}; {prior:.3f} to {learnt:.3f} ({low:.3f} to {high:.3f})"
 
 
-def _farthest(sites: list[dict]) -> str:
-    return f"{max(site['learnt'][0] for site in sites):.3f}" if sites else "none"
+def _others(sites: dict[str, dict]) -> str:
+    said = (
+        f"`{name}` {site['prior'][0]:.3f} to {site['learnt'][0]:.3f}"
+        for name, site in sites.items()
+        if not site["hidden"]
+    )
+    return ", ".join(said) or "none"
 
 
 def _figure(figure: dict) -> str:

@@ -8,7 +8,7 @@ from probscene.inference.features.names import PRETRAINED
 from probscene.inference.features.presence import PRESENCE, PRESENCE_COUNTS
 from probscene.inference.parameters.schedule import ParameterSchedule
 
-from .preset import BOTH, STRUCTURE, TRAINED, Preset
+from .preset import BOTH, TRAINED, Preset
 
 QUICK = Preset(learn=BOTH)
 DEFAULT = replace(
@@ -21,7 +21,6 @@ DEFAULT = replace(
 # Objects behind others are counted as far as they can be seen at all; the prior holds what cannot.
 STREET = replace(
     QUICK,
-    learn=STRUCTURE,
     objective="js",
     variance=5.0,
     prior_kl_weight=0.03,
