@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 from given import out_option
-from learn_aerial import judged
+from learn_aerial import Truth, judged
 from learn_parameters import IMAGES, drawn, said
 from torch import Tensor
 
@@ -87,7 +87,7 @@ def measured(seed: int, args: argparse.Namespace) -> dict:
         "seed": seed,
         "kept": run.parameters["kept"],
         "seconds": timing(run),
-        "structure_of": judged(run.guide),
+        "structure_of": judged(run.guide, Truth()),
     }
     row["target"] = lane_errors([sample(truth, truth.prior, IMAGES)]) | {"kid": said(floor)}
     panels = []
