@@ -17,6 +17,8 @@ class ParameterSchedule:
         images: of the target, at most, that are read.
         reader_images: renders a step of the reader.
         reader_rate, scene_rate, rate, energy_rate: largest learning rates.
+        sure: keep only sites whose readings come surely nearer to held-out images', even where whole images come nearer
+            with all: for models with many sites, of which most are right. A spacing alone hardly makes them so.
     """
 
     reader_steps: int = 600
@@ -34,3 +36,4 @@ class ParameterSchedule:
     scene_rate: float = 2e-3
     rate: float = 5e-3
     energy_rate: float = 2e-3
+    sure: bool = False

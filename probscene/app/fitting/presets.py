@@ -26,6 +26,7 @@ STREET = replace(
     prior_kl_weight=0.03,
     draws_per_structure=1,
     count=CountSchedule(min_visible=0.05),
+    parameters=ParameterSchedule(sure=True),
 )
 # The paper's Multi-MNIST (section 4.1, supplement): 20 epochs of 5,000 target images in batches of 500 are 200 updates.
 PAPER = Preset(

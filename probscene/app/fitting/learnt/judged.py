@@ -35,9 +35,10 @@ class Judged(NamedTuple):
 
     Attributes:
         distances: ``kept``, ``"learnt"`` or ``"prior"``, and the energy distances of renders with learnt parameters
-            and with the prior's from the images. The guide passes sites of which what is read in its renders is not
-            surely nearer to what is read in the images; where renders are surely farther all the same, all but those
-            that bring them nearer alone. With the others it is kept, unless its renders are surely farther then.
+            and with the prior's from the images. Where the former are no nearer, or the schedule says so, the guide
+            passes sites of which what is read in its renders is not surely nearer to what is read in the images; where
+            renders are surely farther all the same, all but those that bring them nearer alone. With the others it is
+            kept, unless its renders are surely farther then.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -65,8 +66,10 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
     def compared() -> Farther:
         return farther(drawn("learnt", learnt.suited(run.model)), of_prior, real)
 
-    if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
-        drawn("learnt", learnt.suited(run.model))
+    apart = compared()
+    kept = "learnt" if apart.one < apart.other else "prior"
+    careful = kept == "prior" or run.preset.parameters.sure
+    if careful and isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         learnt.passed = not_nearer(learning, images)
         apart = compared()
         if apart.sure and judge is not None:
@@ -75,9 +78,6 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
         if kept == "prior":
             learnt.passed = frozenset()
-    else:
-        apart = compared()
-        kept = "learnt" if apart.one < apart.other else "prior"
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if isinstance(learning, MetaSimLearning):  # which reads nothing
         return Judged(distances, {})
