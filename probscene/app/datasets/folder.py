@@ -187,11 +187,11 @@ class DatasetFolder:
         temporary = self._aside(record.name)
         write_json(temporary, self.settings)
         try:
-            os.link(temporary, record)
-        except FileExistsError:
-            pass
-        except (OSError, AttributeError):  # the file system has no second names: the last process's stay
-            _move(temporary, record)
+            if hasattr(os, "link"):
+                with suppress(OSError):
+                    os.link(temporary, record)
+            if not record.exists():  # the file system has no second names: the last process's stay
+                _move(temporary, record)
         finally:
             temporary.unlink(missing_ok=True)
 
