@@ -136,10 +136,8 @@ def site_rows(values: Values) -> tuple[Tensor, Tensor]:
     image of each ``(R,)``."""
     if values.scene.shape[1]:
         return _placed(values.scene, values.turns), torch.arange(len(values.scene))
-    own = _placed(values.nodes, values.turns)
-    before = gathered(own, Graph.of(values.kind, values.parent).before).nan_to_num(0.0)
     image, node = (~values.nodes[..., 0].isnan()).nonzero(as_tuple=True)
-    return torch.cat([own, before], -1)[image, node], image
+    return _rows(values)[image, node, :-2], image
 
 
 def _rows(values: Values) -> Tensor:

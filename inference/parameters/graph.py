@@ -95,3 +95,9 @@ class Seen(NamedTuple):
         back = values.gather(1, at)
         there = (place < values.shape[1]) & (self.kind.gather(1, at) >= 0)
         return back.where(there, others)
+
+
+def class_of(kind: Tensor, kinds: Tensor) -> Tensor:
+    """Which of the classes, whose kinds in the grammar are ``(C,)``, nodes ``(N, M)`` are; -1 for none."""
+    same = kind.unsqueeze(-1) == kinds
+    return same.int().argmax(-1).where(same.any(-1), -1)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from probscene.grammar import Grammar
 
-from ..graph import Graph
+from ..graph import Graph, class_of
 from .reader import Found
 
 FREE, SHUFFLED = -1, -2  # axes
@@ -102,9 +102,7 @@ def assembly(
     """
     C = len(classes)
     kinds = torch.tensor([grammar.kind(name) for name in classes])
-    number = torch.full((len(grammar.kinds) + 1,), -1)
-    number[kinds] = torch.arange(C)
-    label = number[graph.kind]  # padding is the last
+    label = class_of(graph.kind, kinds)
     above = torch.zeros(C, C + 1, dtype=torch.bool)
     n, m = (label >= 0).nonzero(as_tuple=True)
     parent = graph.parent[n, m]

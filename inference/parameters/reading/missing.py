@@ -16,6 +16,7 @@ import torch
 from scipy.stats import wasserstein_distance
 from torch import Tensor
 
+from ..graph import class_of
 from .reader import Found
 from .training import Valued
 
@@ -53,9 +54,7 @@ class Missing(NamedTuple):
             found: ``(N, M)`` bool, which of the nodes are found.
             sites: columns of those that are learnt.
         """
-        label = torch.full((int(max(kinds.max(), valued.kind.max())) + 2,), -1)
-        label[kinds] = torch.arange(len(kinds))
-        label = label[valued.kind]  # padding is the last
+        label = class_of(valued.kind, kinds)
         u, counts = valued.u[..., sites], torch.zeros(len(kinds), len(sites), dtype=torch.bool)
         for c in range(len(kinds)):
             of_class, here = label == c, found & (label == c)
