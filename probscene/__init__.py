@@ -39,8 +39,10 @@ _MODULES = {
     "probscene.drawing": ("Drawing", "Sprites"),
     "probscene.enumeration": ("enumerate_derivations",),
     "probscene.errors": (
-        "DataError", "GrammarError", "MachineError", "ModelError", "ProbsceneError", "RunError", "SamplingError",
+        "DataError", "GeneratorError", "GrammarError", "MachineError", "ModelError", "ProbsceneError", "RunError",
+        "SamplingError",
     ),
+    "probscene.generator": ("Command",),
     "probscene.grammar": ("Grammar",),
     "probscene.image_array": ("ImageArray",),
     "probscene.inference.divergence": ("Divergence", "JensenShannon", "KDELogRatio", "MMD"),
@@ -57,6 +59,7 @@ _MODULES = {
     "probscene.model": ("Groups", "SceneModel", "scene_model"),
     "probscene.photo": ("Photo",),
     "probscene.policy": ("Policy",),
+    "probscene.request": ("Objects", "Request"),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
     "probscene.scene": ("SceneGraph",),
     "probscene.structure": ("StructurePrior", "counts", "ranked", "weights"),
@@ -89,27 +92,38 @@ if TYPE_CHECKING:
     from .derive import derive
     from .drawing import Drawing, Sprites
     from .enumeration import enumerate_derivations
-    from .errors import DataError, GrammarError, MachineError, ModelError, ProbsceneError, RunError, SamplingError
+    from .errors import (
+        DataError,
+        GeneratorError,
+        GrammarError,
+        MachineError,
+        ModelError,
+        ProbsceneError,
+        RunError,
+        SamplingError,
+    )
+    from .generator import Command
     from .grammar import Grammar
     from .image_array import ImageArray
     from .mesh import Mesh
     from .model import Groups, SceneModel, scene_model
     from .photo import Photo
     from .policy import Policy
+    from .request import Objects, Request
     from .sampling import Scenes, sample, seed_everything
     from .scene import SceneGraph
     from .structure import StructurePrior, counts, ranked, weights
     from .world import Camera, Ground, Light, Meshes, World
 
 __all__ = [
-    "FeatureNet", "Features", "Camera", "DataError", "Derivation", "Divergence", "Drawing", "Grammar", "GrammarError",
-    "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio",
-    "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "PCFG", "ParameterGuide", "Photo",
-    "Policy", "Preset", "ProbsceneError", "RenderBatch", "Renderer", "Run", "RunError", "SamplingError",
-    "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "World",
-    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
-    "load_model", "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything", "trial",
-    "weights",
+    "Camera", "Command", "DataError", "Derivation", "Divergence", "Drawing", "FeatureNet", "Features",
+    "GeneratorError", "Grammar", "GrammarError", "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray",
+    "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes",
+    "ModelError", "Objects", "PCFG", "ParameterGuide", "Photo", "Policy", "Preset", "ProbsceneError", "RenderBatch",
+    "Renderer", "Request", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph", "SceneModel", "Scenes",
+    "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive", "enumerate_derivations",
+    "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",
+    "sample", "scene_model", "seed_everything", "trial", "weights",
 ]  # fmt: skip
 
 

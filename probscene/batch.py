@@ -4,8 +4,7 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from .drawing import Drawing
-from .world import World
+from .request import Renderable
 
 
 class Space(NamedTuple):
@@ -47,6 +46,9 @@ class RenderBatch(NamedTuple):
         visible: ``(N, M)`` float32, visible pixels over the pixels of the whole silhouette; 0 if that is empty. In 3D
             of the silhouette inside the image: what lies outside is ``space.truncated``.
         space: in 3D.
+        unknown: which of ``"amodal_box"`` and ``"visible"`` the renderer cannot know, as other people's often cannot.
+            Then they hold what is seen, ``box`` and 1 where there is a visible pixel, and are left out of labels.
+        depth: ``(N, H, W)`` float32, metres, where there is no ``space`` and the renderer knows it.
     """
 
     image: Tensor
@@ -57,6 +59,8 @@ class RenderBatch(NamedTuple):
     pixels: Tensor
     visible: Tensor
     space: Space | None = None
+    unknown: tuple[str, ...] = ()
+    depth: Tensor | None = None
 
 
 class Renderer(Protocol):
@@ -82,4 +86,4 @@ class Renderer(Protocol):
     The first batch of a user's own renderer is checked for all of this, and a ``ModelError`` says what is wrong.
     """
 
-    def __call__(self, drawing: Drawing | World) -> RenderBatch: ...
+    def __call__(self, drawing: Renderable) -> RenderBatch: ...

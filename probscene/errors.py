@@ -19,6 +19,10 @@ class ModelError(ProbsceneError):
     """A scene model does not import, exports nothing, or draws something that cannot be rendered."""
 
 
+class GeneratorError(ProbsceneError):
+    """A model's generator does not start, or cannot draw a scene."""
+
+
 class DataError(ProbsceneError):
     """A folder of images, or a file in it, cannot be used."""
 

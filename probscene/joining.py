@@ -13,12 +13,13 @@ from torch.nn.functional import pad
 from .drawing import Drawing, Layer
 from .errors import ModelError
 from .photo import Photo
+from .request import Renderable, Request, Values
 from .world import Ground, MeshLayer, Part, World, resolve_scene
 
 AnyLayer = TypeVar("AnyLayer", Layer, MeshLayer)
 
 
-def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor, Drawing | World]]) -> Drawing | World:
+def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor, Renderable]]) -> Renderable:
     """The drawing whose scene i comes from the drawing that owns it.
 
     Args:
@@ -38,9 +39,13 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
             )
         layers = _layers(kind, [(own, drawing.kind.shape[1], drawing.layers) for own, drawing in drawings])
         return Drawing(kind, kinds, layers, backgrounds.pop(), _photo([(own, d.photo) for own, d in drawings]))
+    requests = [(own, request) for own, request in drawn if isinstance(request, Request)]
+    if len(requests) == len(drawn):
+        return _request(kind, kinds, requests)
     if len(worlds) != len(drawn):
         raise ModelError(
-            "Expected scenarios that all draw sprites, or all build worlds, actual both; join those alike."
+            "Expected scenarios that all draw sprites, or all build worlds, or all request images of a generator, "
+            "actual several of these; join those alike."
         )
     return World(
         kind,
@@ -51,6 +56,20 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
         _ground([(own, world.ground) for own, world in worlds]),
         _chosen([(own, world.photo) for own, world in worlds]),
     )
+
+
+def _request(kind: Tensor, kinds: tuple[str, ...], parts: list[tuple[Tensor, Request]]) -> Request:
+    """All values, each present only in its own scenes."""
+    M, objects, scene = kind.shape[1], [], []
+    for own, part in parts:
+        own = own.unsqueeze(1)
+        for some in part.objects:
+            values = {key: _as_wide(value, M) for key, value in some.values.items()}
+            objects.append(Values(_as_wide(some.present & own, M), values))
+        scene += [Values(some.present & own, some.values) for some in part.scene]
+    parent = _rows([(own, _as_wide(part.parent, M)) for own, part in parts])
+    seed, photo = _rows([(own, part.seed) for own, part in parts]), _photo([(own, part.photo) for own, part in parts])
+    return Request(kind, kinds, parent, seed, tuple(objects), tuple(scene), photo)
 
 
 def _layers(kind: Tensor, drawn: list[tuple[Tensor, int, tuple[AnyLayer, ...]]]) -> tuple[AnyLayer, ...]:

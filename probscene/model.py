@@ -16,13 +16,13 @@ import pyro
 
 from .batch import Renderer
 from .derive import derive
-from .drawing import Drawing
 from .errors import ModelError
+from .generator import Command
 from .grammar import Grammar
 from .policy import Policy
+from .request import Renderable
 from .scene import SceneGraph
 from .support import Support
-from .world import World
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class SceneProgram:
         max_steps: T_max.
     """
 
-    def __init__(self, draw: Callable[[SceneGraph], Drawing | World], grammar: Grammar, max_steps: int):
+    def __init__(self, draw: Callable[[SceneGraph], Renderable], grammar: Grammar, max_steps: int):
         functools.update_wrapper(self, draw)
         self.draw, self.grammar, self.max_steps = draw, grammar, max_steps
 
-    def __call__(self, num_scenes: int, structure: Policy) -> Drawing | World:
+    def __call__(self, num_scenes: int, structure: Policy) -> Renderable:
         with pyro.plate("scenes", num_scenes, dim=-2):
             return self.draw(SceneGraph(self.grammar, derive(self.grammar, structure, num_scenes, self.max_steps)))
 
@@ -112,20 +112,22 @@ class SceneModel:
         target: ``target(seed)``, the synthetic experiment: a model with another structure policy and another layout.
         renderer: ``renderer(canvas, threads)`` makes the ``Renderer`` of what the program returns; ``threads`` is a
             number, or None for one for every core. Sprites and meshes are drawn with the built-in ones where None.
+        generator: what draws instead of a renderer where the program returns ``scene.request(...)``: a function
+            ``render(scene)``, or a ``Command`` that calls ``serve`` (probscene.worker says what both are given).
         assets_variable: the environment variable that names the folder for ``with_assets`` where no ``--assets`` does;
             it is read when a model is loaded.
 
     Raises:
         ModelError: no ``Grammar``, classes or stuff that are a string, a class that the grammar has no object of,
             groups of no class or of the only one, stuff that is no class or all classes, a canvas that is not two
-            positive whole numbers, a ``max_steps`` that is not one, a renderer that cannot be called, a variable of a
-            model without ``with_assets``.
+            positive whole numbers, a ``max_steps`` that is not one, a renderer or generator that cannot be called, a
+            variable of a model without ``with_assets``.
     """
 
     name: str
     grammar: Grammar
     prior: Policy
-    program: Callable[..., Drawing | World]
+    program: Callable[..., Renderable]
     canvas: tuple[int, int]
     max_steps: int
     classes: tuple[str, ...]
@@ -139,6 +141,7 @@ class SceneModel:
     scenarios: tuple[tuple[str, "SceneModel"], ...] = ()
     renderer: Callable[[tuple[int, int], int | None], Renderer] | None = None
     assets_variable: str = ""
+    generator: Callable[[Any], Any] | Command | None = None
 
     def __post_init__(self):
         if not isinstance(self.grammar, Grammar):
@@ -182,6 +185,11 @@ class SceneModel:
                 f"Expected the renderer of model {self.name!r} as a class or function that is called with the canvas "
                 f"and a number of threads, actual {type(self.renderer).__name__}; give the class, not an instance."
             )
+        if self.generator is not None and not isinstance(self.generator, Command) and not callable(self.generator):
+            raise ModelError(
+                f"Expected the generator of model {self.name!r} as a function of a scene or a Command, actual "
+                f"{type(self.generator).__name__}; write Command([...]) around the words of a command line."
+            )
         if self.assets_variable and self.with_assets is None:
             raise ModelError(
                 f"Expected with_assets in model {self.name!r}, whose assets {self.assets_variable} names, actual none."
@@ -200,7 +208,7 @@ class SceneModel:
         """What its prior or its policy of pretraining may derive; None where one of them is no ``StructurePrior``."""
         return Support.of(self.grammar, (self.prior, self.pretraining_policy))
 
-    def __call__(self, num_scenes: int, structure: Policy | None = None) -> Drawing | World:
+    def __call__(self, num_scenes: int, structure: Policy | None = None) -> Renderable:
         """Run the program; under the prior where no structure policy is given."""
         return self.program(num_scenes, self.prior if structure is None else structure)
 
@@ -214,7 +222,7 @@ def scene_model(
     classes: Sequence[str],
     name: str | None = None,
     **fields: Any,
-) -> Callable[[Callable[[SceneGraph], Drawing | World]], SceneModel]:
+) -> Callable[[Callable[[SceneGraph], Renderable]], SceneModel]:
     """Decorator that makes a ``SceneModel`` of a function of a scene graph.
 
     The function samples parameters at Pyro sites on the nodes and returns ``scene.draw(...)`` or ``scene.build(...)``;
@@ -252,7 +260,7 @@ def scene_model(
         raise ModelError(f"Expected fields of a SceneModel in scene_model(...), actual {', '.join(unknown)}.")
     kinds = (classes,) if isinstance(classes, str) else tuple(classes) if isinstance(classes, Iterable) else classes
 
-    def decorated(draw: Callable[[SceneGraph], Drawing | World]) -> SceneModel:
+    def decorated(draw: Callable[[SceneGraph], Renderable]) -> SceneModel:
         called = getattr(draw, "__name__", "") if name is None else name
         if not _takes_one(draw) or not called:
             raise ModelError(

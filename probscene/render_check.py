@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from .batch import RenderBatch, Renderer, Space
-from .drawing import Drawing
 from .errors import ModelError
-from .world import World
+from .request import Renderable
 
 
 def call_name(renderer: Renderer) -> str:
@@ -17,7 +16,7 @@ def call_name(renderer: Renderer) -> str:
     return getattr(renderer, "__qualname__", f"{type(renderer).__qualname__}.__call__")
 
 
-def check_renderer(renderer: Renderer, drawing: Drawing | World, canvas: tuple[int, int], batch: RenderBatch) -> None:
+def check_renderer(renderer: Renderer, drawing: Renderable, canvas: tuple[int, int], batch: RenderBatch) -> None:
     """See that a batch is what ``Renderer`` promises, and that its first scene, rendered again alone, is the same.
 
     Args:
@@ -43,14 +42,15 @@ def check_renderer(renderer: Renderer, drawing: Drawing | World, canvas: tuple[i
 
 
 def _pairs(batch: RenderBatch, again: RenderBatch) -> list[tuple[str, Tensor, Tensor]]:
-    pairs = [(key, getattr(batch, key), getattr(again, key)) for key in batch._fields if key != "space"]
+    each = [(key, getattr(batch, key), getattr(again, key)) for key in batch._fields]
+    pairs = [(key, one, other) for key, one, other in each if isinstance(one, Tensor) and isinstance(other, Tensor)]
     if batch.space is not None and again.space is not None:
         parts = [key for key in Space._fields if key != "names"]
         pairs += [(f"space.{key}", getattr(batch.space, key), getattr(again.space, key)) for key in parts]
     return pairs
 
 
-def _check_batch(name: str, batch: RenderBatch, drawing: Drawing | World, canvas: tuple[int, int]) -> None:
+def _check_batch(name: str, batch: RenderBatch, drawing: Renderable, canvas: tuple[int, int]) -> None:
     if not isinstance(batch, RenderBatch):
         raise ModelError(
             f"Expected {name} to return a RenderBatch (probscene.batch), actual {type(batch).__name__}; it has the "

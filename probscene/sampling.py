@@ -17,12 +17,11 @@ from torch.nn.functional import pad
 
 from .derivation import Derivation
 from .derive import Given, derive_complete
-from .drawing import Drawing
 from .errors import ModelError
 from .model import SceneModel
 from .policy import Policy
 from .program_errors import remedy, told, useful_text
-from .world import World
+from .request import Renderable
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class Scenes:
     parameters: dict[str, Tensor]
     site_mask: dict[str, Tensor]
     log_prob: Tensor
-    drawing: Drawing | World
+    drawing: Renderable
     failures: Tensor
 
 
@@ -59,7 +58,7 @@ def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
 
 
 def run_program(
-    model: SceneModel | Callable[[int], Drawing | World],
+    model: SceneModel | Callable[[int], Renderable],
     derivation: Derivation,
     parameters: dict[str, Tensor] | None = None,
     failures: Tensor | None = None,
@@ -90,7 +89,7 @@ def run_program(
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"].get("value")
-    if not isinstance(drawing, Drawing | World) or len(drawing) != N:
+    if not isinstance(drawing, Renderable) or len(drawing) != N:
         raise ModelError(
             f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
             f"or scene.build(...)), actual {type(drawing).__name__}."
@@ -131,7 +130,7 @@ def _site_log_prob(name: str, key: str, site: dict[str, Any]) -> Tensor:
         ) from error
 
 
-def check_nodes(name: str, drawing: Drawing | World, derivation: Derivation) -> None:
+def check_nodes(name: str, drawing: Renderable, derivation: Derivation) -> None:
     """See that the program of model ``name`` drew the nodes that were derived.
 
     Raises:

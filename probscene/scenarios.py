@@ -19,16 +19,15 @@ from torch import BoolTensor, Tensor
 
 from .derivation import Derivation, Frontier, expand
 from .derive import Given, derive
-from .drawing import Drawing
 from .enumeration import shortest_lengths
 from .errors import ModelError
 from .grammar import Grammar, Node, Rule, is_nonterminal
 from .joining import join_drawings
 from .model import SceneModel
 from .policy import Policy
+from .request import Renderable
 from .sampling import check_nodes
 from .structure import StructurePrior
-from .world import World
 
 START = "Scenario"
 
@@ -178,12 +177,12 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         models: by scenario.
 
     Raises:
-        ModelError: no models, or models that differ in canvas, channels or renderer.
+        ModelError: no models, or models that differ in canvas, channels, renderer or generator.
     """
     if not models:
         raise ModelError("Expected at least one scenario, actual none.")
     each = list(models.values())
-    for what in ("canvas", "channels", "renderer"):
+    for what in ("canvas", "channels", "renderer", "generator"):
         found = {key: getattr(model, what) for key, model in models.items()}
         if len(set(found.values())) > 1:
             raise ModelError(f"Expected scenarios of one {what}, actual {found}.")
@@ -224,6 +223,7 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         target=target if all(targets) else None,
         scenarios=tuple(models.items()),
         renderer=each[0].renderer,
+        generator=each[0].generator,
         assets_variable=variables.pop() if len(variables) == 1 else "",
     )
 
@@ -237,9 +237,7 @@ def mixture(grammar: JointGrammar, policies: list[Policy], weights: list[float] 
     return Mixture(grammar, policies, weights)
 
 
-def _program(
-    grammar: JointGrammar, models: dict[str, SceneModel], num_scenes: int, structure: Policy
-) -> Drawing | World:
+def _program(grammar: JointGrammar, models: dict[str, SceneModel], num_scenes: int, structure: Policy) -> Renderable:
     max_steps = 1 + max(model.max_steps for model in models.values())
     with pyro.plate("scenes", num_scenes, dim=-2):
         derivation = derive(grammar, structure, num_scenes, max_steps)
@@ -253,7 +251,7 @@ def _program(
         counted = cast(BoolTensor, own.unsqueeze(1))
         with Within(name), poutine.mask(mask=counted), poutine.block(hide=list(sites)), known:
             drawing = poutine.condition(model, data=sites)(num_scenes)
-        if isinstance(drawing, Drawing | World):
+        if isinstance(drawing, Renderable):
             check_nodes(model.name, drawing, part)
         drawn.append((own, drawing))
     return join_drawings(derivation.kind, grammar.kinds, drawn)

@@ -3,10 +3,10 @@
 Axis letters: N scenes, M nodes.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import pyro
 import torch
@@ -18,6 +18,7 @@ from .drawing import Drawing, Layer, Sprites, resolve
 from .errors import ModelError
 from .grammar import Grammar
 from .photo import Look, Photo, sample_photo
+from .request import Objects, Request, resolve_values, sample_seed
 from .world import Camera, Ground, Light, Meshes, MeshLayer, World, resolve_ground, resolve_meshes, resolve_scene
 
 Given = TypeVar("Given", Sprites, Meshes)
@@ -112,6 +113,26 @@ class SceneGraph:
         """
         photo = None if photo is None else resolve_scene(photo, len(self.kind))
         return Drawing(self.kind, self.grammar.kinds, self._resolved(layers, resolve), background, photo)
+
+    def request(self, *objects: Objects, scene: Mapping[str, Any] | None = None, photo: Photo | None = None) -> Request:
+        """What the model's generator is to draw (``SceneModel.generator``), with a seed for each scene, the site
+        ``request.seed``.
+
+        Call it outside ``nodes(...)``.
+
+        Args:
+            scene: values of the scene by name: numbers, or tensors ``(N, 1)``, or ``(N, 1, k)`` for lists of k numbers.
+
+        Raises:
+            ModelError: values of a wrong shape or not finite; it is called inside ``nodes(...)``.
+        """
+        N, found = len(self.kind), []
+        for each in objects:
+            kinds = (each.kinds,) if isinstance(each.kinds, str) else each.kinds
+            found.append(resolve_values(f"Objects({each.kinds!r})", each.values, self.mask(*kinds)))
+        of_scene = resolve_values("the scene", scene or {}, torch.ones(N, 1, dtype=torch.bool))
+        look = None if photo is None else resolve_scene(photo, N)
+        return Request(self.kind, self.grammar.kinds, self.parent, sample_seed(N), tuple(found), (of_scene,), look)
 
     def photo(
         self,

@@ -15,12 +15,14 @@ With four samples a pixel its colour is the mean of what they see; labels and de
 bytes as with one.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from probscene.batch import RenderBatch, Space
-from probscene.drawing import Drawing
 from probscene.errors import ModelError
+from probscene.request import Renderable
 from probscene.world import World
 
 from . import engine
@@ -64,7 +66,7 @@ class MeshRenderer:
         self._atlas, self._finish = MeshAtlas(), PhotoFinish(self.canvas, self.threads)
         self._scratch: dict[str, np.ndarray] = {}
 
-    def __call__(self, drawing: Drawing | World) -> RenderBatch:
+    def __call__(self, drawing: Renderable) -> RenderBatch:
         """Render every scene of a world.
 
         Where several labelled layers draw a node, its labels are those of all of them together; its 3D box is turned
@@ -168,7 +170,7 @@ def _words(flat: np.ndarray) -> np.ndarray:
     return flat[: flat.nbytes // 8 * 8 // flat.itemsize].view(np.uint64)
 
 
-def _labels(result: np.ndarray, extent: np.ndarray, canvas: tuple[int, int]) -> dict[str, torch.Tensor]:
+def _labels(result: np.ndarray, extent: np.ndarray, canvas: tuple[int, int]) -> dict[str, Any]:
     seen, whole = result[..., tables.PIXELS], result[..., tables.WHOLE]
     box = np.where(seen[..., None] > 0, result[..., tables.BOX : tables.BOX + 4], 0)
     amodal = np.where(extent[..., :1] <= extent[..., 2:3], extent, 0)

@@ -15,7 +15,7 @@ import torch
 from probscene.batch import RenderBatch
 from probscene.drawing import Drawing
 from probscene.errors import ModelError
-from probscene.world import World
+from probscene.request import Renderable
 
 from . import engine
 from .photo import PhotoFinish
@@ -45,7 +45,7 @@ class SpriteRenderer:
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
         self._sheet, self._finish = Sheet(), PhotoFinish(self.canvas, self.threads)
 
-    def __call__(self, drawing: Drawing | World) -> RenderBatch:
+    def __call__(self, drawing: Renderable) -> RenderBatch:
         """Render every scene of a drawing.
 
         Where several labelled layers draw a node, its silhouette's pixels are the sum over these layers.

@@ -137,12 +137,14 @@ class Features(Protocol):
         name: in records and messages; another name is another choice.
         resolution: features that differ by less count as equal in the verdict, such as 0.5 of a count.
         pretrained: whether the network has learnt from photographs; a verdict then does not advise to take such a one.
+        images: how many renders its training draws, at most, for a forecast of how long a fit takes.
         takes_labels: whether ``adapt`` makes use of ``Photographs.labelled``; with others ``fit --labels`` is an error.
     """
 
     name: str
     resolution: float = 0.0
     pretrained: bool = False
+    images: int = 0
     takes_labels: bool = False
 
     def build(self, model: SceneModel) -> FeatureNet:

@@ -45,6 +45,11 @@ class ProjectedFeatures(Features):
         name, file = network_name(self.network), self.network.partition("=")[2]
         return f"{name}={Path(file).resolve()}" if file else name
 
+    @property
+    def images(self) -> int:
+        """See ``Features``."""
+        return 2 * self.pairs if self.directions else 0
+
     def build(self, model: SceneModel) -> Projected:
         """The network with an empty projection, or none."""
         from .pretrained import pretrained, weights_file  # torchvision takes seconds to import

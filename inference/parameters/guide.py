@@ -20,10 +20,9 @@ from pyro.distributions import TorchDistribution
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
-from probscene.drawing import Drawing
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.world import World
+from probscene.request import Renderable
 
 from .graph import Graph, Seen
 from .net import ParameterNet
@@ -54,7 +53,7 @@ class ParameterGuide(nn.Module):
         kinds = len(model.grammar.kinds)
         self.net = ParameterNet(kinds, len(self.node_sites), len(self.scene_sites), hidden, before)
 
-    def forward(self, num_scenes: int) -> Drawing | World:
+    def forward(self, num_scenes: int) -> Renderable:
         """The Pyro program: the sites ``rule_t`` and the model's own."""
         pyro.module("parameters", self.net)
         if isinstance(self.structure, nn.Module):
@@ -65,7 +64,7 @@ class ParameterGuide(nn.Module):
         """The model with learnt parameters."""
         return replace(model, program=self.program)
 
-    def program(self, num_scenes: int, structure: Policy) -> Drawing | World:
+    def program(self, num_scenes: int, structure: Policy) -> Renderable:
         """The model's program with learnt parameters, as ``SceneModel.program`` is called."""
         with Learnt(self):
             return self.model.program(num_scenes, structure)

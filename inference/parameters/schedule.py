@@ -37,3 +37,10 @@ class ParameterSchedule:
     rate: float = 5e-3
     energy_rate: float = 2e-3
     sure: bool = False
+
+    @property
+    def drawn(self) -> int:
+        """About how many renders are drawn in all."""
+        steps = self.reader_steps + self.rounds * self.round_reader_steps
+        of_scenes = self.scene_renders + self.rounds * self.round_scene_renders
+        return steps * self.reader_images + of_scenes + self.energy_steps * self.energy_scenes

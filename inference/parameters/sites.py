@@ -17,15 +17,14 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 from torch.nn.functional import pad
 
-from probscene.drawing import Drawing
 from probscene.grammar import Grammar
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.reach import Reach
+from probscene.request import Renderable
 from probscene.sampling import Scenes, run_program, sample
 from probscene.scenarios import JointGrammar
 from probscene.support import Support
-from probscene.world import World
 
 DRAWN = 200  # scenes of which a model's sites are found
 ENOUGH, POINT_MASS = 50, 0.05  # values of a site, and the share of them that are one, that show a point mass
@@ -246,7 +245,7 @@ def having(grammar: Grammar, sites: tuple[Site, ...], kind: Tensor) -> Tensor:
 def within(model: SceneModel, *handlers: Messenger) -> SceneModel:
     """The model, its program run inside handlers, the first one outermost; ``run_program`` hides it from others."""
 
-    def program(num_scenes: int, structure: Policy) -> Drawing | World:
+    def program(num_scenes: int, structure: Policy) -> Renderable:
         with ExitStack() as stack:
             for handler in handlers:
                 stack.enter_context(handler)

@@ -14,12 +14,14 @@ from pathlib import Path
 import torch
 
 from probscene.batch import RenderBatch, Renderer
-from probscene.drawing import Drawing
 from probscene.errors import ModelError, ProbsceneError
+from probscene.generator import Command
 from probscene.model import SceneModel
 from probscene.render_check import check_renderer
+from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.meshes import MeshRenderer
 from probscene.renderers.sprites import SpriteRenderer
+from probscene.request import Renderable, Request
 from probscene.scenarios import join
 from probscene.world import World
 
@@ -68,6 +70,16 @@ def _with_environment(model: SceneModel) -> SceneModel:
     return replace(drawn, assets=f"{drawn.assets} ({model.assets_variable})")
 
 
+def drawn_with(model: SceneModel) -> str:
+    """What a model draws with beside its own code, in words: its assets, and what its generator's command is made of.
+
+    Raises:
+        DataError: a file of the generator's cannot be read.
+    """
+    made = model.generator.fingerprint() if isinstance(model.generator, Command) else ""
+    return "; ".join(filter(None, (model.assets, made)))
+
+
 def same_assets(one: str, other: str) -> bool:
     """Whether two models draw with the same assets, by their words; ``--assets`` and an environment variable that name
     one folder give the same."""
@@ -107,7 +119,12 @@ class _AnyRenderer:
     def __init__(self, canvas: tuple[int, int], threads: int | None):
         self._options = canvas, threads
 
-    def __call__(self, drawing: Drawing | World) -> RenderBatch:
+    def __call__(self, drawing: Renderable) -> RenderBatch:
+        if isinstance(drawing, Request):
+            raise ModelError(
+                "Expected a generator of a model whose program returns scene.request(...), actual none; name what "
+                "draws its scenes: scene_model(..., generator=Command([...]))."
+            )
         return (self._meshes if isinstance(drawing, World) else self._sprites)(drawing)
 
     @cached_property
@@ -125,7 +142,7 @@ class _OwnRenderer:
     def __init__(self, renderer: Renderer, canvas: tuple[int, int]):
         self._renderer, self._canvas, self._checked = renderer, canvas, False
 
-    def __call__(self, drawing: Drawing | World) -> RenderBatch:
+    def __call__(self, drawing: Renderable) -> RenderBatch:
         batch = self._renderer(drawing)
         if not self._checked and len(drawing):
             check_renderer(self._renderer, drawing, self._canvas, batch)
@@ -134,12 +151,14 @@ class _OwnRenderer:
 
 
 def renderer_for(model: SceneModel, threads: int | None = None) -> Renderer:
-    """The model's own renderer, or the built-in one that reads what the model returns; one thread for every core where
-    no number is given.
+    """The model's generator, or its own renderer, or the built-in one that reads what the model returns; one thread for
+    every core where no number is given.
 
     Raises:
         ModelError: the model's own is none; when it is called, see ``check_renderer``.
     """
+    if model.generator is not None:
+        return GeneratedRenderer(model.generator, model.canvas, threads)
     if model.renderer is None:
         return _AnyRenderer(model.canvas, threads)
     renderer = model.renderer(model.canvas, threads)

@@ -8,8 +8,8 @@ import pyro.distributions as dist
 import pytest
 import torch
 
+from probscene.app.checking.model_check import check_model
 from probscene.app.loading import load_model
-from probscene.app.model_check import check_model
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.model import Groups, scene_model

@@ -30,6 +30,11 @@ class CountFeatures(Features):
     name = "count"
     resolution = 0.5  # of a count
 
+    @property
+    def images(self) -> int:
+        """See ``Features``; fewer of a canvas above 128 x 128 pixels."""
+        return self.schedule.steps * self.schedule.images
+
     def build(self, model: SceneModel) -> CountNet:
         """Untrained."""
         return CountNet(model.classes, model.channels, model.canvas, self.width, self.blocks, model.groups)

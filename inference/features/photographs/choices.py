@@ -37,6 +37,11 @@ class PretrainedCountFeatures(Features):
     pretrained = True
     takes_labels = True
 
+    @property
+    def images(self) -> int:
+        """See ``Features``."""
+        return 2 * self.pairs
+
     def build(self, model: SceneModel) -> FeatureNet:
         """Pretrained, with untrained heads."""
         from .heads import PretrainedCountNet  # torchvision takes seconds to import

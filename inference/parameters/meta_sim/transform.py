@@ -15,10 +15,9 @@ import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
-from probscene.drawing import Drawing
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.world import World
+from probscene.request import Renderable
 
 from ..graph import Graph, Seen
 from ..sites import NEAR, Site, of_scenes
@@ -53,7 +52,7 @@ class ParameterTransform(nn.Module):
         self.scene_sites = tuple(site for site in sites if site.of_scene)
         self.net = GraphNetwork(len(model.grammar.kinds), tuple(site.of_scene for site in sites), hidden, rounds)
 
-    def forward(self, num_scenes: int) -> Drawing | World:
+    def forward(self, num_scenes: int) -> Renderable:
         """The Pyro program: the sites ``rule_t`` and the model's own."""
         pyro.module("parameters", self.net)
         return self.program(num_scenes, self.structure)
@@ -62,7 +61,7 @@ class ParameterTransform(nn.Module):
         """The model with moved parameters."""
         return replace(model, program=self.program)
 
-    def program(self, num_scenes: int, structure: Policy) -> Drawing | World:
+    def program(self, num_scenes: int, structure: Policy) -> Renderable:
         """The model's program with moved parameters, as ``SceneModel.program`` is called."""
         with Moved(self):
             return self.model.program(num_scenes, structure)

@@ -13,13 +13,23 @@ from .options import Assets, Model, Seed
 
 
 @app.command()
-def check(model: Model, assets: Assets = None) -> None:
+def check(
+    model: Model,
+    assets: Assets = None,
+    render: Annotated[bool, typer.Option("--render", help="Also see whether its generator can be relied on.")] = False,
+) -> None:
     """Say whether a model's grammar is sound and its program runs, what can be seen of it, and what to mend."""
+    from ..checking.generator_check import check_generator
+    from ..checking.model_check import check_model
     from ..loading import load_model
-    from ..model_check import check_model
 
-    report = check_model(load_model(model, assets))
+    report = check_model(loaded := load_model(model, assets))
     print(report)
+    if render and not report.faults:
+        found = check_generator(loaded)
+        print(found)
+        if found.fault:
+            raise ModelError(found.fault)
     if report.faults:
         raise ModelError(f"Expected a model without faults, actual {model} with {len(report.faults)}; mend them first.")
 

@@ -3,7 +3,8 @@
 Beyond the format's own keys an annotation has ``visible_fraction``, visible pixels over those of the whole silhouette,
 and ``amodal_bbox``, the box of the whole silhouette, which others may cover and the canvas may cut. Of a 3D scene it
 also has ``truncated``, the share of that box beyond the canvas, and ``box_3d``: height, width, length, x, y, z and
-rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within the canvas.
+rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within the canvas. What a renderer does not
+know is left out, see ``RenderBatch.unknown``.
 """
 
 import json
@@ -40,8 +41,16 @@ def check_min_visible(min_visible: float) -> None:
 def labelled(model: SceneModel, batch: RenderBatch, min_visible: float = 0.0) -> Tensor:
     """The category ids ``(N, M)`` int64 of the nodes that are labelled in every format: those of a class that have a
     visible pixel, and of which at least the fraction ``min_visible`` is visible; 0 at the others.
+
+    Raises:
+        ProbsceneError: a ``min_visible`` where the renderer does not know what is visible.
     """
     category = torch.tensor([_category(model, name) for name in model.grammar.kinds])
+    if min_visible and "visible" in batch.unknown:
+        raise ProbsceneError(
+            f"Expected no min_visible with model {model.name!r}, whose generator does not say which share of an object "
+            f"is visible, actual {min_visible:g}; leave it out."
+        )
     shown = (batch.kind >= 0) & (batch.pixels > 0) & (batch.visible >= min_visible)
     return torch.where(shown, category[batch.kind.clamp(min=0)], 0)
 
@@ -65,8 +74,7 @@ def annotations(model: SceneModel, batch: RenderBatch, first: int, min_visible: 
                     "segmentation": mask,
                     "area": int(batch.pixels[i, node]),
                     "iscrowd": 0,
-                    "visible_fraction": round(float(batch.visible[i, node]), 6),
-                    "amodal_bbox": _corner_and_size(batch.amodal_box[i, node]),
+                    **_whole(batch, i, node),
                     **_in_space(batch, i, node),
                 }
             )
@@ -108,6 +116,16 @@ def _masks(instance: Tensor, nodes: Tensor) -> list[dict[str, Any]]:
     masks = columns == (nodes + 1).view(-1, 1, 1).to(columns.dtype)
     encoded = cast(list[dict[str, Any]], rle.encode(masks.numpy().view("uint8").transpose(2, 1, 0)))
     return [{"size": mask["size"], "counts": mask["counts"].decode("ascii")} for mask in encoded]
+
+
+def _whole(batch: RenderBatch, i: int, node: int) -> dict[str, Any]:
+    """What an annotation says of the whole silhouette, where that is known."""
+    found: dict[str, Any] = {}
+    if "visible" not in batch.unknown:
+        found["visible_fraction"] = round(float(batch.visible[i, node]), 6)
+    if "amodal_box" not in batch.unknown:
+        found["amodal_bbox"] = _corner_and_size(batch.amodal_box[i, node])
+    return found
 
 
 def _in_space(batch: RenderBatch, i: int, node: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ Of 2D scenes, what KITTI measures in the world (alpha, dimensions, location, rot
 unknown: -10, -1, -1000, -10. Boxes are left, top, right, bottom of what is visible, in pixels from the canvas's corner,
 ends exclusive. ``occluded`` goes by the visible fraction over the share within the canvas: 0 from 0.9 on, 1 from 0.5
 on, 2 below. Where the canvas cuts an object, that share is its box's, not its silhouette's: what only the canvas cuts
-may come out as 1, seldom as 2.
+may come out as 1, seldom as 2. Where a generator does not tell them, ``truncated`` is -1 and ``occluded`` 3, unknown.
 
 Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``labelling.kitti.TYPES``)
 is written as that type. The 2D box is the whole silhouette's, what others cover included, within the image: KITTI's own
@@ -42,6 +42,7 @@ from ..labelling.kitti import TYPES
 from .coco import labelled
 
 MOST = 255  # classes, and instances of a class: 8 bits each
+_UNSEEN = 3  # level of occlusion that is unknown
 _UNKNOWN = "-1 -1 -1 -1000 -1000 -1000 -10"
 _TYPE = {name: type for type, names in reversed(TYPES.items()) for name in names}
 _VELO_TO_CAM = [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]
@@ -119,10 +120,14 @@ def instances(model: SceneModel, batch: RenderBatch, first: int, min_visible: fl
 
 def _in_plane(name: str, annotation: dict[str, Any], canvas: tuple[int, int]) -> str:
     """The line of an object of a 2D scene."""
-    within = _share_within(annotation["amodal_bbox"], canvas)
-    level = _occluded(annotation["visible_fraction"] / within)
+    truncated, level = "-1", _UNSEEN
+    if "amodal_bbox" in annotation:
+        within = _share_within(annotation["amodal_bbox"], canvas)
+        truncated = f"{1 - within:.2f}"
+        if "visible_fraction" in annotation:
+            level = _occluded(annotation["visible_fraction"] / within)
     x, y, w, h = annotation["bbox"]
-    return f"{name} {1 - within:.2f} {level} -10 {x:.2f} {y:.2f} {x + w:.2f} {y + h:.2f} {_UNKNOWN}\n"
+    return f"{name} {truncated} {level} -10 {x:.2f} {y:.2f} {x + w:.2f} {y + h:.2f} {_UNKNOWN}\n"
 
 
 def _in_space(name: str, annotation: dict[str, Any], canvas: tuple[int, int]) -> str:

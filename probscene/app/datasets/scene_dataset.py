@@ -47,7 +47,7 @@ class SceneDataset(IterableDataset):
     what is visible; ``area`` ``(n,)`` float32, its pixels; ``iscrowd`` ``(n,)`` int64 zeros; ``amodal_boxes``
     ``(n, 4)`` float32, boxes of the whole silhouettes, which others may cover and the canvas may cut; ``visible``
     ``(n,)`` float32, the visible fraction, see ``RenderBatch``; ``image_id``, an int. An image may have no object:
-    n = 0.
+    n = 0. What a generator does not tell of whole silhouettes is not in the target.
 
     Worker processes start Taichi themselves: give the loader ``multiprocessing_context="spawn"``. Several ranks of a
     distributed training take seeds of their own.
@@ -169,10 +169,11 @@ class SceneDataset(IterableDataset):
                 "masks": (instance == (nodes + 1).view(-1, 1, 1).to(instance.dtype)).to(torch.uint8),
                 "area": batch.pixels[i, nodes].float(),
                 "iscrowd": torch.zeros(len(nodes), dtype=torch.int64),
-                "amodal_boxes": batch.amodal_box[i, nodes].float(),
-                "visible": batch.visible[i, nodes],
                 "image_id": first + i,
             }
+            whole = {"amodal_boxes": batch.amodal_box[i, nodes].float(), "visible": batch.visible[i, nodes]}
+            unknown = {"amodal_boxes": "amodal_box"}
+            target |= {key: value for key, value in whole.items() if unknown.get(key, key) not in batch.unknown}
             yield image.expand(3, -1, -1).to(torch.float32, memory_format=torch.contiguous_format).div(255), target
 
     def _open(self) -> tuple[SceneModel, Policy]:

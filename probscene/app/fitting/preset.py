@@ -211,6 +211,15 @@ class Preset:
             return replace(self, guide=kind, pretrain_rate=5e-3, hidden=100, num_latents=32)
         return replace(self, guide=kind)
 
+    @property
+    def images(self) -> int:
+        """About how many images a fit has drawn, at most: for its features, its batches and its parameters."""
+        structure = self.batches * self.num_scenes * self.draws_per_structure
+        if self.learn != BOTH:
+            return self.make_features().images + structure
+        again = self.batches_again * self.num_scenes
+        return self.make_features().images + structure + self.parameters.drawn + again
+
     def unread(self) -> dict[str, str]:
         """Settings that the chosen guide or objective does not read, and why."""
         guide, found = set(self.guide_settings()), {}

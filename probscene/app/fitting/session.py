@@ -20,10 +20,11 @@ from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 from probscene.threads import cores
 
+from ..checking.generator_check import cost
+from ..checking.model_check import QUICK, check_model
 from ..files import write_json
 from ..labelling.few import FewLabels, labels_record, read_few
 from ..loading import lasting_reference, load_model
-from ..model_check import QUICK, check_model
 from ..modules import file_digest
 from ..progress import Display
 from .fit import check_target, fit, open_target
@@ -49,8 +50,7 @@ def checked_model(model: str | SceneModel, assets: Path | None = None) -> SceneM
         ModelError: it does not load, or ``check_model`` finds faults.
     """
     loaded = model if isinstance(model, SceneModel) else load_model(model, assets)
-    faults = check_model(loaded, *QUICK).faults
-    if faults:
+    if faults := check_model(loaded, *QUICK).faults:
         name = loaded.name if isinstance(model, SceneModel) else model
         raise ModelError(f"Expected a model without faults, actual {name}: {' '.join(faults)}")
     return loaded
@@ -94,6 +94,8 @@ def begin(
     check_target(images)
     if photographs is not None:
         preset = _suited(preset, photographs, loaded, images, labels is not None, show)
+    if told := cost(loaded, preset):
+        show.say(told)
     files = {part_file(word) for word in (preset.features, preset.objective, preset.guide) if is_file_part(word)}
     record = {
         "version": probscene.__version__,

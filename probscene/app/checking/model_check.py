@@ -19,8 +19,8 @@ from probscene.model import SceneModel
 from probscene.program_errors import told
 from probscene.sampling import Scenes, run_program, sample
 
-from .chunks import chunk_randomness
-from .loading import renderer_for
+from ..chunks import chunk_randomness
+from ..loading import renderer_for
 from .watch import Watch, longer, lookups, shorter, watched
 
 SCENES, RENDERED = 256, 32  # how many scenes the program is run on, and how many of them are rendered

@@ -1,0 +1,1 @@
+"""What running a model shows: faults, what can be seen, and whether its generator can be relied on."""

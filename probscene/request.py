@@ -1,0 +1,171 @@
+"""Scenes that somebody else draws: what a model's program asks of its generator, beside ``Drawing`` and ``World``.
+
+Axis letters: N scenes, M nodes.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from .drawing import Drawing, of_scenes
+from .errors import ModelError
+from .photo import Photo
+from .world import World
+
+SEED, SEEDS = "request.seed", 1 << 31
+
+
+class Objects:
+    """Values of every node of the named kinds, for ``scene.request``.
+
+    Args:
+        kinds: the kinds of node, a name or several.
+        values: by the name under which a generator finds them: numbers, or tensors that broadcast to ``(N, M)``, or to
+            ``(N, M, k)`` for lists of k numbers. Of nodes of other kinds they are not looked at.
+    """
+
+    def __init__(self, kinds: str | tuple[str, ...], /, **values: Any):
+        self.kinds, self.values = kinds, values
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Named values, resolved on a batch of scenes.
+
+    Attributes:
+        present: ``(N, M)`` bool, which nodes have them; ``(N, 1)`` for those of scenes.
+        values: each ``(N, M)`` or ``(N, M, k)``; ``(N, 1)`` or ``(N, 1, k)`` of scenes.
+    """
+
+    present: Tensor
+    values: dict[str, Tensor]
+
+    def of(self, scenes: slice) -> "Values":
+        """Those of some of the scenes."""
+        return Values(self.present[scenes], {key: value[scenes] for key, value in self.values.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """A batch of scenes for a generator; ``scene.request`` makes it.
+
+    Attributes:
+        kind: ``(N, M)`` int64, index into ``kinds``; -1 pads.
+        kinds: the grammar's object names.
+        parent: ``(N, M)`` int64 node index, -1 for none.
+        seed: ``(N,)`` int64, 0 to 2**31 - 1.
+        objects: values of nodes.
+        scene: values of scenes.
+        photo: what a camera makes of the images, every value ``(N,)``; nothing where None.
+    """
+
+    kind: Tensor
+    kinds: tuple[str, ...]
+    parent: Tensor
+    seed: Tensor
+    objects: tuple[Values, ...]
+    scene: tuple[Values, ...]
+    photo: Photo | None = None
+
+    def __len__(self) -> int:
+        return self.kind.shape[0]
+
+    def __getitem__(self, scenes: slice) -> "Request":
+        """The same request of some of the scenes."""
+        return replace(
+            self,
+            kind=self.kind[scenes],
+            parent=self.parent[scenes],
+            seed=self.seed[scenes],
+            objects=tuple(some.of(scenes) for some in self.objects),
+            scene=tuple(some.of(scenes) for some in self.scene),
+            photo=of_scenes(self.photo, scenes),
+        )
+
+    def records(self, canvas: tuple[int, int]) -> list[dict[str, Any]]:
+        """Each scene as it goes to a generator, see ``scene_of`` in probscene.worker."""
+        objects, scene = [_rows(some) for some in self.objects], [_rows(some) for some in self.scene]
+        found = []
+        for i, (kinds, parents) in enumerate(zip(self.kind.tolist(), self.parent.tolist(), strict=True)):
+            nodes = [
+                {
+                    "id": m + 1,
+                    "kind": self.kinds[kind],
+                    "parent": parents[m] + 1 or None,
+                    "values": _at(objects, i, m),
+                }
+                for m, kind in enumerate(kinds)
+                if kind >= 0
+            ]
+            record = {"height": canvas[0], "width": canvas[1], "seed": int(self.seed[i])}
+            found.append(record | {"values": _at(scene, i, 0), "nodes": nodes})
+        return found
+
+
+Renderable = Drawing | World | Request
+"""What a model's program returns."""
+
+
+def sample_seed(num_scenes: int) -> Tensor:
+    """``(N,)`` a seed for each scene, the site ``request.seed``, which keeps its prior.
+
+    Raises:
+        ModelError: the request is made within a plate of nodes.
+    """
+    unlearnt: Any = {"learn": False}
+    share = pyro.sample(SEED, dist.Uniform(0.0, 1.0), infer=unlearnt)
+    if tuple(share.shape) != (num_scenes, 1):
+        raise ModelError(
+            f"Expected site {SEED!r} with one value a scene, shape ({num_scenes}, 1), actual {tuple(share.shape)}; "
+            "call scene.request(...) inside the plate 'scenes' and outside scene.nodes(...)."
+        )
+    return (share.squeeze(1).double() * SEEDS).long().clamp(max=SEEDS - 1)
+
+
+def resolve_values(what: str, values: Mapping[str, Any], present: Tensor) -> Values:
+    """Broadcast values to ``present (N, M)``.
+
+    Args:
+        what: they are of, in words.
+
+    Raises:
+        ModelError: a value that is no number, does not broadcast, or is not finite where it is asked for.
+    """
+    found = {}
+    for name, given in values.items():
+        try:
+            value = torch.as_tensor(given).detach()
+        except (TypeError, ValueError, RuntimeError):
+            raise ModelError(
+                f"Expected {name} of {what} as a number or a tensor, actual {given!r}; a generator is sent the values "
+                "of sites, such as x = pyro.sample(...)."
+            ) from None
+        try:
+            value = value.expand(*present.shape, *value.shape[2:])
+        except RuntimeError:
+            raise ModelError(
+                f"Expected {name} of {what} to broadcast to (scenes, nodes) = {tuple(present.shape)}, with one more "
+                f"axis for a list of numbers, actual shape {tuple(value.shape)}."
+            ) from None
+        if value.ndim > 3 or (value.is_floating_point() and not torch.isfinite(value[present]).all()):
+            fault = f"shape {tuple(value.shape)}" if value.ndim > 3 else "NaN or infinity"
+            raise ModelError(f"Expected {name} of {what} as finite numbers or lists of them, actual {fault}.")
+        found[name] = value
+    return Values(present, found)
+
+
+def _rows(values: Values) -> tuple[list, dict[str, list]]:
+    return values.present.tolist(), {name: value.tolist() for name, value in values.values.items()}
+
+
+def _at(layers: list[tuple[list, dict[str, list]]], scene: int, node: int) -> dict[str, Any]:
+    found = {}
+    for present, values in layers:
+        if present[scene][node]:
+            found |= {name: rows[scene][node] for name, rows in values.items()}
+    return found

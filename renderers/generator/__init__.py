@@ -1,0 +1,1 @@
+"""Programs in processes of their own that draw the scenes of a model."""

@@ -1,0 +1,194 @@
+"""One process of a ``Command``: started, asked for one scene after the other, killed with all that it has started."""
+
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from probscene import worker
+from probscene.errors import GeneratorError
+from probscene.generator import Command
+
+from .reply import Fault, Picture, read
+
+TAIL, LOG = 12, 1 << 20  # lines of a log that are told; bytes after which it starts again
+MOST = 1 << 30  # bytes of an answer
+_LOOK = 0.1  # seconds between two looks at whether a process that has not called still runs
+_TOLD = 4000  # characters
+
+
+class Process:
+    """A running worker.
+
+    Args:
+        command: what runs.
+        folder: for its socket, its log and the file that it imports.
+        number: of the worker, for the names of these.
+
+    Attributes:
+        drawn: scenes so far.
+        memory: megabytes that it had in use, at most.
+
+    Raises:
+        GeneratorError: the program cannot be started, or is of another version or protocol.
+        Fault: it ended, or did not call ``serve`` in time.
+    """
+
+    def __init__(self, command: Command, folder: Path, number: int):
+        self.command, self.drawn, self.memory = command, 0, 0.0
+        self._log = log_of(folder, number)
+        address, token = folder / str(number), secrets.token_hex(16)
+        address.unlink(missing_ok=True)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listening:
+            listening.bind(str(address))
+            listening.listen(1)
+            variables = {worker.SOCKET: str(address), worker.TOKEN: token, "PROBSCENE_WORKER": str(folder)}
+            self._log.write_bytes(b"")
+            try:
+                with open(self._log, "ab") as log:  # so that it can be cut off while it is written
+                    self._process = subprocess.Popen(
+                        command.argv,
+                        stdin=subprocess.DEVNULL,
+                        stdout=log,
+                        stderr=subprocess.STDOUT,
+                        env={**os.environ, **variables},
+                        start_new_session=True,
+                    )
+            except OSError as error:
+                raise GeneratorError(
+                    f"Expected to start the generator {command.name}, actual {error.strerror} for {command.argv[0]!r}; "
+                    "mend the argv of its Command."
+                ) from error
+            try:
+                self._wire = self._called(listening)
+                self._greeted(token)
+            except BaseException:
+                self.kill()
+                raise
+
+    def draw(self, record: dict[str, Any]) -> Picture:
+        """Draw a scene.
+
+        Raises:
+            Fault: it raised an error, ended, took too long, or sent something else.
+        """
+        wire = _Timed(self._wire, self.command.timeout)
+        try:
+            worker.send(wire, record)
+            answer = worker.receive(wire, MOST)
+        except TimeoutError:
+            raise Fault(f"it had drawn nothing after {self.command.timeout:g} seconds") from None
+        except (OSError, ValueError) as error:
+            raise Fault(f"{self._ended()}{type(error).__name__}: {error}") from error
+        if answer is None:
+            raise Fault(f"{self._ended()}it hung up")
+        self.drawn += 1
+        self.memory = float(answer[0].get("memory", 0.0))
+        picture = read(record, *answer)
+        if self._log.stat().st_size > LOG:
+            os.truncate(self._log, 0)
+        return picture
+
+    @property
+    def pid(self) -> int:
+        """Of the process, and of its group."""
+        return self._process.pid
+
+    @property
+    def worn(self) -> bool:
+        """Whether it is to be replaced by a fresh one."""
+        command = self.command
+        too_many = command.restart_after is not None and self.drawn >= command.restart_after
+        return too_many or (command.memory is not None and self.memory > command.memory)
+
+    def kill(self) -> None:
+        """End it, and all that it has started in its process group."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        if hasattr(self, "_wire"):
+            self._wire.close()
+
+    def _called(self, listening: socket.socket) -> socket.socket:
+        """The connection to the process, once it has called."""
+        listening.settimeout(_LOOK)
+        end = time.monotonic() + self.command.start_timeout
+        while True:
+            try:
+                return listening.accept()[0]
+            except TimeoutError:
+                if self._process.poll() is not None:
+                    raise Fault(f"{self._ended()}it had not called serve") from None
+                if time.monotonic() > end:
+                    raise Fault(f"it had not called serve {self.command.start_timeout:g} seconds after") from None
+
+    def _greeted(self, token: str) -> None:
+        try:
+            hello = worker.receive(_Timed(self._wire, self.command.start_timeout), 1 << 16)
+        except (OSError, ValueError) as error:
+            raise GeneratorError(self._stranger(str(error))) from error
+        if hello is None:
+            raise Fault(f"{self._ended()}it hung up")
+        said = hello[0]
+        if said.get("protocol") != worker.PROTOCOL or said.get("token") != token:
+            raise GeneratorError(self._stranger(f"protocol {said.get('protocol')!r}"))
+        if self.command.version and said.get("version") != self.command.version:
+            raise GeneratorError(
+                f"Expected version {self.command.version!r} of the generator {self.command.name}, actual "
+                f"{said.get('version')!r}; start that one, or change version= of the Command and fit again."
+            )
+
+    def _stranger(self, actual: str) -> str:
+        return (
+            f"Expected the generator {self.command.name} to speak protocol {worker.PROTOCOL} of probscene, actual "
+            f"{actual}; let it import the file probscene_worker in the folder that PROBSCENE_WORKER names, not a copy."
+        )
+
+    def _ended(self) -> str:
+        """How it ended, where it has."""
+        try:
+            status = self._process.wait(0.5)
+        except subprocess.TimeoutExpired:
+            return ""
+        if status < 0:
+            return f"it was ended by {signal.Signals(-status).name}; "
+        return f"it ended with status {status}; "
+
+
+def log_of(folder: Path, number: int) -> Path:
+    """Where a worker prints."""
+    return folder / f"{number}.log"
+
+
+def tail(log: Path) -> str:
+    """The end of what a worker has printed; empty where that is nothing."""
+    try:
+        printed = log.read_bytes()[-_TOLD:]
+    except OSError:
+        return ""
+    return "\n".join(printed.decode(errors="replace").splitlines()[-TAIL:])
+
+
+class _Timed:
+    """A socket with so many seconds in all."""
+
+    def __init__(self, wire: socket.socket, seconds: float):
+        self._wire, self._end = wire, time.monotonic() + seconds
+
+    def recv(self, number: int) -> bytes:
+        return self._now().recv(number)
+
+    def sendall(self, data: bytes) -> None:
+        self._now().sendall(data)
+
+    def _now(self) -> socket.socket:
+        left = self._end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        self._wire.settimeout(left)
+        return self._wire

@@ -1,0 +1,145 @@
+"""Scenes that other processes draw: the bytes of an undisturbed run whatever happens, or one clear error."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import torch
+
+from probscene.errors import GeneratorError
+from probscene.generator import Command
+from probscene.renderers.generated import GeneratedRenderer
+from probscene.renderers.generator.pool import pool_for
+
+SCENES = 24
+
+
+def same(one, other):
+    return all(torch.equal(a, b) for a, b in zip(one[:7], other[:7], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("crash", {}), ("exit", {}), ("raise", {}), ("garbage", {}), ("noise", {}), ("hang", {"timeout": 1.5}),
+        ("leak", {"memory": 60.0}), ("", {"restart_after": 5}), ("", {"workers": 1}), ("", {"workers": 5}),
+    ],
+)  # fmt: skip
+def test_the_bytes_are_those_of_an_undisturbed_run(drawn, request_of, fault, fresh, running, command, name, settings):
+    request = request_of(SCENES)
+    assert (request.seed % 3 == 0).sum() > 3  # those are disturbed
+    undisturbed = drawn(request)
+    fresh()
+    fault(name)
+    assert same(drawn(request, **settings), undisturbed)
+    workers = pool_for(command(**settings), 2).processes()
+    assert workers or name == "leak"
+    fresh()
+    assert not any(running(group) for group in workers)
+
+
+def test_a_scene_does_not_depend_on_its_batch(drawn, request_of):
+    request = request_of(SCENES)
+    whole = drawn(request)
+    for some in (slice(0, 1), slice(7, 12)):
+        part = drawn(request[some])
+        assert torch.equal(part.image, whole.image[some]) and torch.equal(part.instance, whole.instance[some])
+
+
+def test_what_a_killed_worker_has_started_is_killed_with_it(drawn, request_of, fault, command, running):
+    fault("hang")
+    groups, request = set(), request_of(6)
+    drawing = threading.Thread(target=drawn, args=(request,), kwargs={"timeout": 2.0})
+    drawing.start()
+    while drawing.is_alive():
+        groups |= set(pool_for(command(timeout=2.0), 2).processes())
+        time.sleep(0.05)
+    left = set(pool_for(command(timeout=2.0), 2).processes())
+    assert groups - left and not any(running(group) for group in groups - left)
+
+
+def test_a_worker_that_is_killed_from_outside_is_replaced(drawn, request_of, command, fresh):
+    request = request_of(SCENES)
+    whole = drawn(request)
+    for group in pool_for(command(), 2).processes():
+        os.killpg(group, signal.SIGKILL)
+    assert same(drawn(request), whole)
+
+
+def test_workers_are_shared_and_as_many_as_are_asked_for(drawn, request_of, command):
+    drawn(request_of(SCENES))
+    first = pool_for(command(), 1).processes()
+    drawn(request_of(SCENES, seed=1))
+    assert 1 <= len(first) <= 2 and pool_for(command(), 1).processes() == first
+
+
+def test_several_threads_draw_at_once(drawn, request_of):
+    requests = [request_of(8, seed=s) for s in range(4)]
+    expected, found = [drawn(request) for request in requests], {}
+    threads = [threading.Thread(target=lambda i=i: found.update({i: drawn(requests[i])})) for i in range(4)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert all(same(found[i], expected[i]) for i in range(4))
+
+
+def test_a_scene_that_always_fails_is_named_with_what_was_raised_and_printed(drawn, request_of, fault):
+    fault("always")
+    with pytest.raises(GeneratorError, match="draw_boxes.py to draw the scene of seed") as error:
+        drawn(request_of(1), attempts=2)
+    assert all(x in str(error.value) for x in ("in 2 attempts", "never any mesh", "draw_boxes.py", "drawing", "plate"))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "said"),
+    [
+        ("gone", {"attempts": 1}, "status 1; it had not called serve\nThe end of what it printed:\nno licence"),
+        ("silent", {"attempts": 1, "start_timeout": 1.0}, "had not called serve 1 seconds after"),
+        ("hang", {"attempts": 1, "timeout": 1.0}, "had drawn nothing after 1 seconds"),
+        ("garbage", {"attempts": 1}, r"expected image as uint8 \(32, 40, 3\), actual uint8 \(1,\)"),
+        ("crash", {"attempts": 1}, "was ended by SIGABRT"),
+        ("", {"version": "2"}, "version '2' of the generator draw_boxes.py, actual ''"),
+    ],
+)
+def test_what_goes_wrong_is_said(drawn, request_of, fault, name, settings, said):
+    fault(name)
+    with pytest.raises(GeneratorError, match=said):
+        drawn(request_of(SCENES), **settings)
+
+
+def test_a_program_that_is_not_there_or_speaks_otherwise(request_of, tmp_path):
+    request = request_of(1)
+    with pytest.raises(GeneratorError, match="start the generator nowhere, actual No such file"):
+        GeneratedRenderer(Command(["/nowhere"]), (32, 40))(request)
+    stranger = tmp_path / "stranger.py"
+    stranger.write_text(
+        "import os, socket, time\nwire = socket.socket(socket.AF_UNIX)\nwire.connect(os.environ['PROBSCENE_SOCKET'])\n"
+        "wire.sendall(b'HTTP/1.1 200 OK\\r\\n\\r\\n')\ntime.sleep(60)\n"
+    )
+    with pytest.raises(GeneratorError, match="speak protocol 1"):
+        GeneratedRenderer(Command([sys.executable, str(stranger)]), (32, 40))(request)
+
+
+def test_the_processes_end_with_their_parent(command, running):
+    """Also where it is killed, and has no time to end them."""
+    code = f"""
+import os, sys
+from probscene.generator import Command
+from probscene.renderers.generator.pool import pool_for
+pool = pool_for(Command({command().argv!r}), 1)
+pool.draw([{{"height": 4, "width": 4, "seed": 1, "values": {{}}, "nodes": []}}])
+print(pool.processes()[0], flush=True)
+os.kill(os.getpid(), 9)
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    worker, end = int(told.stdout), time.monotonic() + 10
+    while time.monotonic() < end:
+        if not running(worker):
+            return
+        time.sleep(0.1)
+    pytest.fail("the worker still runs")
