@@ -1,4 +1,4 @@
-.PHONY: install demo docs tutorial test lint benchmark clean
+.PHONY: install demo docs tutorial test lint benchmark blender clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -51,6 +51,11 @@ benchmark: install
 	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[test,benchmark]'
 	@set -e; for script in $$(grep -l __main__ benchmarks/*.py); do echo "$$script"; $(BIN)/python "$$script"; done
 
+# Blender as a Python module, for examples/generators/blender; its wheels are for Python 3.11 alone.
+blender:
+	@python3.11 -m venv .blender
+	@.blender/bin/python -m pip install --quiet 'bpy==5.0.1' 'numpy<2' OpenEXR
+
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .blender build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
