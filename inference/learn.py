@@ -15,6 +15,7 @@ from probscene.sampling import seed_everything
 
 from .guides.base import Guide
 from .objective import ScoreFunction
+from .reuse import RenderPool
 from .training import Report, batch_seed, check_finite, restore_training, training_state
 
 
@@ -31,6 +32,7 @@ class Trainer:
         num_real: real images a batch, drawn anew each time (the paper); all of them where None.
         learning_rate: the first; it falls to 0 along a cosine, or stays where ``cosine`` is False (the paper).
         seed: batch k is drawn from (seed, k).
+        pool: from which the objective takes renders again, kept with the rest.
 
     Attributes:
         unit, total, done: see ``Training``; batches.
@@ -50,7 +52,9 @@ class Trainer:
         learning_rate: float = 1e-2,
         cosine: bool = True,
         seed: int = 0,
+        pool: RenderPool | None = None,
     ):
+        self.pool = pool
         self.model, self.guide, self.objective, self.real = model, guide, objective, real
         self.total, self.num_scenes, self.num_real, self.seed = batches, num_scenes, num_real, seed
         self.learning_rate, self.cosine = learning_rate, cosine
@@ -78,7 +82,8 @@ class Trainer:
                     each(self, self.diagnostics())
 
     def diagnostics(self) -> dict[str, float]:
-        """Of the last batch: its mean cost, that cost's spread, rejections and length."""
+        """Of the last batch: its mean cost, that cost's spread, rejections and length; and of all batches, how many
+        scenes were rendered, and of how many, where renders are taken again."""
         batch = self.objective.batch
         assert batch is not None
         return {
@@ -88,6 +93,7 @@ class Trainer:
             "rejections": batch.rejections,
             "length": batch.derivation.lengths.float().mean().item(),
             "learning_rate": self.adam.rate,
+            **({} if self.pool is None else {"rendered": self.pool.drawn, "of": self.pool.asked}),
         }
 
     def summary(self) -> dict[str, Any]:
@@ -98,7 +104,9 @@ class Trainer:
         """All that ``restore`` needs, as named tensors."""
         averages = {f"average-{stratum}": value for stratum, value in self.objective.averages.items()}
         whole = self.adam.whole(list(self.guide.parameters()))
-        return training_state(self.guide, {"adam": whole}, done=self.done, **averages)
+        pool = {} if self.pool is None else self.pool.state()
+        kept = {f"pool.{key}": value for key, value in pool.items()}
+        return training_state(self.guide, {"adam": whole}, done=self.done, **averages) | kept
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
@@ -107,6 +115,8 @@ class Trainer:
         self.adam.take(whole)
         self.done = int(numbers["done"])
         averages = {key: value for key, value in numbers.items() if key.startswith("average-")}
+        if self.pool is not None:
+            self.pool.restore({k.removeprefix("pool."): v for k, v in tensors.items() if k.startswith("pool.")})
         self.objective.averages = {int(key.removeprefix("average-")): value for key, value in averages.items()}
 
     def _batch(self) -> None:

@@ -187,7 +187,7 @@ class Drawing:
     def __len__(self) -> int:
         return self.kind.shape[0]
 
-    def __getitem__(self, scenes: slice) -> "Drawing":
+    def __getitem__(self, scenes: slice | Tensor) -> "Drawing":
         """The same drawing of some of the scenes."""
         layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
         return replace(self, kind=self.kind[scenes], layers=layers, photo=of_scenes(self.photo, scenes))
@@ -196,7 +196,7 @@ class Drawing:
 AnyPart = TypeVar("AnyPart")
 
 
-def of_scenes(part: AnyPart, scenes: slice) -> AnyPart:
+def of_scenes(part: AnyPart, scenes: slice | Tensor) -> AnyPart:
     """A dataclass with some of the scenes' rows of all its tensors; what has none is as it is."""
     if part is None:
         return part

@@ -45,7 +45,7 @@ class Values:
     present: Tensor
     values: dict[str, Tensor]
 
-    def of(self, scenes: slice) -> "Values":
+    def of(self, scenes: slice | Tensor) -> "Values":
         """Those of some of the scenes."""
         return Values(self.present[scenes], {key: value[scenes] for key, value in self.values.items()})
 
@@ -75,7 +75,7 @@ class Request:
     def __len__(self) -> int:
         return self.kind.shape[0]
 
-    def __getitem__(self, scenes: slice) -> "Request":
+    def __getitem__(self, scenes: slice | Tensor) -> "Request":
         """The same request of some of the scenes."""
         return replace(
             self,

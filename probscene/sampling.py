@@ -44,6 +44,17 @@ class Scenes:
     drawing: Renderable
     failures: Tensor
 
+    def some(self, which: Tensor) -> "Scenes":
+        """Those of a mask ``(N,)`` bool."""
+        return Scenes(
+            self.derivation[which],
+            {name: value[which] for name, value in self.parameters.items()},
+            {name: mask[which] for name, mask in self.site_mask.items()},
+            self.log_prob[which],
+            self.drawing[which],
+            self.failures[which],
+        )
+
 
 def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
     """Scenes with complete structures from ``policy`` and parameters from the model's program, or from that of

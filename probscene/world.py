@@ -167,7 +167,7 @@ class World:
     def __len__(self) -> int:
         return self.kind.shape[0]
 
-    def __getitem__(self, scenes: slice) -> "World":
+    def __getitem__(self, scenes: slice | Tensor) -> "World":
         """The same world of some of the scenes."""
 
         parts = {name: of_scenes(getattr(self, name), scenes) for name in ("camera", "light", "photo", "ground")}

@@ -16,7 +16,7 @@ CHOICES = {
     "learn": (STRUCTURE, BOTH),
     "parameter_method": (LIKELIHOOD, META_SIM),
 }
-LEAST = {"num_scenes": 2, "scenes": 2, "batches_again": 0, "rounds": 0, "energy_steps": 0, "directions": 0}
+LEAST = {"num_scenes": 2, "scenes": 2, "batches_again": 0, "rounds": 0, "energy_steps": 0, "directions": 0, "reuse": 0}
 FIRST = {"objective": Preset.with_objective, "guide": Preset.with_guide, "features": Preset.with_features}
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate", "difference")
 

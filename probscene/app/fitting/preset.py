@@ -54,6 +54,8 @@ class Preset:
             on the policy that the model names for it, within its support.
         batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Trainer`` and ``ScoreFunction``.
         draws_per_structure: drawings of each structure, of which the clearest is looked at.
+        reuse: renders of scenes of equal counts before one of them, at random, is taken again instead of a new one,
+            for renderers that are slow; every scene is rendered where 0. See ``RenderPool``.
         baseline, scale, incompletion_weight, prior_kl_weight: see ``ScoreFunction``, whose prior is the policy
             that guides are pretrained on.
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
@@ -90,6 +92,7 @@ class Preset:
     num_scenes: int = 500
     num_real: int | None = None
     draws_per_structure: int = 4
+    reuse: int = 0
     updates: int = 3
     learning_rate: float = 1e-2
     cosine: bool = True

@@ -15,6 +15,7 @@ from probscene.inference.judging.farther import farther
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
+from probscene.inference.reuse import RenderPool
 from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
@@ -46,9 +47,10 @@ def learn_structure(run: RunFolder, observer: Observer, net: FeatureNet, real: T
     if known is not None:
         guide.load_state_dict(known)
         return guide
-    objective = _objective(run, run.model, observer, net, guide, preset.draws_per_structure)
+    pool = _pool(run, run.model)
+    objective = _objective(run, run.model, observer, net, guide, preset.draws_per_structure, pool)
     rate, seeds = preset.learning_rate, batch_seed(seed, 3)
-    trainer = _trainer(run, run.model, guide, objective, real, preset.batches, rate, seeds)
+    trainer = _trainer(run, run.model, guide, objective, real, preset.batches, rate, seeds, pool)
     keep = Keeper(run, FIRST, trainer)
     if trainer.done == 0:
         epochs = preset.pretrain_epochs
@@ -82,9 +84,10 @@ def learn_structure_again(run: RunFolder, net: FeatureNet, real: Tensor, guide: 
     seed_everything(batch_seed(seed, 8))
     model = guide.suits(run.model)
     observer, before = Observer(model, run.record["threads"]), {k: v.clone() for k, v in guide.state_dict().items()}
-    objective = _objective(run, model, observer, net, guide, draws_per_structure=1)
+    pool = _pool(run, model)
+    objective = _objective(run, model, observer, net, guide, 1, pool)
     rate, seeds = SLOWER * preset.learning_rate, batch_seed(seed, 7)
-    trainer = _trainer(run, model, guide, objective, real, preset.batches_again, rate, seeds)
+    trainer = _trainer(run, model, guide, objective, real, preset.batches_again, rate, seeds, pool)
     seen = _seen(run, observer, net, guide)
     _run(trainer, Keeper(run, AGAIN, trainer), AGAIN, progress)
     which = compared(net)
@@ -101,13 +104,23 @@ def _seen(run: RunFolder, observer: Observer, net: FeatureNet, guide: Guide) -> 
         return observer.observe(net)(sample(run.model, guide, run.preset.num_scenes))
 
 
+def _pool(run: RunFolder, model: SceneModel) -> RenderPool | None:
+    return RenderPool(model, run.preset.reuse) if run.preset.reuse else None
+
+
 def _objective(
-    run: RunFolder, model: SceneModel, observer: Observer, net: FeatureNet, guide: Guide, draws_per_structure: int
+    run: RunFolder,
+    model: SceneModel,
+    observer: Observer,
+    net: FeatureNet,
+    guide: Guide,
+    draws_per_structure: int,
+    pool: RenderPool | None,
 ) -> ScoreFunction:
-    preset = run.preset
+    preset, observe = run.preset, observer.observe(net, draws_per_structure)
     held = Held(model, {*run.unread, *(model.stuff if run.readings else ())}, preset.num_scenes)
     return ScoreFunction(
-        held.beside(observer.observe(net, draws_per_structure)),
+        held.beside(observe if pool is None else pool.around(observe)),
         held.added_to(run.divergence(inner(net))),
         baseline=preset.baseline,
         updates=preset.updates,
@@ -128,10 +141,11 @@ def _trainer(
     batches: int,
     rate: float,
     seed: int,
+    pool: RenderPool | None,
 ) -> Trainer:
     preset = run.preset
     scenes, images = preset.num_scenes, preset.num_real
-    return Trainer(model, guide, objective, real, batches, scenes, images, rate, preset.cosine, seed=seed)
+    return Trainer(model, guide, objective, real, batches, scenes, images, rate, preset.cosine, seed, pool)
 
 
 def _run(trainer: Trainer, keep: Keeper, stage: str, progress: Progress) -> None:
