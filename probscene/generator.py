@@ -28,6 +28,8 @@ class Command:
         attempts: how often a scene is tried, each time by a fresh worker, before it is an error.
         files: what the program is made of, beside the files among its arguments. A run is bound to their bytes.
         version: of the program, which it has to say to ``serve``; any where empty.
+        keep: a folder in which pictures are kept and taken again for the same scene, as when a fit goes on, begins anew
+            with the same seed, or has another target; it grows by each image. None for nothing.
         reproducible: whether one scene always gives the same bytes. Where not, no image is promised again.
 
     Raises:
@@ -43,6 +45,7 @@ class Command:
     attempts: int = 3
     files: Sequence[str | Path] = ()
     version: str = ""
+    keep: str | Path | None = None
     reproducible: bool = True
 
     def __post_init__(self):

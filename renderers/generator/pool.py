@@ -20,6 +20,7 @@ from probscene import worker
 from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
 
+from .kept import Kept
 from .process import Process, log_of, tail
 from .reply import Fault, Picture
 
@@ -58,6 +59,7 @@ class Pool:
 
     def __init__(self, command: Command):
         self.command, self.closed = command, False
+        self._kept = None if command.keep is None else Kept(Path(command.keep), command)
         self._tasks: SimpleQueue[_Task | None] = SimpleQueue()
         self._processes: dict[int, Process] = {}
         self._threads: list[threading.Thread] = []
@@ -131,6 +133,13 @@ class Pool:
                 future.set_exception(error)
 
     def _drawn(self, record: dict[str, Any], number: int) -> Picture:
+        if self._kept is None:
+            return self._draw(record, number)
+        if (picture := self._kept.load(record)) is None:
+            self._kept.save(record, picture := self._draw(record, number))
+        return picture
+
+    def _draw(self, record: dict[str, Any], number: int) -> Picture:
         faults: list[str] = []
         for _ in range(self.command.attempts):
             try:

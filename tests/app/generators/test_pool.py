@@ -10,7 +10,7 @@ import time
 import pytest
 import torch
 
-from probscene.errors import GeneratorError
+from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
 from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import pool_for
@@ -143,3 +143,37 @@ os.kill(os.getpid(), 9)
             return
         time.sleep(0.1)
     pytest.fail("the worker still runs")
+
+
+def test_pictures_that_are_kept_are_taken_again(drawn, request_of, command, fault, fresh, tmp_path):
+    request, keep = request_of(SCENES), tmp_path / "kept"
+    fault("boxes")
+    first = drawn(request, keep=keep)
+    files = sorted(keep.rglob("*"))
+    assert len([file for file in files if file.suffix == ".npz"]) == SCENES
+    fresh()
+    fault("always")
+    again = drawn(request, keep=keep)
+    assert same(again, first) and again.unknown == first.unknown == ("visible",)
+    assert not pool_for(command(keep=keep), 1).processes() and sorted(keep.rglob("*")) == files
+    next(file for file in files if file.suffix == ".npz").write_bytes(b"damaged")
+    with pytest.raises(GeneratorError, match="never any mesh"):
+        drawn(request, keep=keep, attempts=1)
+    fresh()
+    fault("boxes")
+    assert same(drawn(request, keep=keep), first)
+
+
+def test_another_command_has_pictures_of_its_own(drawn, request_of, tmp_path, fault, fresh):
+    request = request_of(2)
+    drawn(request, keep=tmp_path)
+    fresh()
+    fault("always")
+    with pytest.raises(GeneratorError, match="never any mesh"):
+        drawn(request, keep=tmp_path, files=(__file__,), attempts=1)
+
+
+def test_a_folder_that_cannot_be_written_is_named(drawn, request_of, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MachineError, match="file.*, which keep= of the Command names, actual Not a directory"):
+        drawn(request_of(1), keep=tmp_path / "file")

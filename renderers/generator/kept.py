@@ -1,0 +1,68 @@
+"""Pictures that are kept on disk and taken again for the same scene of the same command."""
+
+import hashlib
+import io
+import json
+import os
+import secrets
+import zipfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probscene.errors import MachineError
+from probscene.generator import Command
+
+from .reply import Picture
+
+
+class Kept:
+    """A folder of pictures, which several processes may share.
+
+    Args:
+        folder: made where it is not there.
+        command: what draws them; another one's pictures are never taken.
+
+    Raises:
+        DataError: a file of the command cannot be read.
+    """
+
+    def __init__(self, folder: Path, command: Command):
+        self.folder, self._made_of = folder, command.fingerprint()
+
+    def file(self, record: dict[str, Any]) -> Path:
+        """Where the picture of a scene is, or will be."""
+        about = json.dumps([self._made_of, record], sort_keys=True)
+        name = hashlib.sha256(about.encode()).hexdigest()
+        return self.folder / name[:2] / f"{name}.npz"
+
+    def load(self, record: dict[str, Any]) -> Picture | None:
+        """The picture of a scene; None where there is none, or where its file is damaged."""
+        try:
+            with np.load(self.file(record)) as found:
+                return Picture(*(found.get(key) for key in Picture._fields))
+        except (OSError, EOFError, ValueError, zipfile.BadZipFile):
+            return None
+
+    def save(self, record: dict[str, Any], picture: Picture) -> None:
+        """Keep the picture of a scene.
+
+        Raises:
+            MachineError: the folder cannot be written.
+        """
+        file, whole = self.file(record), io.BytesIO()
+        np.savez_compressed(whole, **{key: part for key, part in picture._asdict().items() if part is not None})
+        aside = file.with_name(f".{file.stem}.{secrets.token_hex(4)}")
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            aside.write_bytes(whole.getbuffer())
+            os.replace(aside, file)
+        except OSError as error:
+            with suppress(OSError):
+                aside.unlink()
+            raise MachineError(
+                f"Expected to write pictures to {self.folder}, which keep= of the Command names, actual "
+                f"{error.strerror}; make room, or take keep= away."
+            ) from error
