@@ -53,6 +53,15 @@ def learn_looks(result: dict) -> Rows:
     return rows
 
 
+def learn_generator(result: dict) -> Rows:
+    """A row for each quantity, the mean of the seeds and their range."""
+    sources = ("prior", "start", "learnt", "floor")
+    rows: Rows = [["total variation", *sources]]
+    for quantity in (name for name in result["rows"][0]["learnt"] if name != "mean"):
+        rows.append([quantity, *(spread([row[source][quantity] for row in result["rows"]], 3) for source in sources)])
+    return rows
+
+
 def _of_site(site: dict | None) -> str:
     if site is None:
         return ""
@@ -76,7 +85,11 @@ def _figure(figure: dict) -> str:
     return f"{figure['value']:.3f} ({figure['low']:.3f} to {figure['high']:.3f})"
 
 
-TABLES: dict[str, Callable[[dict], Rows]] = {"ablate": ablate, "learn_looks": learn_looks}
+TABLES: dict[str, Callable[[dict], Rows]] = {
+    "ablate": ablate,
+    "learn_generator": learn_generator,
+    "learn_looks": learn_looks,
+}
 
 
 def spread(values: list[float], digits: int) -> str:
