@@ -32,7 +32,7 @@ def anything_is_read(patch):
     patch.setattr(skill, "READABLE", -1e9)
     patch.setattr(reader, "LEAST_MASS", 1e-3)
     patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
-    patch.setattr(judged, "not_nearer", lambda *_: frozenset())
+    patch.setattr(judged, "passed", lambda *_: frozenset())
 
 
 @pytest.fixture(scope="module")
@@ -198,8 +198,8 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
 
 
-def test_sites_whose_readings_come_no_nearer_keep_the_prior():
-    """The target's has the prior's values in all sites but ``x``; of ``z`` nothing is read in it."""
+def test_sites_keep_the_prior_by_what_is_read_of_them():
+    """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target."""
 
     class Learning:
         def site_rows(self, images):
@@ -223,14 +223,15 @@ def test_sites_whose_readings_come_no_nearer_keep_the_prior():
         return mean + torch.randn(number, 2), torch.arange(number) // 3
 
     images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert judged.not_nearer(Learning(), images) == {"y", "z", "w"}
+    assert judged.passed(Learning(), images, careful=True) == {"y", "z", "w"}
+    assert judged.passed(Learning(), images, careful=False) == {"w"}
 
 
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
 def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
     monkeypatch.setattr(judged, "farther", lambda *_: Farther(1.0, 1.0, 0.0))
-    monkeypatch.setattr(judged, "not_nearer", lambda *_: frozenset(passed))
+    monkeypatch.setattr(judged, "passed", lambda *_: frozenset(passed))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
     assert done.code == 0, done.err

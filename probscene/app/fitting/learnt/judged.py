@@ -35,10 +35,10 @@ class Judged(NamedTuple):
 
     Attributes:
         distances: ``kept``, ``"learnt"`` or ``"prior"``, and the energy distances of renders with learnt parameters
-            and with the prior's from the images. Where the former are no nearer, or the schedule says so, the guide
-            passes sites of which what is read in its renders is not surely nearer to what is read in the images; where
-            renders are surely farther all the same, all but those that bring them nearer alone. With the others it is
-            kept, unless its renders are surely farther then.
+            and with the prior's from the images. The guide passes sites of which what is read in its renders is surely
+            farther from what is read in the images; where renders are no nearer, or the schedule says so, all of which
+            it is not surely nearer; and where they are surely farther all the same, all but those that bring them
+            nearer alone. With the others it is kept, unless its renders are surely farther then.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -69,9 +69,10 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
     apart = compared()
     kept = "learnt" if apart.one < apart.other else "prior"
     careful = kept == "prior" or run.preset.parameters.sure
-    if careful and isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
-        learnt.passed = not_nearer(learning, images)
-        apart = compared()
+    if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
+        learnt.passed = passed(learning, images, careful)
+        if learnt.passed:
+            apart = compared()
         if apart.sure and judge is not None:
             learnt.passed = useless(learnt, judge)
             apart = compared()
@@ -94,13 +95,18 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
     return Judged(distances, sites)
 
 
-def not_nearer(learning: ParameterLearning, images: dict[str, Tensor]) -> frozenset[str]:
-    """Sites of which what is read in learnt renders is not surely nearer to what is read in the target than with the
-    prior's parameters: there is nothing to be learnt of them, or it was not."""
+def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool) -> frozenset[str]:
+    """Sites that keep their prior, by what is read in learnt renders, in the prior's and in the target: those of which
+    learnt renders are surely farther from the target; where one is careful, those of which they are not surely nearer,
+    as there is nothing to be learnt of them, or it was not."""
     return frozenset(
         name
         for name, of in learning.site_rows(images).items()
-        if not _surely_nearer(of["learnt"], of["prior"], of["target"])
+        if (
+            not _surely_nearer(of["learnt"], of["prior"], of["target"])
+            if careful
+            else _surely_nearer(of["prior"], of["learnt"], of["target"])
+        )
     )
 
 
