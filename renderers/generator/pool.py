@@ -5,13 +5,13 @@ that it has started, and the scene tried again by a fresh one. At the end of thi
 whose pool is gone ends itself.
 """
 
-import atexit
 import os
 import shutil
 import tempfile
 import threading
 from collections import Counter
 from concurrent.futures import Future
+from multiprocessing.util import Finalize
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -75,7 +75,7 @@ class Pool:
                 f"Expected to write temporary files for the generator {command.name}, actual {error.strerror}; make "
                 "room, or set TMPDIR."
             ) from error
-        atexit.register(self.close)
+        Finalize(None, self.close, exitpriority=1)  # also at the end of a process that multiprocessing has started
 
     def grow(self, workers: int) -> None:
         """Let at least so many workers draw at once."""

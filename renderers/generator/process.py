@@ -88,7 +88,8 @@ class Process:
         if answer is None:
             raise Fault(f"{self._ended()}it hung up")
         self.drawn += 1
-        self.memory = float(answer[0].get("memory", 0.0))
+        memory = answer[0].get("memory")
+        self.memory = memory if isinstance(memory, float) else 0.0
         picture = read(record, *answer)
         if self._log.stat().st_size > LOG:
             os.truncate(self._log, 0)
@@ -130,6 +131,8 @@ class Process:
     def _greeted(self, token: str) -> None:
         try:
             hello = worker.receive(_Timed(self._wire, self.command.start_timeout), 1 << 16)
+        except TimeoutError:
+            raise Fault(f"it had said nothing {self.command.start_timeout:g} seconds after it called") from None
         except (OSError, ValueError) as error:
             raise GeneratorError(self._stranger(str(error))) from error
         if hello is None:

@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-LARGEST = np.iinfo(np.int16).max  # id in a RenderBatch
 _TYPES = {"image": "B", "instance": "bBhHiIlLqQnN", "depth": "f"}  # formats of memoryview
 
 

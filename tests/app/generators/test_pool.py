@@ -1,5 +1,6 @@
 """Scenes that other processes draw: the bytes of an undisturbed run whatever happens, or one clear error."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -177,3 +178,20 @@ def test_a_folder_that_cannot_be_written_is_named(drawn, request_of, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(MachineError, match="file.*, which keep= of the Command names, actual Not a directory"):
         drawn(request_of(1), keep=tmp_path / "file")
+
+
+def pool_of_a_child(argv, out):
+    pool = pool_for(Command(argv), 1)
+    pool.draw([{"height": 4, "width": 4, "seed": 1, "values": {}, "nodes": []}])
+    out.put((pool.processes()[0], str(pool.folder)))
+
+
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+def test_a_process_of_multiprocessing_leaves_nothing(method, command, running):
+    context = multiprocessing.get_context(method)
+    out = context.Queue()
+    child = context.Process(target=pool_of_a_child, args=(command().argv, out))
+    child.start()
+    group, folder = out.get(timeout=60)
+    child.join()
+    assert child.exitcode == 0 and not running(group) and not os.path.exists(folder)
