@@ -17,9 +17,11 @@ a function of a scene::
 ``probscene`` starts the program (``Command`` in probscene.generator) and sends it one scene after the other. What is
 printed goes to a log, whose end is told where a scene fails.
 
-On the wire, a Unix socket, each message is two big-endian 32-bit lengths, then JSON, then the bytes of all arrays.
+On the wire, a Unix socket or, where the system has none, one of TCP on this machine, each message is two big-endian
+32-bit lengths, then JSON, then the bytes of all arrays.
 """
 
+import importlib
 import json
 import os
 import select
@@ -32,6 +34,7 @@ import traceback
 
 PROTOCOL = 1
 SOCKET, TOKEN = "PROBSCENE_SOCKET", "PROBSCENE_TOKEN"  # variables of the environment
+_TCP = "tcp:"  # before a port, in an address
 _LENGTHS = struct.Struct(">II")
 _KIBIBYTES = 1 if sys.platform != "darwin" else 1024  # what ru_maxrss counts in
 
@@ -87,8 +90,7 @@ def serve(render, version=""):
             f"Expected to be started by probscene, actual no {SOCKET} in the environment; name this program in the "
             "Command of a scene model's generator."
         )
-    wire = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    wire.connect(os.environ[SOCKET])
+    wire = connected(os.environ[SOCKET])
     threading.Thread(target=_leave_with, args=(wire,), daemon=True).start()
     send(wire, {"protocol": PROTOCOL, "token": os.environ[TOKEN], "version": str(version), "process": os.getpid()})
     while True:
@@ -101,6 +103,33 @@ def serve(render, version=""):
             told = "".join(traceback.format_exception(type(error), error, error.__traceback__))
             reply, arrays = {"error": told}, []
         send(wire, dict(reply, memory=memory()), arrays)
+
+
+def listening(folder, number):
+    """A socket to which one process may connect, and its address; a file in ``folder`` where the system has such."""
+    if not hasattr(socket, "AF_UNIX"):
+        wire = socket.create_server(("127.0.0.1", 0), backlog=1)
+        return wire, f"{_TCP}{wire.getsockname()[1]}"
+    address = os.path.join(folder, str(number))
+    if os.path.exists(address):
+        os.unlink(address)
+    wire = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        wire.bind(address)
+    except OSError:
+        wire.close()
+        raise
+    wire.listen(1)
+    return wire, address
+
+
+def connected(address):
+    """A connection to a ``listening`` process."""
+    if not address.startswith(_TCP):
+        wire = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        wire.connect(address)
+        return wire
+    return socket.create_connection(("127.0.0.1", int(address[len(_TCP) :])))
 
 
 def packed(drawn):
@@ -128,7 +157,7 @@ def packed(drawn):
 def memory():
     """The most that this process has had resident, megabytes; 0 where that is not known."""
     try:
-        import resource
+        resource = importlib.import_module("resource")
     except ImportError:
         return 0.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 / _KIBIBYTES
@@ -175,7 +204,11 @@ def _bytes(wire, number):
 
 def _leave_with(wire):
     """End this process, and all of its group, when the other side has gone, also in the middle of a scene."""
+    if not hasattr(select, "poll"):
+        return
     poll = select.poll()
     poll.register(wire, select.POLLHUP)
     poll.poll()
-    os.kill(0, signal.SIGKILL)
+    if hasattr(signal, "SIGKILL"):
+        os.kill(0, signal.SIGKILL)
+    os._exit(1)

@@ -42,12 +42,10 @@ class Process:
     def __init__(self, command: Command, folder: Path, number: int):
         self.command, self.drawn, self.memory = command, 0, 0.0
         self._log = log_of(folder, number)
-        address, token = folder / str(number), secrets.token_hex(16)
-        address.unlink(missing_ok=True)
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listening:
-            listening.bind(str(address))
-            listening.listen(1)
-            variables = {worker.SOCKET: str(address), worker.TOKEN: token, "PROBSCENE_WORKER": str(folder)}
+        listening, address = worker.listening(folder, number)
+        token = secrets.token_hex(16)
+        with listening:
+            variables = {worker.SOCKET: address, worker.TOKEN: token, "PROBSCENE_WORKER": str(folder)}
             self._log.write_bytes(b"")
             try:
                 with open(self._log, "ab") as log:  # so that it can be cut off while it is written
@@ -109,8 +107,11 @@ class Process:
 
     def kill(self) -> None:
         """End it, and all that it has started in its process group."""
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+        if hasattr(os, "killpg") and hasattr(signal, "SIGKILL"):
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        else:
+            self._process.kill()
         self._process.wait()
         if hasattr(self, "_wire"):
             self._wire.close()

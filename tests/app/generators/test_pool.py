@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -76,6 +77,15 @@ def test_workers_are_shared_and_as_many_as_are_asked_for(drawn, request_of, comm
     first = pool_for(command(), 1).processes()
     drawn(request_of(SCENES, seed=1))
     assert 1 <= len(first) <= 2 and pool_for(command(), 1).processes() == first
+
+
+def test_without_unix_sockets_the_bytes_are_the_same(drawn, request_of, fresh, monkeypatch):
+    request = request_of(SCENES)
+    whole = drawn(request)
+    fresh()
+    monkeypatch.delattr(socket, "AF_UNIX")
+    monkeypatch.delattr(os, "killpg")
+    assert same(drawn(request, restart_after=7), whole)
 
 
 def test_several_threads_draw_at_once(drawn, request_of):
