@@ -52,9 +52,9 @@ def read(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
         raise Fault(
             f"expected ids of nodes of the scene in instance, 0 to {most}, actual {int(ids.min())} to {int(ids.max())}"
         )
-    known = np.isin(ids, [0, *(node["id"] for node in record["nodes"])])
-    if not known.all():
-        raise Fault(f"expected ids of nodes of the scene in instance, actual {int(ids[~known][0])}, which is of none")
+    none = set(range(1, most)) - {node["id"] for node in record["nodes"]}
+    if none and (strange := np.isin(ids, list(none))).any():
+        raise Fault(f"expected ids of nodes of the scene in instance, actual {int(ids[strange][0])}, which is of none")
     depth = _array(arrays, "depth", (height, width)) if "depth" in arrays else None
     if depth is not None and np.isnan(depth).any():
         raise Fault("expected depth without NaN, actual NaN; infinity where there is sky")

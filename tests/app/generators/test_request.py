@@ -131,6 +131,17 @@ def test_what_is_no_picture_is_named(model, change, said):
         batch_of(model, lambda scene: change(painted(scene)), request)
 
 
+def test_an_id_of_a_node_that_is_none_is_named(model, request_of):
+    """Nodes that only pad may lie between others, where scenarios are joined."""
+    request = request_of(1)
+    request = replace(
+        request, kind=torch.tensor([[0, -1, 1]]), parent=torch.tensor([[-1, -1, 0]]), objects=(), scene=()
+    )
+    with pytest.raises(ModelError, match="actual 2, which is of none"):
+        batch_of(model, lambda scene: painted(scene) | {"instance": np.full((32, 40), 2)}, request)
+    assert batch_of(model, painted, request).pixels.tolist() == [[10, 0, 10]]
+
+
 def test_an_error_in_this_process_names_the_line(model, request_of):
     def broken(scene):
         return scene.values["fog"]
