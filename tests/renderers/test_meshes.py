@@ -79,8 +79,8 @@ def test_agrees_with_the_numpy_twin(shapes, seed, lying):
 
 def agrees(ours, twin):
     """Labels are equal, but for what rounding may change."""
-    assert [tensor.dtype for tensor in ours[:-1]] == [tensor.dtype for tensor in twin[:-1]]
-    assert [tensor.shape for tensor in ours[:-1]] == [tensor.shape for tensor in twin[:-1]]
+    assert [tensor.dtype for tensor in ours[:7]] == [tensor.dtype for tensor in twin[:7]]
+    assert [tensor.shape for tensor in ours[:7]] == [tensor.shape for tensor in twin[:7]]
     assert ours.space.names == twin.space.names and torch.equal(ours.kind, twin.kind)
     same = (ours.instance == twin.instance) & (ours.space.semantic == twin.space.semantic)
     assert (~same).float().mean() <= 1e-3
@@ -151,7 +151,7 @@ def test_same_bytes_for_any_threads_and_any_batch(shapes, seed, cut, samples):
     for part in (slice(0, cut), slice(cut, None), slice(cut, cut + 1)):
         again = (RENDERER if samples == 1 else SMOOTH)(world[part])
         space = batch.space._replace(**{k: v[part] for k, v in batch.space._asdict().items() if k != "names"})
-        assert shapes.same(batch.__class__(*(tensor[part] for tensor in batch[:-1]), space), again)
+        assert shapes.same(batch.__class__(*(tensor[part] for tensor in batch[:7]), space), again)
 
 
 def many(shapes, number: int):

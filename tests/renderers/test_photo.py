@@ -102,7 +102,7 @@ def test_labels_are_those_without_a_photo(seed, height, width):
     images = noise_of(seed, 3, height, width)
     renderer = SpriteRenderer((height, width), threads=1)
     with_photo, without = renderer(drawing_of(images, random_photo(seed, 3))), renderer(drawing_of(images))
-    assert all(torch.equal(a, b) for a, b in zip(with_photo[1:-1], without[1:-1], strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(with_photo[1:7], without[1:7], strict=True))
 
 
 @given(SEED, st.integers(0, 4), SIZE, SIZE)

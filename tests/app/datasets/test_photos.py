@@ -85,4 +85,4 @@ def test_labels_of_a_photo_are_the_drawings():
     plain = run_program(drawn, scenes.derivation, values)
     photo, drawing = (renderer_for(photographed, 1)(each.drawing) for each in (scenes, plain))
     assert not torch.equal(photo.image, drawing.image)
-    assert all(torch.equal(a, b) for a, b in zip(photo[1:-1], drawing[1:-1], strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(photo[1:7], drawing[1:7], strict=True))
