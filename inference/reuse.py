@@ -32,27 +32,27 @@ class RenderPool:
     """
 
     def __init__(self, model: SceneModel, least: int):
-        self.model, self.least, self.drawn, self.asked = model, least, 0, 0
+        self.model, self.least, self.asked = model, least, 0
         self._rows: dict[bytes, list[int]] = {}
         self._counts: list[Tensor] = []
         self._features: list[Tensor] = []
+
+    @property
+    def drawn(self) -> int:
+        return len(self._features)
 
     def around(self, observe: Callable[[Scenes], Tensor]) -> Callable[[Scenes], Tensor]:
         """``observe``, called only for scenes of whose counts there are not enough renders."""
 
         def features(scenes: Scenes) -> Tensor:
             counts = self._counts_of(scenes.derivation)
-            found: list[int] = []
-            for row in counts:
-                known = self._rows.get(row.numpy().tobytes(), [])
-                enough = len(known) >= self.least
-                found.append(known[int(torch.randint(len(known), ()))] if enough else -1)
-            new = torch.tensor([row < 0 for row in found], dtype=torch.bool)
-            made = observe(scenes.some(new)) if new.any() else None
-            if made is not None:
-                found = self._with(found, counts, made)
-            self.asked += len(found)
-            return torch.stack([self._features[row] for row in found])
+            row = torch.tensor([self._known(each) for each in counts])
+            new = row < 0
+            if new.any():
+                row[new] = torch.arange(self.drawn, self.drawn + int(new.sum()))
+                self._keep(counts[new], observe(scenes.some(new)))
+            self.asked += len(row)
+            return torch.stack([self._features[each] for each in row])
 
         return features
 
@@ -68,24 +68,23 @@ class RenderPool:
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
-        self.__init__(self.model, self.least)
+        self.asked = 0
+        for kept in (self._rows, self._counts, self._features):
+            kept.clear()
         if tensors:
             self._keep(tensors["counts"], tensors["features"])
             self.asked = int(tensors["asked"])
 
-    def _with(self, found: list[int], counts: Tensor, made: Tensor) -> list[int]:
-        rows = iter(range(len(self._features), len(self._features) + len(made)))
-        found = [next(rows) if row < 0 else row for row in found]
-        first = len(self._features)
-        self._keep(counts[torch.tensor([row >= first for row in found])], made)
-        return found
+    def _known(self, counts: Tensor) -> int:
+        """A render of these counts; -1 where there are not enough."""
+        rows = self._rows.get(counts.numpy().tobytes(), [])
+        return rows[int(torch.randint(len(rows), ()))] if len(rows) >= self.least else -1
 
     def _keep(self, counts: Tensor, features: Tensor) -> None:
-        for row, feature in zip(counts, features, strict=True):
-            self._rows.setdefault(row.numpy().tobytes(), []).append(len(self._features))
-            self._counts.append(row)
+        for each, feature in zip(counts, features, strict=True):
+            self._rows.setdefault(each.numpy().tobytes(), []).append(self.drawn)
+            self._counts.append(each)
             self._features.append(feature)
-        self.drawn += len(features)
 
     def _counts_of(self, derivation: Derivation) -> Tensor:
         """``(N, C)`` int16."""
@@ -93,9 +92,9 @@ class RenderPool:
         whole = derivation.counts(kinds)
         if groups is None:
             return whole.to(torch.int16)
-        is_group = kind == self.model.grammar.kind(groups.kind)
-        group = group_of(kind, derivation.parent, self.model.grammar.kind(groups.kind))
-        rank = (is_group.cumsum(1) - 1).gather(1, group.clamp(min=0)).clamp(max=groups.max_groups - 1)
+        group_kind = self.model.grammar.kind(groups.kind)
+        group = group_of(kind, derivation.parent, group_kind)
+        rank = ((kind == group_kind).cumsum(1) - 1).gather(1, group.clamp(min=0)).clamp(max=groups.max_groups - 1)
         inside = (group >= 0) & (kind >= 0)
         each = torch.zeros(len(kind), groups.max_groups * kinds, dtype=whole.dtype)
         each.scatter_add_(1, (rank * kinds + kind).where(inside, 0), inside.to(whole.dtype))

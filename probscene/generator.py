@@ -6,9 +6,10 @@ in a process, and most often an environment, of its own. What a function or prog
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from .errors import DataError, ModelError
 
@@ -86,3 +87,7 @@ class Command:
                     "put it back, or take it out of files=."
                 ) from error
         return f"generator {self.name}, {digest.hexdigest()[:16]}"
+
+
+Generator = Callable[[Any], Any] | Command
+"""What draws the scenes of a model: a function of a scene in this process, or a program."""

@@ -17,7 +17,7 @@ import pyro
 from .batch import Renderer
 from .derive import derive
 from .errors import ModelError
-from .generator import Command
+from .generator import Command, Generator
 from .grammar import Grammar
 from .policy import Policy
 from .request import Renderable
@@ -141,7 +141,7 @@ class SceneModel:
     scenarios: tuple[tuple[str, "SceneModel"], ...] = ()
     renderer: Callable[[tuple[int, int], int | None], Renderer] | None = None
     assets_variable: str = ""
-    generator: Callable[[Any], Any] | Command | None = None
+    generator: Generator | None = None
 
     def __post_init__(self):
         if not isinstance(self.grammar, Grammar):

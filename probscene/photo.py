@@ -6,15 +6,15 @@ Axis letter: N scenes.
 from dataclasses import dataclass, fields
 from typing import Any
 
-import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
 
 from .errors import ModelError
+from .scene_sites import scene_site, seed_site
 
 MAX_BLUR = 64.0  # pixels
-SEEDS = 2**31 - 1
+CALL = "scene.photo(...)"
 
 Look = Tensor | float | tuple[float, float] | dist.Distribution
 """A value, ``(N, 1)`` or a number; or what it is drawn from: the two ends of a uniform prior, or a distribution."""
@@ -93,23 +93,12 @@ def sample_photo(num_scenes: int, looks: dict[str, Look | None]) -> Photo:
         look = looks.get(name)
         if isinstance(look, tuple | list | dist.Distribution):
             prior = look if isinstance(look, dist.Distribution) else _uniform(name, look)
-            values[name] = _site(name, num_scenes, prior)
+            values[name] = scene_site(f"photo.{name}", num_scenes, prior, CALL)
         elif look is not None:
             values[name] = look
     if "noise" in values:
-        share = _site("seed", num_scenes, dist.Uniform(0.0, 1.0), infer={"learn": False})
-        values["seed"] = (share.double() * SEEDS).long()
+        values["seed"] = seed_site("photo.seed", num_scenes, CALL)
     return Photo(**values)
-
-
-def _site(name: str, num_scenes: int, prior: Any, **more: Any) -> Tensor:
-    value = pyro.sample(f"photo.{name}", prior, **more)
-    if tuple(value.shape) != (num_scenes, 1):
-        raise ModelError(
-            f"Expected site 'photo.{name}' with one value a scene, shape ({num_scenes}, 1), actual "
-            f"{tuple(value.shape)}; call scene.photo(...) inside the plate 'scenes' and outside scene.nodes(...)."
-        )
-    return value
 
 
 def _uniform(name: str, ends: tuple[float, float] | list[float]) -> Any:

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import pyro
-import pyro.distributions as dist
 import torch
 from torch import Tensor
 
@@ -16,8 +14,6 @@ from .drawing import Drawing, of_scenes
 from .errors import ModelError
 from .photo import Photo
 from .world import World
-
-SEED, SEEDS = "request.seed", 1 << 31
 
 
 class Objects:
@@ -109,22 +105,6 @@ class Request:
 
 Renderable = Drawing | World | Request
 """What a model's program returns."""
-
-
-def sample_seed(num_scenes: int) -> Tensor:
-    """``(N,)`` a seed for each scene, the site ``request.seed``, which keeps its prior.
-
-    Raises:
-        ModelError: the request is made within a plate of nodes.
-    """
-    unlearnt: Any = {"learn": False}
-    share = pyro.sample(SEED, dist.Uniform(0.0, 1.0), infer=unlearnt)
-    if tuple(share.shape) != (num_scenes, 1):
-        raise ModelError(
-            f"Expected site {SEED!r} with one value a scene, shape ({num_scenes}, 1), actual {tuple(share.shape)}; "
-            "call scene.request(...) inside the plate 'scenes' and outside scene.nodes(...)."
-        )
-    return (share.squeeze(1).double() * SEEDS).long().clamp(max=SEEDS - 1)
 
 
 def resolve_values(what: str, values: Mapping[str, Any], present: Tensor) -> Values:

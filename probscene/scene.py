@@ -18,7 +18,8 @@ from .drawing import Drawing, Layer, Sprites, resolve
 from .errors import ModelError
 from .grammar import Grammar
 from .photo import Look, Photo, sample_photo
-from .request import Objects, Request, resolve_values, sample_seed
+from .request import Objects, Request, resolve_values
+from .scene_sites import seed_site
 from .world import Camera, Ground, Light, Meshes, MeshLayer, World, resolve_ground, resolve_meshes, resolve_scene
 
 Given = TypeVar("Given", Sprites, Meshes)
@@ -132,7 +133,8 @@ class SceneGraph:
             found.append(resolve_values(f"Objects({each.kinds!r})", each.values, self.mask(*kinds)))
         of_scene = resolve_values("the scene", scene or {}, torch.ones(N, 1, dtype=torch.bool))
         look = None if photo is None else resolve_scene(photo, N)
-        return Request(self.kind, self.grammar.kinds, self.parent, sample_seed(N), tuple(found), (of_scene,), look)
+        seed = seed_site("request.seed", N, "scene.request(...)").squeeze(1)
+        return Request(self.kind, self.grammar.kinds, self.parent, seed, tuple(found), (of_scene,), look)
 
     def photo(
         self,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from probscene.batch import RenderBatch
 from probscene.errors import ModelError
-from probscene.generator import Command
+from probscene.generator import Command, Generator
 from probscene.program_errors import told
 from probscene.request import Renderable, Request
 from probscene.threads import cores
@@ -36,7 +36,7 @@ class GeneratedRenderer:
         threads: how many scenes are drawn at once by a ``Command`` that does not say; one for each core where None.
     """
 
-    def __init__(self, generator: Callable[[Any], Any] | Command, canvas: tuple[int, int], threads: int | None = None):
+    def __init__(self, generator: Generator, canvas: tuple[int, int], threads: int | None = None):
         self.generator, self.canvas, self.threads = generator, canvas, threads or cores()
         self._alone = threading.Lock()
 
@@ -52,17 +52,16 @@ class GeneratedRenderer:
                 f"Expected the program of a model with a generator to return scene.request(...), actual "
                 f"{type(drawing).__name__}; or take generator= away."
             )
-        request = drawing
-        records = request.records(self.canvas)
+        records = drawing.records(self.canvas)
         if isinstance(self.generator, Command):
             pictures = pool_for(self.generator, self.threads).draw(records)
         else:
             with self._alone, told("the generator", self.generator):
                 pictures = [_drawn_here(self.generator, record) for record in records]
-        batch = _batch(request, pictures, self.canvas)
-        if request.photo is None or not len(request):
+        batch = _batch(drawing, pictures, self.canvas)
+        if drawing.photo is None or not len(drawing):
             return batch
-        return batch._replace(image=photographed(request.photo, batch.image, self.threads))
+        return batch._replace(image=photographed(drawing.photo, batch.image, self.threads))
 
 
 def _drawn_here(generator: Callable[[Any], Any], record: dict[str, Any]) -> Picture:

@@ -40,10 +40,10 @@ def pool_for(command: Command, workers: int) -> "Pool":
         return _POOLS[key]
 
 
-def close_pools() -> None:
-    """End the workers of all commands in this process; who draws again has fresh ones."""
+def close_pools(command: Command | None = None) -> None:
+    """End the workers of a command in this process, or of all; who draws again has fresh ones."""
     with _LOCK:
-        for key in [key for key in _POOLS if key[0] == os.getpid()]:
+        for key in [key for key in _POOLS if key[0] == os.getpid() and command in (None, key[1])]:
             _POOLS.pop(key).close()
 
 

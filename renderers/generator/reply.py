@@ -5,6 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 _TYPES = {"image": "B", "instance": "bBhHiIlLqQnN", "depth": "f"}  # formats of memoryview
+_BYTES: dict[tuple[str, float], type] = {
+    ("instance", 2): np.uint16,
+    ("depth", 4): np.float32,
+}  # what plain bytes are, by how many a pixel has
 
 
 class Fault(Exception):
@@ -64,13 +68,10 @@ def read(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
 def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
     if name not in arrays:
         raise Fault(f"expected {name} of shape {shape}, actual none")
-    value = arrays[name]
-    if value.ndim == 1 and value.dtype == np.uint8 and name == "instance":  # bytes of 8 or 16 bits each
-        wide = value.size == 2 * int(np.prod(shape))
-        value = value.view(np.uint16) if wide else value
-    elif value.ndim == 1 and value.dtype == np.uint8 and name == "depth":
-        value = value.view(np.float32) if value.size % 4 == 0 else value
-    if value.ndim == 1 and value.size == int(np.prod(shape)):
+    value, size = arrays[name], int(np.prod(shape))
+    if value.ndim == 1 and value.dtype == np.uint8 and size:
+        value = value.view(_BYTES.get((name, value.size / size), np.uint8))
+    if value.ndim == 1 and value.size == size:
         value = value.reshape(shape)
     if value.shape != shape or value.dtype.char not in _TYPES[name]:
         kind = {"image": "uint8", "instance": "integers", "depth": "float32"}[name]

@@ -2,13 +2,15 @@
 image cost?"""
 
 import time
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 
 from probscene.batch import RenderBatch
 from probscene.errors import ModelError
-from probscene.generator import Command
+from probscene.generator import Command, Generator
 from probscene.model import SceneModel
 from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import close_pools
@@ -66,7 +68,7 @@ class GeneratorReport(NamedTuple):
 
 
 def check_generator(model: SceneModel) -> GeneratorReport:
-    """Draw a few scenes of the prior twice. Running workers of any generator are ended.
+    """Draw a few scenes of the prior twice. Running workers of the generator are ended.
 
     Raises:
         ModelError: the model has no generator.
@@ -77,42 +79,73 @@ def check_generator(model: SceneModel) -> GeneratorReport:
             f"Expected a model with a generator, actual {model.name!r}, which probscene draws itself; leave --render "
             "out."
         )
-    with chunk_randomness(0, 0):
-        request = sample(model, model.prior, SCENES).drawing
-    render, found = GeneratedRenderer(model.generator, model.canvas, threads=1), []
-    spent = 0.0
-    for order in (range(SCENES), reversed(range(SCENES))):
-        close_pools()
-        render(request[:1])  # starts it
-        before, each = time.monotonic(), {}
-        for i in order:
-            each[i] = render(request[i : i + 1])
-        spent += time.monotonic() - before
-        found.append([each[i] for i in range(SCENES)])
-    close_pools()
-    command = model.generator if isinstance(model.generator, Command) else None
+    generator = _unkept(model.generator)
+    _end(generator)
+    spent, first = _drawn(generator, model, range(SCENES))
+    _end(generator)
+    more, again = _drawn(generator, model, reversed(range(SCENES)))
+    _end(generator)
     return GeneratorReport(
-        command.name if command else getattr(model.generator, "__name__", type(model.generator).__name__),
-        _differs(*found),
-        spent / (2 * SCENES),
-        1 if command is None else command.workers or cores(),
-        command is None or command.reproducible,
+        _name(generator),
+        _differs(first, again),
+        (spent + more) / 2,
+        _workers(generator),
+        not isinstance(generator, Command) or generator.reproducible,
     )
 
 
 def cost(model: SceneModel, preset: Preset) -> str:
-    """How long a fit draws, in a sentence, where that is long; else empty."""
+    """How long a fit draws, in a sentence, where that is long; else empty. The workers that it starts go on.
+
+    Raises:
+        GeneratorError: the generator cannot draw a few scenes of the prior.
+    """
     if model.generator is None:
         return ""
-    report = check_generator(model)
-    seconds = report.seconds * preset.images / report.workers
+    generator = _unkept(model.generator)
+    workers, each = _workers(generator), _drawn(generator, model, range(SCENES))[0]
+    if generator != model.generator:
+        _end(generator)
+    seconds = each * preset.images / workers
     if seconds < SLOW:
         return ""
     return (
-        f"Note: this fit has about {preset.images:,} images drawn, for which the generator {report.command} needs "
-        f"{_told(seconds)} ({1000 * report.seconds:.3g} ms an image, {report.workers} at once); fewer with "
+        f"Note: this fit has about {preset.images:,} images drawn, for which the generator {_name(generator)} "
+        f"needs {_told(seconds)} ({1000 * each:.3g} ms an image, {workers} at once); fewer with "
         "--features count=efficientnet, and with --set reuse=4, which takes renders of equal counts again."
     )
+
+
+def _unkept(generator: Generator) -> Generator:
+    """The generator, of which no picture is kept: what is checked has to be drawn."""
+    return replace(generator, keep=None) if isinstance(generator, Command) else generator
+
+
+def _drawn(generator: Generator, model: SceneModel, order: Iterable[int]) -> tuple[float, list[RenderBatch]]:
+    """Seconds an image, where scenes are drawn one by one in that order; and the pictures, in the order of the
+    scenes."""
+    with chunk_randomness(0, 0):
+        scenes = sample(model, model.prior, SCENES).drawing
+    render = GeneratedRenderer(generator, model.canvas)
+    render(scenes[torch.zeros(_workers(generator), dtype=torch.int64)])  # starts all workers
+    before = time.monotonic()
+    found = {i: render(scenes[i : i + 1]) for i in order}
+    return (time.monotonic() - before) / SCENES, [found[i] for i in range(SCENES)]
+
+
+def _end(generator: Generator) -> None:
+    if isinstance(generator, Command):
+        close_pools(generator)
+
+
+def _name(generator: Generator) -> str:
+    return (
+        generator.name if isinstance(generator, Command) else getattr(generator, "__name__", type(generator).__name__)
+    )
+
+
+def _workers(generator: Generator) -> int:
+    return generator.workers or cores() if isinstance(generator, Command) else 1
 
 
 def _differs(first: list[RenderBatch], again: list[RenderBatch]) -> tuple[str, ...]:

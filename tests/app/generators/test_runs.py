@@ -23,6 +23,9 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.errors import GeneratorError, ModelError, ProbsceneError, RunError
 from probscene.generator import Command
+from probscene.renderers.generated import GeneratedRenderer
+from probscene.renderers.generator.pool import pool_for
+from probscene.sampling import sample
 
 HERE = Path(__file__).parent
 GUIDE = {"hidden": 8}
@@ -150,22 +153,31 @@ def test_the_check_draws_again_in_another_order(model, call):
         check_generator(load_model("multi_mnist"))
 
 
-def test_a_generator_may_say_that_it_is_not_reproducible(copied, model):
+def test_a_generator_may_say_that_it_is_not_reproducible(copied, model, tmp_path):
     script = copied.with_name("draw_boxes.py")
     script.write_text(script.read_text().replace("random.Random(scene.seed)", "random.Random()"))
     command = Command([sys.executable, str(script)])
     assert "another image" in check_generator(replace(model, generator=command)).fault
+    kept = replace(command, keep=tmp_path / "kept")
+    GeneratedRenderer(kept, model.canvas)(sample(model, model.prior, 2).drawing)
+    assert "another image" in check_generator(replace(model, generator=kept)).fault  # not those that are kept
     open_ = check_generator(replace(model, generator=replace(command, reproducible=False)))
     assert not open_.fault and "no image can be made again" in str(open_)
 
 
 def test_hours_are_told_before_a_fit(model, monkeypatch):
     assert not cost(model, preset("quick"))
-    slow = check_generator(model)._replace(seconds=1.2, workers=2)
-    monkeypatch.setattr("probscene.app.checking.generator_check.check_generator", lambda model: slow)
-    told = cost(model, preset("quick"))
+    monkeypatch.setattr("probscene.app.checking.generator_check._drawn", lambda *args: (1.2, []))
+    told = cost(replace(model, generator=replace(model.generator, workers=2)), preset("quick"))
     assert "needs" in told and " h (1.2e+03 ms an image, 2 at once)" in told
     assert not cost(load_model("multi_mnist"), preset("quick"))
+
+
+def test_telling_the_hours_leaves_the_workers_at_work(model):
+    GeneratedRenderer(model.generator, model.canvas)(sample(model, model.prior, 4).drawing)
+    before = pool_for(model.generator, 1).processes()
+    cost(model, preset("quick"))
+    assert before and set(before) <= set(pool_for(model.generator, 1).processes())
 
 
 def test_a_fit_looks_at_what_the_generator_draws(copied, tmp_path):
