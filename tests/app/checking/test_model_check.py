@@ -15,7 +15,7 @@ from probscene.grammar import Grammar
 from probscene.model import Groups, scene_model
 from probscene.structure import StructurePrior, counts
 
-GOOD = Path(__file__).with_name("discs.py").read_text(encoding="utf-8")
+GOOD = (Path(__file__).parents[1] / "discs.py").read_text(encoding="utf-8")
 X = 'x = pyro.sample("x", dist.Uniform(8.0, 56.0))'
 BLUE = 'Sprites.disc("blue", x, y, radius=6.0, tint=(0.2, 0.2, 1.0)),'
 FAULTS = {
