@@ -44,6 +44,22 @@ def test_the_bytes_are_those_of_an_undisturbed_run(drawn, request_of, fault, fre
     assert not any(running(group) for group in workers)
 
 
+def test_only_a_worker_that_holds_much_memory_is_replaced(drawn, request_of, fault, fresh, command):
+    request = request_of(SCENES)
+    pool = pool_for(command(memory=60.0), 2)  # this process has far more
+    drawn(request, memory=60.0)
+    workers = set(pool.processes())
+    drawn(request, memory=60.0)
+    assert len(workers) == 2 and set(pool.processes()) == workers
+    fresh()
+    fault("leak")
+    pool, seen = pool_for(command(memory=60.0), 2), set()
+    for i in range(SCENES):
+        drawn(request[i : i + 1], memory=60.0)
+        seen |= set(pool.processes())
+    assert len(seen) > 2
+
+
 def test_a_scene_does_not_depend_on_its_batch(drawn, request_of):
     request = request_of(SCENES)
     whole = drawn(request)
