@@ -34,7 +34,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
 from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
 from probscene.app.fitting.preset import BOTH
-from probscene.app.fitting.session import timing
+from probscene.app.fitting.storage import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder

@@ -25,7 +25,7 @@ from probscene.app.api.fit import fit
 from probscene.app.files import write_json
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
-from probscene.app.fitting.session import timing
+from probscene.app.fitting.storage import timing
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide

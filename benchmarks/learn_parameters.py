@@ -33,7 +33,7 @@ from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
 from probscene.app.fitting.learnt.structure import BEFORE
 from probscene.app.fitting.preset import LIKELIHOOD
 from probscene.app.fitting.run import RunFolder
-from probscene.app.fitting.session import timing
+from probscene.app.fitting.storage import timing
 from probscene.app.loading import renderer_for
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite

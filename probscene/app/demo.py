@@ -28,6 +28,7 @@ from .fitting import session
 from .fitting.preset import Preset
 from .fitting.presets import QUICK
 from .fitting.run import RunFolder
+from .fitting.storage import timing
 from .judging.looked import LEARNT, PRIOR, STRUCTURE, policies
 from .labelling.counts import write_counts
 from .loading import load_model
@@ -82,7 +83,7 @@ def demo(
         console.print(table)
     print("\nWithout labels:")
     verdict_text.show_parts(measured["trust"], console)
-    spent = sum(session.timing(run).values())
+    spent = sum(timing(run).values())
     print(f"\nFitting took {spent:.0f} s and saw only {target}. Where to look:")
     for name, what in (
         ("grid.png", "scenes of the prior, of learnt structure alone, of all that was learnt, and of the target"),

@@ -44,7 +44,7 @@ for module, names in ABSENT.items():
 from pathlib import Path
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.datasets.workers import spread
+from probscene.app.workers.processes import spread
 from probscene.app.files import machine_error
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder

@@ -30,6 +30,7 @@ from ..trial import trial as trying
 from ..trial.results import Results
 from ..views import comparison as comparison_picture
 from ..views import report as reporting
+from ..workers.cluster import connected
 
 
 def render(model: SceneModel, scenes: Scenes, threads: int | None = None) -> RenderBatch:
@@ -56,6 +57,7 @@ def generate(
     policy: Policy | None = None,
     min_visible: float = 0.0,
     shard: str | None = None,
+    cluster: str | None = None,
 ) -> Dataset:
     """Write a labelled dataset; the same call goes on after an interruption.
 
@@ -69,6 +71,7 @@ def generate(
         policy: other structures for a model.
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
         shard: ``"I/N"``, I from 0: one of N calls that make the dataset together, see ``generate_run``.
+        cluster: the address of a Ray cluster whose nodes make a run's images, see ``Cluster``.
 
     Raises:
         ProbsceneError: see ``generate_run``.
@@ -78,11 +81,12 @@ def generate(
         if not isinstance(source, RunFolder | SceneModel) and not is_run(str(source)):
             source = load_model(str(source))
         if isinstance(source, SceneModel):
-            if workers != 1:
+            if workers != 1 or cluster is not None:
                 raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
             return generate_scenes(source, policy or source.prior, num, out, seed, format, said, min_visible, shard)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
-        return generate_run(run, num, out, seed, workers, format, said, min_visible, shard)
+        with connected(cluster, show.say) as nodes:
+            return generate_run(run, num, out, seed, workers, format, said, min_visible, shard, nodes)
 
 
 def evaluate(

@@ -23,6 +23,7 @@ from ..fitting.presets import preset as preset_of
 from ..fitting.session import Target
 from ..loading import load_model
 from ..walls.warn import tell
+from ..workers.cluster import connected
 from .calls import display
 from .run import Run, parts_of
 
@@ -48,6 +49,7 @@ def fit(
     labels: Path | str | None = None,
     resume: bool = False,
     progress: bool = True,
+    cluster: str | None = None,
 ) -> Run:
     """Learn which structures occur in unlabelled images.
 
@@ -81,6 +83,8 @@ def fit(
             folder ``label_2``.
         resume: go on with the run in ``out`` where there is one; the other arguments are those that it was begun with.
         progress: show it, on stderr.
+        cluster: the address of a Ray cluster whose nodes render scenes and read them while structure is learnt, see
+            ``Cluster``. They have to see the run's folder by the same path.
 
     Raises:
         ProbsceneError: an input is at fault; the message says which and how to mend it. What was finished of the run
@@ -123,7 +127,8 @@ def fit(
                     other,
                 )
             if not run.is_finished:
-                session.carry_out(run, images, show, *_cache(cache))
+                with connected(cluster, show.say) as nodes:
+                    session.carry_out(run, images, show, *_cache(cache), nodes)
                 tell(run, show)
         except BaseException:
             if temporary is not None:

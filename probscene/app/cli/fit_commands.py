@@ -11,7 +11,7 @@ from probscene.errors import ProbsceneError
 
 from ..arguments import checked_seed
 from .application import app
-from .options import Assets, Cache, NoCache, PresetName, Seed
+from .options import Assets, Cache, ClusterAddress, NoCache, PresetName, Seed
 
 
 @app.command()
@@ -61,6 +61,7 @@ def fit(
     no_cache: NoCache = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
     no_verdict: Annotated[bool, typer.Option("--no-verdict", help="Do not judge the fit at its end.")] = False,
+    cluster: ClusterAddress = None,
 ) -> None:
     """Learn which structures occur in a folder of unlabelled images, and say how near that came."""
     from rich.console import Console
@@ -73,6 +74,7 @@ def fit(
     from ..progress import Display
     from ..views.verdict_text import show_parts
     from ..walls.warn import tell
+    from ..workers.cluster import connected
 
     if seed is not None:
         checked_seed(seed)
@@ -113,7 +115,8 @@ def fit(
             )
             ctx.obj.words.append("--resume")
         if not run.is_finished:
-            session.carry_out(run, images, show, cache, not no_cache)
+            with connected(cluster, show.say) as nodes:
+                session.carry_out(run, images, show, cache, not no_cache, nodes)
             tell(run, show)
             if not no_verdict:
                 judged = judge(run, images or open_target(run, show), show, AFTER_A_FIT)

@@ -27,3 +27,11 @@ Visible = Annotated[
     ),
 ]
 PresetName = StrEnum("PresetName", ["quick", "default", "street", "paper", "paper-aerial", "paper-driving"])
+ClusterAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="ADDRESS",
+        help="Of a Ray cluster whose nodes share the work, HOST:6379; auto for one on this machine.",
+    ),
+]

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from .application import app
-from .options import MinHeight, RunPath, Seed, SomeLabels, Visible
+from .options import ClusterAddress, MinHeight, RunPath, Seed, SomeLabels, Visible
 
 
 @app.command()
@@ -30,15 +30,18 @@ def generate(
         str | None,
         typer.Option(metavar="I/N", help="One of N commands, I from 0, that make it together; none finishes it."),
     ] = None,
+    cluster: ClusterAddress = None,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
     from ..datasets.generate import generate
     from ..fitting.run import RunFolder
     from ..progress import Display
+    from ..workers.cluster import connected
 
-    with Display() as show:
+    with Display() as show, connected(cluster, show.say) as nodes:
         said = show.stage("generating")
-        dataset = generate(RunFolder.at(run), num, out, seed, workers, format or "coco", said, min_visible, shard)
+        opened = RunFolder.at(run)
+        dataset = generate(opened, num, out, seed, workers, format or "coco", said, min_visible, shard, nodes)
     print(f"{dataset.num} images in {dataset.path}, {dataset.made} of them made now")
     if not dataset.finished:
         print("When all shards are done, the same command without --shard writes the files of labels.")

@@ -14,6 +14,7 @@ import json
 import os
 import shutil
 import socket
+import time
 import uuid
 import zlib
 from collections.abc import Callable, Iterator
@@ -30,6 +31,7 @@ from .formats import found
 from .provenance import image_name
 
 LINES = "provenance.jsonl"
+SEEN = 20  # seconds
 UNSAID = {"min_visible": 0.0}
 """Settings that are recorded only where they have another value than this."""
 
@@ -232,6 +234,22 @@ class DatasetFolder:
                 f"Expected the settings that the dataset in {self.out} was begun with ({was}), actual {now}; "
                 "give the same, or name another folder; this one is left as it is."
             )
+
+
+def check_begun(out: Path) -> None:
+    """See that a dataset which another machine has begun is seen here, too.
+
+    Raises:
+        DataError: it is not.
+    """
+    for _ in range(SEEN):  # a network's file system may be some seconds behind
+        if (out / ".parts" / "settings.json").exists():
+            return
+        time.sleep(1)
+    raise DataError(
+        f"Expected the folder {out} of the machine that runs the command, actual another or none; write to a folder "
+        "that all nodes share."
+    )
 
 
 def _link(other: Path, path: Path) -> None:

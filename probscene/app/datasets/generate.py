@@ -28,11 +28,12 @@ from probscene.policy import Policy
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder
 from ..loading import renderer_for
+from ..workers.cluster import Cluster
+from ..workers.processes import spread
 from . import coco, kitti, shards, yolo
-from .folder import LINES, UNSAID, WHOLE, DatasetFolder, Shard
+from .folder import LINES, UNSAID, WHOLE, DatasetFolder, Shard, check_begun
 from .formats import chosen
 from .provenance import provenance
-from .workers import spread
 
 Done = Callable[[int, int], None]
 """Called with the number of images there are, and how many there are to be."""
@@ -64,6 +65,7 @@ def generate(
     progress: Done | None = None,
     min_visible: float = 0.0,
     shard: str | None = None,
+    cluster: Cluster | None = None,
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
 
@@ -75,27 +77,34 @@ def generate(
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
         shard: ``"I/N"``, I from 0: makes every N-th chunk alone, and no files of labels for the whole. Several shards
             may write to one folder at once; the same call without ``shard`` makes what is missing and finishes.
+        cluster: of which all nodes make images, in place of ``workers``. They have to see the folders of the run and of
+            the dataset by the same paths.
 
     Raises:
         ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
             format, more classes or objects than KITTI's masks can number, another text for a shard.
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
-        MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped.
+        MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped. See also
+            ``Crew.run``.
     """
     if workers < 1:
         raise ProbsceneError(f"Expected a positive number of workers, actual {workers}.")
+    if cluster is not None and workers > 1:
+        raise ProbsceneError(f"Expected workers or a cluster, actual {workers} workers and a cluster; leave one out.")
     part = WHOLE if shard is None else Shard.of(shard)
     job = Job(run.model, run.guide, num, Path(out), seed, chosen(format), run.guide_hash(), min_visible)
-    if workers == 1:
+    if workers == 1 and cluster is None:
         return job.run(job.each, progress, part)
     if run.objects:
         raise ProbsceneError(
-            f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual {workers}; "
-            "fit a model and parts in files for more."
+            f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual "
+            f"{workers if cluster is None else 'a cluster'}; fit a model and parts in files for more."
         )
-    task = (run.path, num, Path(out), seed, job.formats, min_visible)
-    return job.run(partial(spread, _worker, task, workers), progress, part)
+    task = (run.path.resolve(), num, Path(out).resolve(), seed, job.formats, min_visible)
+    if cluster is None:
+        return job.run(partial(spread, _worker, task, workers), progress, part)
+    return job.run(cluster.crew(_actor, task).run, progress, part)
 
 
 def generate_scenes(
@@ -255,6 +264,13 @@ def _worker(
     """What a worker process does with a chunk's number."""
     opened = RunFolder.at(run)
     return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), min_visible).make
+
+
+def _actor(run: Path, num: int, out: Path, *settings: Any) -> Callable[[int], int]:
+    """The same on a node of a cluster."""
+    make = _worker(run, num, out, *settings)
+    check_begun(out)
+    return make
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:

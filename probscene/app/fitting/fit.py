@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from probscene.dataset import ImageFolder, Images
-from probscene.errors import DataError, RunError
+from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.judging.two_sample import NEEDED, check_features
 from probscene.inference.training import Training, batch_seed
@@ -25,6 +25,7 @@ from probscene.threads import threads
 from ..files import write_text
 from ..labelling.few import FewLabels, PartlyLabelled
 from ..progress import Progress
+from ..workers.cluster import Cluster
 from .cache import NetworkCache
 from .learnt.outcome import compared, conclude, give_up
 from .learnt.parameters import learn_parameters
@@ -47,6 +48,7 @@ def fit(
     use_cache: bool = True,
     say: Say | None = None,
     labels: FewLabels | None = None,
+    cluster: Cluster | None = None,
 ) -> Policy:
     """Finish a run: take the stages that it lacks.
 
@@ -56,6 +58,8 @@ def fit(
         use_cache: whether to look there at all.
         say: is told where a network came from there.
         labels: of some of the target's images, for features that take them.
+        cluster: of which all nodes render scenes and read them while structure is learnt. They have to see the run's
+            folder by the same path.
 
     Raises:
         DataError: the target cannot be used: see ``check_target`` and ``check_features``.
@@ -64,6 +68,11 @@ def fit(
     """
     if run.is_finished:
         return run.guide
+    if cluster is not None and run.objects:
+        raise ProbsceneError(
+            f"Expected no cluster for a fit with parts in memory alone ({', '.join(run.objects)}); put model and parts "
+            "in files, which nodes can open."
+        )
     images = cache(lambda: open_target(run, progress) if target is None else target)
     observer = Observer(run.model, run.record["threads"])
     with threads(run.record["threads"]):
@@ -76,11 +85,11 @@ def fit(
         if which is not None and not which.any():
             said = give_up(run)
         else:
-            guide = learn_structure(run, observer, net.net, real, progress)
+            guide = learn_structure(run, observer, net.net, real, progress, cluster)
             if "parameters" in run.preset.learn:
                 with threads(run.record["threads"]):
                     learn_parameters(run, observer, net.net, guide, images, progress, say or (lambda text: None))
-                learn_structure_again(run, net.net, real, guide, progress)
+                learn_structure_again(run, net.net, real, guide, progress, cluster)
             said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
     for name in (FIRST, AGAIN):
         (run.path / f"{name}-checkpoint.safetensors").unlink(missing_ok=True)

@@ -5,12 +5,14 @@ Axis letters: N scenes, M nodes, D features, C H W.
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from probscene.batch import RenderBatch
 from probscene.dataset import grey
+from probscene.derivation import Derivation
 from probscene.inference.features.base import Examples, FeatureNet, class_table, examples
 from probscene.inference.features.counting.grouping import group_of
 from probscene.model import SceneModel
@@ -18,9 +20,22 @@ from probscene.relations import relations
 from probscene.sampling import Scenes, run_program, sample
 from probscene.threads import threads
 
+from ..chunks import chunk_randomness
 from ..loading import renderer_for
+from ..workers.cluster import Crew
 
 RENDERED_AT_ONCE = 64  # images in memory
+
+Observe = Callable[[Scenes], Tensor]
+"""Features ``(N, D)`` of scenes."""
+
+
+class Part(NamedTuple):
+    """Some structures of a batch, ``rules (N, T)``, and what their parameters are drawn from."""
+
+    rules: Tensor
+    seed: int
+    number: int
 
 
 class Observer:
@@ -73,7 +88,7 @@ class Observer:
         size = (batch.amodal_box[..., 2:] - batch.amodal_box[..., :2]).prod(-1)[seen].sqrt()
         return float(size.quantile(0.1)) if len(size) else math.inf
 
-    def observe(self, net: FeatureNet, draws_per_structure: int = 1) -> Callable[[Scenes], Tensor]:
+    def observe(self, net: FeatureNet, draws_per_structure: int = 1) -> Observe:
         """Render and embed, a few images at a time.
 
         Args:
@@ -94,6 +109,33 @@ class Observer:
                 return torch.cat([net.embed(self._as_read(some)) for some in images])
 
         return features
+
+    def observe_anew(self, net: FeatureNet, draws_per_structure: int = 1, crew: Crew | None = None) -> Observe:
+        """Features of scenes of the same structures, their parameters drawn anew: each part of a batch from a seed and
+        its number, so that it does not matter where that is done.
+
+        Args:
+            draws_per_structure: see ``observe``.
+            crew: actors that do it, prepared to do ``Part``s by ``part``; else this process does.
+        """
+
+        def features(scenes: Scenes) -> Tensor:
+            seed = int(torch.randint(1 << 62, ()))
+            some = scenes.derivation.rules.split(RENDERED_AT_ONCE)
+            parts = [Part(rules.clone(), seed, number) for number, rules in enumerate(some)]  # a view has all to pickle
+            if crew is None:
+                return torch.cat([self.part(part, net, draws_per_structure)[1] for part in parts])
+            found: list[tuple[int, Tensor]] = []
+            crew.run(parts, found.append)
+            return torch.cat([features for _, features in sorted(found, key=lambda pair: pair[0])])
+
+        return features
+
+    def part(self, some: "Part", net: FeatureNet, draws_per_structure: int) -> tuple[int, Tensor]:
+        """A part's number and its features ``(N, D)``."""
+        with chunk_randomness(some.seed, some.number), torch.no_grad():
+            derivation = Derivation.of(self.model.grammar, some.rules)
+            return some.number, self.observe(net, draws_per_structure)(run_program(self.model, derivation))
 
     def _as_read(self, images: Tensor) -> Tensor:
         """Renders ``(N, 3, H, W)`` as ``ImageFolder`` would read them from files, ``(N, channels, H, W)``."""

@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,15 +26,15 @@ from ..labelling.few import FewLabels, labels_record, read_few
 from ..loading import lasting_reference, load_model
 from ..modules import file_digest
 from ..progress import Display
+from ..workers.cluster import Cluster
 from .fit import check_target, fit, open_target
 from .parts import Parts, in_memory, is_file_part, part_file
 from .preset import Preset
 from .presets import takers_of_labels
 from .run import RunFolder
 from .scene_features import UNLIKE, unlike
-from .storage import check_free
+from .storage import TIMING, check_free, timing
 
-TIMING = "timing.json"
 BEFORE = ("reading", "features", "readings", "target", "pretraining")
 STAGES = (*BEFORE, "structure", "parameters", "structure-again", "outcome")
 
@@ -188,19 +187,24 @@ def resume(
 
 
 def carry_out(
-    run: RunFolder, target: Images | None, show: Display, cache: Path | None = None, use_cache: bool = True
+    run: RunFolder,
+    target: Images | None,
+    show: Display,
+    cache: Path | None = None,
+    use_cache: bool = True,
+    cluster: Cluster | None = None,
 ) -> None:
     """Finish the fit; the time is kept even where it is interrupted.
 
     Args:
-        cache, use_cache: see ``fit.fit``.
+        cache, use_cache, cluster: see ``fit.fit``.
 
     Raises:
         ProbsceneError: see ``fit.fit``.
     """
     before = timing(run)
     try:
-        fit(run, show, target, cache, use_cache, show.say, run.few)
+        fit(run, show, target, cache, use_cache, show.say, run.few, cluster)
     finally:
         spent = {stage: before.get(stage, 0.0) + show.seconds.get(stage, 0.0) for stage in STAGES}
         write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
@@ -221,14 +225,6 @@ def _suited(
         f"{photographs.features} says so from the start."
     )
     return photographs
-
-
-def timing(run: RunFolder) -> dict[str, float]:
-    """Seconds by stage, as far as they are known."""
-    try:
-        return json.loads((run.path / TIMING).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
 
 
 def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display) -> Images:

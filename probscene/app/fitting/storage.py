@@ -33,6 +33,7 @@ from ..files import write_json, write_text, write_whole
 from ..modules import file_digest
 from .parts import IN_MEMORY, inner
 
+TIMING = "timing.json"
 FORMAT = 3  # of the run folder; another number is not read
 READINGS, OUTCOME, PARAMETERS = "readings.json", "outcome.json", "parameters.json"
 SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
@@ -262,3 +263,11 @@ def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
             "were when the run was begun, or fit again."
         ) from error
     module.eval()
+
+
+def timing(run: Storage) -> dict[str, float]:
+    """Seconds by stage, as far as they are known."""
+    try:
+        return json.loads((run.path / TIMING).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}

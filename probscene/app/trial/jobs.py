@@ -21,8 +21,8 @@ from probscene.errors import RunError
 from probscene.threads import threads
 
 from ..chunks import chunk_randomness
-from ..datasets.workers import spread
 from ..files import make_folder, write_whole
+from ..workers.processes import spread
 from .detector import Recipe, build
 from .plan import Part, chosen
 from .sets import Example, LabelledSet

@@ -21,9 +21,9 @@ from ..evaluation.labels import read_labels
 from ..evaluation.sources import START
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
-from ..fitting import session
 from ..fitting.fit import open_target
 from ..fitting.run import RunFolder
+from ..fitting.storage import timing
 from ..judging.looked import LEARNT, PRIOR, STRUCTURE, policies
 from ..pictures import Pixels, grid, pixels, shrunk
 from ..progress import STAGES, Display
@@ -270,7 +270,7 @@ def _log(run: RunFolder) -> list[dict[str, Any]]:
 
 
 def _timing(run: RunFolder) -> str:
-    spent = session.timing(run)
+    spent = timing(run)
     if not spent:
         return "<p>No times were recorded.</p>"
     rows = [(STAGES[stage][0], f"{spent[stage]:.1f} s") for stage in STAGES if stage in spent]

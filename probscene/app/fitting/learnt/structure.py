@@ -5,6 +5,9 @@ that their counts are read otherwise. With learnt parameters both are read alike
 difference out. Axis letters: L images, D features.
 """
 
+from collections.abc import Callable
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
@@ -21,22 +24,32 @@ from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
 
 from ...progress import Progress
-from ..observer import Observer
+from ...workers.cluster import Cluster, Crew
+from ..observer import Observe, Observer, Part
 from ..parts import inner
 from ..run import RunFolder
 from ..storage import Keeper
 from .outcome import compared
+from .parameters import NAME, beside, with_parameters
 
 FIRST, AGAIN = "guide", "structure-again"  # of the checkpoints
 BEFORE = "guide-first"  # of the guide that parameters are learnt with
 SLOWER = 0.2  # of the first pass's rate
 
 
-def learn_structure(run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, progress: Progress) -> Guide:
+def learn_structure(
+    run: RunFolder,
+    observer: Observer,
+    net: FeatureNet,
+    real: Tensor,
+    progress: Progress,
+    cluster: Cluster | None = None,
+) -> Guide:
     """A guide of the structures of a model with the prior's parameters.
 
     Args:
         real: ``(L, D)``.
+        cluster: of which all nodes render and read scenes; else this process does.
 
     Raises:
         ProbsceneError: a cost or a parameter is no longer finite.
@@ -47,8 +60,9 @@ def learn_structure(run: RunFolder, observer: Observer, net: FeatureNet, real: T
     if known is not None:
         guide.load_state_dict(known)
         return guide
-    pool = _pool(run, run.model)
-    objective = _objective(run, run.model, observer, net, guide, preset.draws_per_structure, pool)
+    pool, crew = _pool(run, run.model), _crew(run, cluster, preset.draws_per_structure, again=False)
+    observe = observer.observe_anew(net, preset.draws_per_structure, crew)
+    objective = _objective(run, run.model, observe, net, guide, pool)
     rate, seeds = preset.learning_rate, batch_seed(seed, 3)
     trainer = _trainer(run, run.model, guide, objective, real, preset.batches, rate, seeds, pool)
     keep = Keeper(run, FIRST, trainer)
@@ -62,18 +76,26 @@ def learn_structure(run: RunFolder, observer: Observer, net: FeatureNet, real: T
             learning_rate=preset.pretrain_rate,
             progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
         )
-    _run(trainer, keep, "structure", progress)
+    _run(trainer, keep, "structure", progress, crew)
     if "parameters" in preset.learn:
         run.write_tensors(BEFORE, guide.state_dict())
     return guide
 
 
-def learn_structure_again(run: RunFolder, net: FeatureNet, real: Tensor, guide: Guide, progress: Progress) -> None:
+def learn_structure_again(
+    run: RunFolder,
+    net: FeatureNet,
+    real: Tensor,
+    guide: Guide,
+    progress: Progress,
+    cluster: Cluster | None = None,
+) -> None:
     """Go on with a guide whose scenes have learnt parameters; as it is where they have none, and as it was where its
     scenes end farther from the target.
 
     Args:
         real: ``(L, D)``.
+        cluster: see ``learn_structure``.
 
     Raises:
         ProbsceneError: a cost or a parameter is no longer finite.
@@ -84,12 +106,12 @@ def learn_structure_again(run: RunFolder, net: FeatureNet, real: Tensor, guide: 
     seed_everything(batch_seed(seed, 8))
     model = guide.suits(run.model)
     observer, before = Observer(model, run.record["threads"]), {k: v.clone() for k, v in guide.state_dict().items()}
-    pool = _pool(run, model)
-    objective = _objective(run, model, observer, net, guide, 1, pool)
+    pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True)
+    objective = _objective(run, model, observer.observe_anew(net, 1, crew), net, guide, pool)
     rate, seeds = SLOWER * preset.learning_rate, batch_seed(seed, 7)
     trainer = _trainer(run, model, guide, objective, real, preset.batches_again, rate, seeds, pool)
     seen = _seen(run, observer, net, guide)
-    _run(trainer, Keeper(run, AGAIN, trainer), AGAIN, progress)
+    _run(trainer, Keeper(run, AGAIN, trainer), AGAIN, progress, crew)
     which = compared(net)
     which = slice(None) if which is None else which
     now, then, target = (part[:, which].double().numpy() for part in (_seen(run, observer, net, guide), seen, real))
@@ -108,16 +130,31 @@ def _pool(run: RunFolder, model: SceneModel) -> RenderPool | None:
     return RenderPool(model, run.preset.reuse) if run.preset.reuse else None
 
 
+def _crew(run: RunFolder, cluster: Cluster | None, draws_per_structure: int, again: bool) -> Crew | None:
+    task = run.path.resolve(), draws_per_structure, again
+    return None if cluster is None else cluster.crew(_actor, task, run.record["threads"])
+
+
+def _actor(path: Path, draws_per_structure: int, again: bool) -> Callable[[Part], tuple[int, Tensor]]:
+    """What a node of a cluster does with a part of a batch."""
+    run = RunFolder.at(path)
+    model, net = run.model, run.network()
+    assert net is not None
+    if again and (suits := with_parameters(run, run.new_guide(), beside(run.read_tensors(NAME) or {})).suits):
+        model = suits(model)
+    observer = Observer(model, run.record["threads"])
+    return lambda part: observer.part(part, net, draws_per_structure)
+
+
 def _objective(
     run: RunFolder,
     model: SceneModel,
-    observer: Observer,
+    observe: Observe,
     net: FeatureNet,
     guide: Guide,
-    draws_per_structure: int,
     pool: RenderPool | None,
 ) -> ScoreFunction:
-    preset, observe = run.preset, observer.observe(net, draws_per_structure)
+    preset = run.preset
     held = Held(model, {*run.unread, *(model.stuff if run.readings else ())}, preset.num_scenes)
     return ScoreFunction(
         held.beside(observe if pool is None else pool.around(observe)),
@@ -148,10 +185,14 @@ def _trainer(
     return Trainer(model, guide, objective, real, batches, scenes, images, rate, preset.cosine, seed, pool)
 
 
-def _run(trainer: Trainer, keep: Keeper, stage: str, progress: Progress) -> None:
+def _run(trainer: Trainer, keep: Keeper, stage: str, progress: Progress, crew: Crew | None) -> None:
     def each(trainer: Training, diagnostics: dict[str, float]) -> None:
         keep({"stage": stage, **diagnostics})
         progress(stage, trainer.done, trainer.total, f"cost {diagnostics['cost']:.3f}")
 
-    trainer.run(each)
+    try:
+        trainer.run(each)
+    finally:
+        if crew is not None:
+            crew.close()
     keep.finish()

@@ -1,0 +1,143 @@
+"""A Ray cluster makes what one process makes, whatever becomes of its nodes."""
+
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from probscene.app.datasets.generate import _actor, generate
+from probscene.app.fitting.run import RunFolder
+from probscene.app.workers import cluster as clusters
+from probscene.app.workers.cluster import Cluster
+from probscene.errors import MachineError, ModelError, ProbsceneError
+
+pytest.importorskip("ray")
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
+
+
+def doubling(pause=0.0, fault=None):
+    """A crew's work, found by nodes under this file's name."""
+
+    def do(task):
+        time.sleep(pause)
+        if task == fault:
+            raise ModelError("this one cannot be drawn")
+        return task, 2 * task
+
+    return do
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def said():
+    return []
+
+
+@pytest.fixture
+def nodes(simulated, said, monkeypatch):
+    """A connection to the cluster; what is late is soon found to be."""
+    monkeypatch.setattr(clusters, "LATE", 2.0)
+    with Cluster(simulated.address, said.append) as connected:
+        yield connected
+
+
+def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, said):
+    crew, found = nodes.crew(doubling, (0.1,)), []
+
+    def done(result):
+        found.append(result)
+        if len(found) == 6:
+            simulated.kill()
+        if len(found) == 12:
+            simulated.freeze()
+
+    crew.run(range(40), done)
+    assert sorted(found) == [(task, 2 * task) for task in range(40)]
+    while not any("is lost" in line for line in said):  # Ray needs some seconds to see it
+        again = []
+        crew.run([7, 8], again.append)  # on the node that is left
+        assert sorted(again) == [(7, 14), (8, 16)]
+    assert sum("has not answered" in line for line in said) == 1
+    crew.close()
+
+
+def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_path):
+    run, made = RunFolder.at(fitted), []
+    generate(run, 700, tmp_path / "alone", seed=3, format="coco,yolo")
+
+    def progress(number, _):
+        made.append(number)
+        if len(made) == 3:
+            simulated.kill()
+        if len(made) == 5:
+            simulated.freeze()
+
+    dataset = generate(run, 700, tmp_path / "out", 3, format="coco,yolo", progress=progress, cluster=nodes)
+    assert dataset.made == 700 and dataset.finished and made[-1] == 700
+    assert contents(tmp_path / "out") == contents(tmp_path / "alone")
+
+
+def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_path, monkeypatch):
+    words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "num_scenes=150"]
+    assert call(*words, "--out", tmp_path / "alone").code == 0
+    parts, run = [], clusters.Crew.run
+
+    def disturbed(crew, tasks, done):
+        def each(result):
+            parts.append(result)
+            if len(parts) == 5:
+                simulated.kill()
+            done(result)
+
+        return run(crew, tasks, each)
+
+    monkeypatch.setattr(clusters.Crew, "run", disturbed)
+    result = call(*words, "--out", tmp_path / "out", "--cluster", simulated.address)
+    assert result.code == 0, result.err
+    assert len(parts) == 4 * 3
+    for name in ("features.safetensors", "guide.safetensors", "log.jsonl"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
+
+
+def test_what_a_task_raises_is_told_with_its_node(nodes):
+    with pytest.raises(ModelError, match="^On node .*: this one cannot be drawn$"):
+        nodes.crew(doubling, (0.0, 3)).run([3], lambda result: None)
+
+
+def test_other_versions_are_refused(nodes, monkeypatch):
+    here = clusters.versions()
+    monkeypatch.setattr(clusters, "versions", lambda: {**here, "torch": "1.0"})
+    with pytest.raises(ProbsceneError, match="Expected torch 1.0 on node .*, as on this machine, actual 2"):
+        nodes.crew(doubling, ()).run([1], lambda result: None)
+
+
+def test_the_last_node_is_lost(simulated, nodes):
+    def done(_):
+        while simulated.nodes:
+            simulated.kill()
+
+    with pytest.raises(MachineError, match="Expected a node with 1 cores .*, actual .*goes on where it stopped"):
+        nodes.crew(doubling, (0.1,)).run(range(1000), done)
+
+
+def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
+    run = RunFolder.at(fitted)
+    assert run.guide_hash() and run.guide  # as of another machine's disk, which nodes do not have
+    run.path = tmp_path / "elsewhere"
+    with pytest.raises(ProbsceneError, match="On node .*: Expected a run folder, .*elsewhere"):
+        nodes.crew(_actor, (run.path, 10, tmp_path / "out", 0, ("coco",), 0.0)).run([0], lambda result: None)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "nowhere", "nowhere.invalid:6379"])
+def test_a_cluster_that_is_not_there_is_one_line(call, fitted, tmp_path, address):
+    result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
+    assert result.code == 1 and result.err.count("\n") == 1
+    assert f"Expected a Ray cluster at {address}, actual none" in result.err and not (tmp_path / "out").exists()
+
+
+def test_workers_or_a_cluster(fitted, tmp_path):
+    with pytest.raises(ProbsceneError, match="Expected workers or a cluster"):
+        generate(RunFolder.at(fitted), 4, tmp_path / "out", workers=2, cluster=SimpleNamespace())
