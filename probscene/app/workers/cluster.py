@@ -26,6 +26,7 @@ SLOWER = 4.0  # times the longest that has been done before: then another actor 
 LOOK = 2.0  # seconds from one look at the nodes to the next
 START = 180.0  # seconds in which the first actor has to be there
 ATTEMPTS = 3  # actors that may die with a task before it is an error
+SHARED = "Nodes have to see the run's folder, its files and --out by the same paths as this machine."
 WAIT, CONNECT = 0.5, 10.0  # seconds
 
 
@@ -242,7 +243,8 @@ class Crew:
         kind, value = found
         if kind == "fault":
             where = f"On node {self._names[member.node]}: "
-            raise type(value)(f"{where}{value}") if isinstance(value, ProbsceneError) else value
+            shared = f" {SHARED}" if asked == "prepare" else ""
+            raise type(value)(f"{where}{value}{shared}") if isinstance(value, ProbsceneError) else value
         return (value,)
 
     def _check_versions(self, member: _Member, there: dict[str, str]) -> None:
