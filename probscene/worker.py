@@ -156,8 +156,9 @@ def packed(drawn):
 
 def memory():
     """The most that this process has had resident, megabytes; 0 where that is not known."""
+    status = os.path.join(os.sep, "proc", "self", "status")  # of Linux; ru_maxrss is there at least what a parent had
     try:
-        with open("/proc/self/status") as file:  # ru_maxrss of a child of fork is at least what its parent had
+        with open(status, encoding="ascii", errors="replace") as file:
             return next(float(line.split()[1]) / 1024 for line in file if line.startswith("VmHWM"))
     except (OSError, StopIteration):
         pass
