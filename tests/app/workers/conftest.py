@@ -1,13 +1,18 @@
-"""A cluster for tests."""
+"""A cluster of three nodes, whatever was done to them before."""
+
+from pathlib import Path
 
 import pytest
 
-from .simulated import Simulated
+from probscene.app.modules import import_file
+
+SIMULATED = Path(__file__).parents[3] / "benchmarks" / "simulated_cluster.py"
 
 
 @pytest.fixture(scope="module")
 def _simulated():
-    simulated = Simulated()
+    pytest.importorskip("ray")
+    simulated = import_file(SIMULATED).Simulated()
     yield simulated
     simulated.shutdown()
 

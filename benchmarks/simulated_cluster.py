@@ -1,4 +1,4 @@
-"""A cluster on this machine, of a head without cores and nodes of one core each, that can be killed and frozen."""
+"""A Ray cluster simulated on this machine, of a head without cores and nodes of one core, to be killed and frozen."""
 
 import contextlib
 import os

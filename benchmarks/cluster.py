@@ -1,0 +1,148 @@
+"""What a Ray cluster costs, and what a node costs that dies or freezes.
+
+    python benchmarks/cluster.py [--out FOLDER] [--images 20000] [--disturbed 6000]
+
+First one process, two workers and ``--cluster auto`` make the same Multi-MNIST images: seconds, and seconds of CPU of
+all processes, those of Ray among them; and what a cluster costs with one chunk. Then three simulated nodes of one core
+each make fewer images, undisturbed, and with a node killed after a quarter and another frozen after a half: seconds,
+and how long the longest wait between two chunks was. A fit's structure is learnt on the same nodes, disturbed likewise.
+Whatever was disturbed is compared with the bytes of one process. Digits are those that come with the install.
+"""
+
+import argparse
+import contextlib
+import filecmp
+import json
+import shutil
+import threading
+import time
+from pathlib import Path
+
+import psutil
+from given import command, out_option
+from simulated_cluster import Simulated
+
+import probscene as ps
+from probscene.app.datasets.generate import generate
+from probscene.app.files import write_json
+from probscene.app.fitting.run import RunFolder
+from probscene.app.workers.cluster import Cluster, Crew
+
+SHORT = {"count.steps": 60, "batches": 8, "num_scenes": 300, "pretrain_derivations": 500, "learn": "structure"}
+
+
+class CPU:
+    """Seconds of CPU of this process and of all that it has started."""
+
+    def __enter__(self):
+        self.seen: dict[int, float] = {}
+        self.ended = threading.Event()
+        self.thread = threading.Thread(target=self._watch, daemon=True)
+        self.begun, self.before = time.monotonic(), self._own()
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._look()
+        self.ended.set()
+        self.thread.join()
+        self.wall = time.monotonic() - self.begun
+        self.seconds = self._own() - self.before + sum(self.seen.values())
+
+    def _own(self) -> float:
+        return sum(psutil.Process().cpu_times()[:2])
+
+    def _look(self) -> None:
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                self.seen[process.pid] = sum(process.cpu_times()[:2])
+
+    def _watch(self) -> None:
+        while not self.ended.wait(0.5):
+            self._look()
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether two folders hold the same files."""
+    files = [{path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} for folder in (one, other)]
+    return files[0] == files[1] and not filecmp.cmpfiles(one, other, files[0], shallow=False)[1]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    out_option(parser, __file__)
+    parser.add_argument("--images", type=int, default=20_000)
+    parser.add_argument("--disturbed", type=int, default=6_000)
+    args = parser.parse_args()
+    out, found = args.out, {"command": command(__file__)}
+    model = ps.load_model("multi_mnist")
+    target = out / "target"
+    ps.generate(model.target(0), 300, target, format="images", progress=False)
+    shutil.rmtree(out / "alone", ignore_errors=True)
+    fit = {"preset": "quick", "features": "count", "settings": SHORT, "cache": out / "cache"}
+    alone = ps.fit("multi_mnist", target / "images", out=out / "alone", **fit)
+    run = RunFolder.at(alone.path)
+
+    def made(name, number, **how):
+        shutil.rmtree(out / name, ignore_errors=True)
+        with CPU() as cost:
+            if how.pop("auto", False):
+                with Cluster("auto") as cluster:
+                    generate(run, number, out / name, 0, cluster=cluster)
+            else:
+                generate(run, number, out / name, 0, **how)
+        found[name] = {"images": number, "seconds": cost.wall, "cpu": cost.seconds}
+        print(name, json.dumps(found[name]), flush=True)
+
+    made("cluster of one chunk", 64, auto=True)
+    if args.images:
+        made("one process", args.images)
+        made("two workers", args.images, workers=2)
+        made("cluster", args.images, auto=True)
+        found["same bytes"] = same(out / "one process", out / "cluster")
+    made("fewer", args.disturbed)
+    simulated = Simulated()
+    for name, disturb in (("three nodes", False), ("one killed, one frozen", True)):
+        simulated.whole()
+        shutil.rmtree(out / name, ignore_errors=True)
+        times, said, done = [time.monotonic()], [], set()
+
+        def progress(number, total, disturb=disturb, times=times, done=done):
+            times.append(time.monotonic())
+            for share, what in ((4, simulated.kill), (2, simulated.freeze)):
+                if disturb and number >= total // share and what not in done:
+                    done.add(what)
+                    what()
+
+        with Cluster(simulated.address, said.append) as cluster:
+            generate(run, args.disturbed, out / name, 0, progress=progress, cluster=cluster)
+        longest = max(later - earlier for earlier, later in zip(times, times[1:], strict=False))
+        found[name] = {"images": args.disturbed, "seconds": times[-1] - times[0], "longest wait": longest}
+        found[name] |= {"same bytes": same(out / "fewer", out / name), "said": said}
+        print(name, json.dumps(found[name]), flush=True)
+    simulated.whole()
+    shutil.rmtree(out / "nodes", ignore_errors=True)
+    run_crew, parts = Crew.run, []
+
+    def disturbed(crew, tasks, done):
+        def each(result):
+            parts.append(result)
+            for number, what in ((8, simulated.kill), (20, simulated.freeze)):
+                if len(parts) == number:
+                    what()
+            done(result)
+
+        run_crew(crew, tasks, each)
+
+    Crew.run = disturbed
+    with CPU() as cost:
+        ps.fit("multi_mnist", target / "images", out=out / "nodes", cluster=simulated.address, **fit)
+    guides = [(out / name / "guide.safetensors").read_bytes() for name in ("alone", "nodes")]
+    found["fit"] = {"seconds": cost.wall, "same bytes": guides[0] == guides[1]}
+    print("fit", json.dumps(found["fit"]), flush=True)
+    simulated.shutdown()
+    write_json(out / "results.json", found)
+
+
+if __name__ == "__main__":
+    main()
