@@ -64,7 +64,7 @@ def generate(
     Args:
         source: a run or its folder, for the learnt structures; or a model, for the prior's.
         num: how many images.
-        out: the folder to write.
+        out: the folder to write, or an address of a file system that fsspec knows, such as ``s3://bucket/folder``.
         format: ``"coco"``, ``"yolo"``, ``"kitti"``, ``"webdataset"``, several of them, or ``"images"`` for no labels.
         workers: processes of a run's generation; the bytes do not depend on their number. More than one are spawned: a
             script calls this under ``if __name__ == "__main__":``.
@@ -77,7 +77,7 @@ def generate(
         ProbsceneError: see ``generate_run``.
     """
     with display(progress) as show:
-        said, out = show.stage("generating"), Path(out)
+        said = show.stage("generating")
         if not isinstance(source, RunFolder | SceneModel) and not is_run(str(source)):
             source = load_model(str(source))
         if isinstance(source, SceneModel):

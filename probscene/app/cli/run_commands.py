@@ -13,7 +13,9 @@ from .options import ClusterAddress, MinHeight, RunPath, Seed, SomeLabels, Visib
 def generate(
     run: RunPath,
     num: Annotated[int, typer.Option(metavar="N", help="How many images.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    out: Annotated[
+        str, typer.Option(metavar="DIR", help="The folder to write, or an address such as s3://bucket/folder.")
+    ],
     format: Annotated[
         list[str] | None,
         typer.Option(

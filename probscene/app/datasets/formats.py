@@ -10,8 +10,7 @@ All are written from the same renders and share ``images/``: KITTI's image files
 where the file system has none. Shards hold images of their own; for them alone, no ``images/`` is written.
 """
 
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Callable, Iterable
 
 from probscene.errors import ProbsceneError
 
@@ -36,10 +35,14 @@ def chosen(format: str | Iterable[str]) -> tuple[str, ...]:
     return _normal(names)
 
 
-def found(folder: Path) -> tuple[str, ...]:
-    """The formats of a finished dataset, as ``chosen`` gives them."""
-    names = [name for name, mark in _MARKS.items() if (folder / mark).exists()]
-    return _normal([*names, *(["images"] if (folder / "images").exists() else [])])
+def found(exists: Callable[[str], bool]) -> tuple[str, ...]:
+    """The formats of a finished dataset, as ``chosen`` gives them.
+
+    Args:
+        exists: whether the dataset has a file or folder of a name.
+    """
+    names = [name for name, mark in _MARKS.items() if exists(mark)]
+    return _normal([*names, *(["images"] if exists("images") else [])])
 
 
 def _normal(names: list[str]) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ from ..workers.processes import spread
 from . import coco, kitti, shards, yolo
 from .folder import LINES, UNSAID, WHOLE, DatasetFolder, Shard, check_begun
 from .formats import chosen
+from .places import place_at
 from .provenance import provenance
 
 Done = Callable[[int, int], None]
@@ -43,13 +44,13 @@ class Dataset(NamedTuple):
     """A dataset, or a shard of it.
 
     Attributes:
-        path: the folder.
+        path: the folder, or the address.
         made: how many images this call made; 0 where they were there before.
         num: how many images there are, of the shard or of all.
         finished: whether the files of labels are written.
     """
 
-    path: Path
+    path: Path | str
     made: int
     num: int
     finished: bool
@@ -58,7 +59,7 @@ class Dataset(NamedTuple):
 def generate(
     run: RunFolder,
     num: int,
-    out: Path,
+    out: Path | str,
     seed: int = 0,
     workers: int = 1,
     format: str | Iterable[str] = "coco",
@@ -70,6 +71,7 @@ def generate(
     """Write ``num`` images of the learnt structures.
 
     Args:
+        out: the folder to write, or an address of a file system that fsspec knows, such as ``s3://bucket/folder``.
         workers: processes. More than one are spawned: a script calls this under ``if __name__ == "__main__":``.
         format: names of ``formats.FORMATS``, such as ``"coco"``, ``"coco,yolo"`` or ``("coco", "yolo")``; ``"images"``
             for no labels.
@@ -93,7 +95,7 @@ def generate(
     if cluster is not None and workers > 1:
         raise ProbsceneError(f"Expected workers or a cluster, actual {workers} workers and a cluster; leave one out.")
     part = WHOLE if shard is None else Shard.of(shard)
-    job = Job(run.model, run.guide, num, Path(out), seed, chosen(format), run.guide_hash(), min_visible)
+    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), min_visible)
     if workers == 1 and cluster is None:
         return job.run(job.each, progress, part)
     if run.objects:
@@ -101,7 +103,7 @@ def generate(
             f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual "
             f"{workers if cluster is None else 'a cluster'}; fit a model and parts in files for more."
         )
-    task = (run.path.resolve(), num, Path(out).resolve(), seed, job.formats, min_visible)
+    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, min_visible)
     if cluster is None:
         return job.run(partial(spread, _worker, task, workers), progress, part)
     return job.run(cluster.crew(_actor, task).run, progress, part)
@@ -111,7 +113,7 @@ def generate_scenes(
     model: SceneModel,
     policy: Policy,
     num: int,
-    out: Path,
+    out: Path | str,
     seed: int = 0,
     format: str | Iterable[str] = "coco",
     progress: Done | None = None,
@@ -151,7 +153,7 @@ class Job:
         model: SceneModel,
         policy: Policy,
         num: int,
-        out: Path,
+        out: Path | str,
         seed: int = 0,
         format: str | Iterable[str] = "coco",
         guide: str | None = None,
@@ -190,7 +192,7 @@ class Job:
         work(chunks, done)
         if shard == WHOLE:
             folder.finish(self._labels())
-        return Dataset(folder.out, made, num, folder.finished)
+        return Dataset(folder.place.where, made, num, folder.finished)
 
     def each(self, chunks: list[int], done: Callable[[int], None]) -> None:
         """Make chunks one after the other."""
@@ -252,21 +254,23 @@ class Job:
     def _write_shard(self, chunks: range, path: Path) -> None:
         def samples() -> Iterator[tuple[int, dict[str, bytes]]]:
             for record in self.folder.records(chunks):
-                for i, label in shards.labels(self.model, record):
-                    yield i, {"png": (self.folder.out / self.folder.image(i)).read_bytes(), "json": label}
+                found = list(shards.labels(self.model, record))
+                images = self.folder.place.read_all([self.folder.image(i) for i, _ in found])
+                for (i, label), png in zip(found, images, strict=True):
+                    yield i, {"png": png, "json": label}
 
         shards.write(path, samples())
 
 
 def _worker(
-    run: Path, num: int, out: Path, seed: int, format: tuple[str, ...], min_visible: float
+    run: Path, num: int, out: str, seed: int, format: tuple[str, ...], min_visible: float
 ) -> Callable[[int], int]:
     """What a worker process does with a chunk's number."""
     opened = RunFolder.at(run)
     return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), min_visible).make
 
 
-def _actor(run: Path, num: int, out: Path, *settings: Any) -> Callable[[int], int]:
+def _actor(run: Path, num: int, out: str, *settings: Any) -> Callable[[int], int]:
     """The same on a node of a cluster."""
     make = _worker(run, num, out, *settings)
     check_begun(out)

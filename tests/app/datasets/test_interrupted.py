@@ -76,8 +76,8 @@ def half_labels(path, *args):
     "where, name, call, full",
     [
         (Path, "write_bytes", 70, half(Path.write_bytes)),  # an image of the second chunk
-        (Path, "write_text", 1, half(Path.write_text)),  # the settings
-        (Path, "write_text", 3, half(Path.write_text)),  # the second chunk's record
+        (Path, "write_bytes", 1, half(Path.write_bytes)),  # the settings
+        (Path, "write_bytes", 131, half(Path.write_bytes)),  # the second chunk's record
         (coco, "write", 1, half_labels),
     ],
 )

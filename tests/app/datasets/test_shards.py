@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import probscene
-from probscene.app.datasets import folder
 from probscene.app.datasets.generate import generate
+from probscene.app.datasets.places import LocalPlace
 from probscene.errors import DataError, ProbsceneError
 
 from .conftest import contents
@@ -81,18 +81,16 @@ def test_a_dataset_may_be_finished_while_a_shard_is_at_work(run, undisturbed, tm
 
 
 def test_files_that_another_shard_writes_are_not_foreign(run, undisturbed, tmp_path, monkeypatch):
-    """The folder is empty when a shard looks, and another one has begun when it writes its settings."""
-    out, make_folder = tmp_path / "out", folder.make_folder
+    """The folder is empty when a shard looks, and another one has begun when it looks for settings."""
+    out, names = tmp_path / "out", LocalPlace.names
 
-    def other_first(path):
-        monkeypatch.setattr(folder, "make_folder", make_folder)
-        if path.name == ".parts":
-            generate(run, 130, out, seed=3, shard="1/2")
-        else:
-            monkeypatch.setattr(folder, "make_folder", other_first)
-        return make_folder(path)
+    def other_after(place):
+        found = names(place)
+        monkeypatch.setattr(LocalPlace, "names", names)
+        generate(run, 130, out, seed=3, shard="1/2")
+        return found
 
-    monkeypatch.setattr(folder, "make_folder", other_first)
+    monkeypatch.setattr(LocalPlace, "names", other_after)
     assert generate(run, 130, out, seed=3, shard="0/2").made == 66
     generate(run, 130, out, seed=3)
     assert contents(out) == contents(undisturbed)
