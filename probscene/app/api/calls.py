@@ -58,6 +58,7 @@ def generate(
     min_visible: float = 0.0,
     shard: str | None = None,
     cluster: str | None = None,
+    flat: bool = False,
 ) -> Dataset:
     """Write a labelled dataset; the same call goes on after an interruption.
 
@@ -72,6 +73,7 @@ def generate(
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
         shard: ``"I/N"``, I from 0: one of N calls that make the dataset together, see ``generate_run``.
         cluster: the address of a Ray cluster whose nodes make a run's images, see ``Cluster``.
+        flat: see ``generate_run``.
 
     Raises:
         ProbsceneError: see ``generate_run``.
@@ -86,7 +88,7 @@ def generate(
             return generate_scenes(source, policy or source.prior, num, out, seed, format, said, min_visible, shard)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
         with connected(cluster, show.say) as nodes:
-            return generate_run(run, num, out, seed, workers, format, said, min_visible, shard, nodes)
+            return generate_run(run, num, out, seed, workers, format, said, min_visible, shard, nodes, flat)
 
 
 def evaluate(

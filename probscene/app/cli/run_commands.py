@@ -33,6 +33,7 @@ def generate(
         typer.Option(metavar="I/N", help="One of N commands, I from 0, that make it together; none finishes it."),
     ] = None,
     cluster: ClusterAddress = None,
+    flat: Annotated[bool, typer.Option("--flat", help="One folder also for more than 10,000 images.")] = False,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
     from ..datasets.generate import generate
@@ -43,7 +44,7 @@ def generate(
     with Display() as show, connected(cluster, show.say) as nodes:
         said = show.stage("generating")
         opened = RunFolder.at(run)
-        dataset = generate(opened, num, out, seed, workers, format or "coco", said, min_visible, shard, nodes)
+        dataset = generate(opened, num, out, seed, workers, format or "coco", said, min_visible, shard, nodes, flat)
     print(f"{dataset.num} images in {dataset.path}, {dataset.made} of them made now")
     if not dataset.finished:
         print("When all shards are done, the same command without --shard writes the files of labels.")

@@ -20,7 +20,7 @@ from probscene.batch import RenderBatch
 from probscene.errors import ProbsceneError
 from probscene.model import SceneModel
 
-from .provenance import image_name
+from .provenance import stem
 
 
 def categories(model: SceneModel) -> list[dict[str, Any]]:
@@ -81,13 +81,16 @@ def annotations(model: SceneModel, batch: RenderBatch, first: int, min_visible: 
     return found
 
 
-def write(path: Path, model: SceneModel, num: int, info: dict[str, Any], found: Iterable[dict[str, Any]]) -> None:
-    """The whole file, for ``num`` images; annotations get ids from 1 in the order they come, and are not kept."""
+def write(
+    path: Path, model: SceneModel, num: int, info: dict[str, Any], found: Iterable[dict[str, Any]], flat: bool = True
+) -> None:
+    """The whole file, for ``num`` images; annotations get ids from 1 in the order they come, and are not kept.
+
+    Args:
+        flat: see ``stem``.
+    """
     height, width = model.canvas
-    images = (
-        {"id": i, "file_name": image_name(i).removeprefix("images/"), "height": height, "width": width}
-        for i in range(num)
-    )
+    images = ({"id": i, "file_name": f"{stem(i, flat)}.png", "height": height, "width": width} for i in range(num))
     numbered = ({"id": number, **annotation} for number, annotation in enumerate(found, 1))
     with open(path, "w", encoding="utf-8", newline="\n") as file:
         file.write(f'{{"info": {json.dumps(info)},\n"licenses": [],\n"categories": {json.dumps(categories(model))}')

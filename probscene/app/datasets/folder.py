@@ -26,7 +26,8 @@ from .provenance import image_name
 
 LINES, SETTINGS = "provenance.jsonl", f"{PARTS}/settings.json"
 SEEN = 20  # seconds
-UNSAID = {"min_visible": 0.0}
+FLAT = 10_000  # images
+UNSAID = {"min_visible": 0.0, "flat": True}
 """Settings that are recorded only where they have another value than this."""
 
 
@@ -60,11 +61,16 @@ class DatasetFolder:
         origin: the settings that every line of provenance names.
         num: how many images.
         formats: see ``formats.chosen``.
+        flat: all images in one folder; of more than ``FLAT``, a thousand share one otherwise.
+
+    Attributes:
+        flat: whether they are.
     """
 
-    def __init__(self, out: Path | str, origin: dict[str, Any], num: int, formats: tuple[str, ...]):
+    def __init__(self, out: Path | str, origin: dict[str, Any], num: int, formats: tuple[str, ...], flat: bool = False):
         self.place, self.num = place_at(out), num
-        self.settings = {**origin, "num": num, "format": ",".join(formats)}
+        self.flat = flat or num <= FLAT
+        self.settings = {**origin, "num": num, "format": ",".join(formats), "flat": self.flat}
         self._kept = formats != ("webdataset",)
         self._origin = origin
 
@@ -108,7 +114,8 @@ class DatasetFolder:
 
     def image(self, index: int) -> str:
         """Where the file of image number ``index`` is while the work goes on, relative to the folder."""
-        return image_name(index) if self._kept else f"{PARTS}/{image_name(index)}"
+        name = image_name(index, self.flat)
+        return name if self._kept else f"{PARTS}/{name}"
 
     def write(self, chunk: int, files: dict[str, bytes], links: dict[str, str], record: dict[str, Any]) -> None:
         """Write a chunk: its files, then its record.
@@ -176,7 +183,8 @@ class DatasetFolder:
             raise DataError(
                 f"Expected lines of provenance in {self.place}/{LINES}, actual something else; name another folder."
             ) from error
-        return {**settings, "num": num, "format": ",".join(found(self.place.exists))}
+        settings |= {"num": num, "format": ",".join(found(self.place.exists))}
+        return settings | {"flat": line["image"] == image_name(line["index"], True)}
 
     def _compare(self, before: dict[str, Any]) -> None:
         before, settings = UNSAID | before, UNSAID | self.settings

@@ -67,6 +67,7 @@ def generate(
     min_visible: float = 0.0,
     shard: str | None = None,
     cluster: Cluster | None = None,
+    flat: bool = False,
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
 
@@ -81,6 +82,7 @@ def generate(
             may write to one folder at once; the same call without ``shard`` makes what is missing and finishes.
         cluster: of which all nodes make images, in place of ``workers``. They have to see the folders of the run and of
             the dataset by the same paths.
+        flat: all images in one folder; of more than 10,000, a thousand share one otherwise. KITTI's folders are flat.
 
     Raises:
         ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
@@ -95,7 +97,7 @@ def generate(
     if cluster is not None and workers > 1:
         raise ProbsceneError(f"Expected workers or a cluster, actual {workers} workers and a cluster; leave one out.")
     part = WHOLE if shard is None else Shard.of(shard)
-    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), min_visible)
+    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), min_visible, flat)
     if workers == 1 and cluster is None:
         return job.run(job.each, progress, part)
     if run.objects:
@@ -103,7 +105,7 @@ def generate(
             f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual "
             f"{workers if cluster is None else 'a cluster'}; fit a model and parts in files for more."
         )
-    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, min_visible)
+    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, min_visible, flat)
     if cluster is None:
         return job.run(partial(spread, _worker, task, workers), progress, part)
     return job.run(cluster.crew(_actor, task).run, progress, part)
@@ -141,7 +143,7 @@ class Job:
 
     Args:
         guide: SHA-256 of the policy's checkpoint, where it is a learnt one.
-        min_visible: see ``generate``.
+        min_visible, flat: see ``generate``.
 
     Raises:
         ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
@@ -158,6 +160,7 @@ class Job:
         format: str | Iterable[str] = "coco",
         guide: str | None = None,
         min_visible: float = 0.0,
+        flat: bool = False,
     ):
         if num < 1:
             raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
@@ -171,7 +174,7 @@ class Job:
         self.origin = {"seed": seed, "model": model.name, "guide": guide, "version": probscene.__version__}
         if self.min_visible != UNSAID["min_visible"]:
             self.origin["min_visible"] = self.min_visible
-        self.folder = DatasetFolder(out, self.origin, num, self.formats)
+        self.folder = DatasetFolder(out, self.origin, num, self.formats, flat)
         self._renderer = renderer_for(model, threads=1)
 
     def run(
@@ -209,7 +212,8 @@ class Job:
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
         batch = self._renderer(scenes.drawing[:size])
         found = [] if self.formats == ("images",) else coco.annotations(self.model, batch, first, self.min_visible)
-        record = {"annotations": found, "provenance": provenance(self.model, scenes, first, self.origin)[:size]}
+        lines = provenance(self.model, scenes, first, self.origin, self.folder.flat)
+        record = {"annotations": found, "provenance": lines[:size]}
         self.folder.write(chunk, *self._files(batch, first, found), record)
         return chunk
 
@@ -222,9 +226,9 @@ class Job:
             of_image[annotation["image_id"]].append(annotation)
         images = map(png, as_written(self.model, batch.image))
         files = {self.folder.image(i): image for i, image in zip(of_image, images, strict=True)}
-        links = {}
+        links, flat = {}, self.folder.flat
         if "yolo" in self.formats:
-            files |= {yolo.label_name(i): yolo.label(self.model, of_image[i]).encode() for i in of_image}
+            files |= {yolo.label_name(i, flat): yolo.label(self.model, of_image[i]).encode() for i in of_image}
         if "kitti" in self.formats:
             masks = kitti.instances(self.model, batch, first, self.min_visible)
             files |= {kitti.file_name("label_2", i): kitti.label(self.model, of_image[i]).encode() for i in of_image}
@@ -237,11 +241,12 @@ class Job:
 
     def _labels(self) -> dict[str, Callable[[Path], Any]]:
         """What is written when every chunk is there."""
-        model, folder = self.model, self.folder
+        model, folder, flat = self.model, self.folder, self.folder.flat
+        info = {key: value for key, value in folder.settings.items() if key != "flat"}
         labels = {}
         if "coco" in self.formats:
             found = (annotation for record in folder.records() for annotation in record["annotations"])
-            labels["annotations.json"] = lambda path: coco.write(path, model, folder.num, folder.settings, found)
+            labels["annotations.json"] = lambda path: coco.write(path, model, folder.num, info, found, flat)
         if "yolo" in self.formats:
             labels["data.yaml"] = lambda path: path.write_text(yolo.data(model), encoding="utf-8", newline="\n")
         if "webdataset" in self.formats:
@@ -263,11 +268,11 @@ class Job:
 
 
 def _worker(
-    run: Path, num: int, out: str, seed: int, format: tuple[str, ...], min_visible: float
+    run: Path, num: int, out: str, seed: int, format: tuple[str, ...], min_visible: float, flat: bool
 ) -> Callable[[int], int]:
     """What a worker process does with a chunk's number."""
     opened = RunFolder.at(run)
-    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), min_visible).make
+    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), min_visible, flat).make
 
 
 def _actor(run: Path, num: int, out: str, *settings: Any) -> Callable[[int], int]:

@@ -22,13 +22,23 @@ from probscene.sampling import Scenes, run_program
 from ..chunks import as_written, chunk_randomness
 from ..loading import renderer_for
 
+SHARED = 1000  # images of a folder, where there are several
 
-def image_name(index: int) -> str:
+
+def stem(index: int, flat: bool) -> str:
+    """What the files of image number ``index`` are called, without ending; where not ``flat``, with a folder before it
+    that a thousand images share."""
+    return f"{index:06d}" if flat else f"{index // SHARED:04d}/{index:06d}"
+
+
+def image_name(index: int, flat: bool) -> str:
     """The file of image number ``index``, relative to the dataset's folder."""
-    return f"images/{index:06d}.png"
+    return f"images/{stem(index, flat)}.png"
 
 
-def provenance(model: SceneModel, scenes: Scenes, first: int, origin: dict[str, Any]) -> list[dict[str, Any]]:
+def provenance(
+    model: SceneModel, scenes: Scenes, first: int, origin: dict[str, Any], flat: bool = True
+) -> list[dict[str, Any]]:
     """One line for each scene: ``origin``, then the image's own index, rules and parameters.
 
     ``parameters`` gives by site the values at the nodes where it counts, in the order of the nodes; they are exact.
@@ -39,7 +49,7 @@ def provenance(model: SceneModel, scenes: Scenes, first: int, origin: dict[str, 
         rules = rules[rules >= 0].tolist()
         lines.append(
             {
-                "image": image_name(first + i),
+                "image": image_name(first + i, flat),
                 "index": first + i,
                 **origin,
                 "rules": rules,

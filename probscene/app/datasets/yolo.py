@@ -13,10 +13,12 @@ from typing import Any
 
 from probscene.model import SceneModel
 
+from .provenance import stem
 
-def label_name(index: int) -> str:
-    """The file of image number ``index``, relative to the dataset's folder."""
-    return f"labels/{index:06d}.txt"
+
+def label_name(index: int, flat: bool = True) -> str:
+    """The file of image number ``index``, relative to the dataset's folder; see ``stem``."""
+    return f"labels/{stem(index, flat)}.txt"
 
 
 def label(model: SceneModel, annotations: list[dict[str, Any]]) -> str:

@@ -218,3 +218,29 @@ def test_memory_is_flat(model, tmp_path):
 
     generate_scenes(large, model.prior, 20 * 64, tmp_path / "out", progress=measure)
     assert max(resident) - resident[4] < 100
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_many_images_share_folders_of_a_thousand_unless_one_is_asked_for(run, tmp_path, monkeypatch, flat):
+    monkeypatch.setattr("probscene.app.datasets.folder.FLAT", 100)
+    monkeypatch.setattr("probscene.app.datasets.provenance.SHARED", 50)
+    out = tmp_path / "out"
+    formats = "coco,yolo,webdataset"
+    generate(run, 130, out, seed=3, format=formats, flat=flat)
+    assert generate(run, 130, out, seed=3, format=formats, flat=flat).made == 0
+    names = [f"{i:06d}" if flat else f"{i // 50:04d}/{i:06d}" for i in range(130)]
+    found = {file.relative_to(out / "images").with_suffix("").as_posix() for file in (out / "images").rglob("*.png")}
+    assert found == set(names)
+    texts = (out / "labels").rglob("*.txt")
+    assert {file.relative_to(out / "labels").with_suffix("").as_posix() for file in texts} == found
+    images = json.loads((out / "annotations.json").read_text())["images"]
+    assert [image["file_name"] for image in images] == [f"{name}.png" for name in names]
+    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+    assert [line["image"] for line in lines] == [f"images/{name}.png" for name in names]
+    with pytest.raises(DataError, match=rf"begun with \(flat {flat}\)"):
+        generate(run, 130, out, seed=3, format=formats, flat=not flat)
+    monkeypatch.setattr("probscene.app.datasets.folder.FLAT", 1000)
+    generate(run, 130, tmp_path / "usual", seed=3, format=formats)
+    for name in names:
+        usual = tmp_path / "usual" / "images" / f"{name.rpartition('/')[2]}.png"
+        assert (out / "images" / f"{name}.png").read_bytes() == usual.read_bytes()
