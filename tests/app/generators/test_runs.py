@@ -166,8 +166,10 @@ def test_a_generator_may_say_that_it_is_not_reproducible(copied, model, tmp_path
 
 
 def test_hours_are_told_before_a_fit(model, monkeypatch):
+    measured = "probscene.app.checking.generator_check._drawn"
+    monkeypatch.setattr(measured, lambda *args: (0.001, []))
     assert not cost(model, preset("quick"))
-    monkeypatch.setattr("probscene.app.checking.generator_check._drawn", lambda *args: (1.2, []))
+    monkeypatch.setattr(measured, lambda *args: (1.2, []))
     told = cost(replace(model, generator=replace(model.generator, workers=2)), preset("quick"))
     assert "needs" in told and " h (1.2e+03 ms an image, 2 at once)" in told
     assert not cost(load_model("multi_mnist"), preset("quick"))

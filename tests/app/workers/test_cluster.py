@@ -128,7 +128,7 @@ def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
     assert run.guide_hash() and run.guide  # as of another machine's disk, which nodes do not have
     run.path = tmp_path / "elsewhere"
     with pytest.raises(ProbsceneError, match="On node .*: Expected a run folder .*elsewhere.*by the same paths"):
-        nodes.crew(_actor, (run.path, 10, tmp_path / "out", 0, ("coco",), 0.0)).run([0], lambda result: None)
+        nodes.crew(_actor, (run.path, 10, tmp_path / "out", 0, ("coco",), 0.0, False)).run([0], lambda result: None)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "nowhere", "nowhere.invalid:6379"])
