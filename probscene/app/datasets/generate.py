@@ -108,7 +108,11 @@ def generate(
     task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, min_visible, flat)
     if cluster is None:
         return job.run(partial(spread, _worker, task, workers), progress, part)
-    return job.run(cluster.crew(_actor, task).run, progress, part)
+    crew = cluster.crew(_actor, task)
+    try:
+        return job.run(crew.run, progress, part)
+    finally:
+        crew.close()
 
 
 def generate_scenes(

@@ -149,7 +149,11 @@ class Crew:
                     task = todo.popleft()
                     self._ask(member, task, member.handle.do.remote(tasks[task]))
             waited = {member.answer: member for member in self._members if member.answer is not None}
-            ready, _ = self.ray.wait(list(waited), timeout=WAIT) if waited else ([], [])
+            if waited:
+                ready, _ = self.ray.wait(list(waited), timeout=WAIT)
+            else:
+                ready = []
+                time.sleep(WAIT)
             for answer in ready:
                 member, task = waited[answer], waited[answer].asked
                 value = self._value(member)
@@ -181,7 +185,8 @@ class Crew:
         self._members.clear()
 
     def _lost(self, most: int) -> list[_Member]:
-        """Start actors where there are cores for more, ``most`` in all; those that have gone with their nodes."""
+        """Start actors where there are cores for more, so that ``most`` are at work; those that have gone with their
+        nodes."""
         if time.monotonic() - self._looked < LOOK:
             return []
         self._looked = time.monotonic()
@@ -202,7 +207,8 @@ class Crew:
         for rank in range(max(room.values())):
             for node, number in room.items():
                 there = sum(member.node == node for member in self._members)
-                if rank < number and there <= rank and len(self._members) < most:
+                working = sum(not member.late for member in self._members)
+                if rank < number and there <= rank and working < most:
                     self._names[node] = nodes[node]["NodeManagerHostname"]
                     self._start(node)
         return lost
