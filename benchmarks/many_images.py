@@ -88,6 +88,7 @@ def main():
     parser.add_argument("--formats", nargs="+", choices=("webdataset", "coco"), default=["webdataset", "coco"])
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # in a shell's background it is ignored, by children too
     target, path, rows = args.out / "target", args.out / "run", []
     ps.generate(ps.load_model("multi_mnist").target(0), 200, target, format="images", progress=False)
     shutil.rmtree(path, ignore_errors=True)

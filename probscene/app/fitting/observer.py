@@ -22,7 +22,7 @@ from probscene.threads import threads
 
 from ..chunks import chunk_randomness
 from ..loading import renderer_for
-from ..workers.cluster import Crew
+from ..workers.crew import Crew
 
 RENDERED_AT_ONCE = 64  # images in memory
 

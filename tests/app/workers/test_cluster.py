@@ -7,7 +7,7 @@ import pytest
 
 from probscene.app.datasets.generate import _actor, generate
 from probscene.app.fitting.run import RunFolder
-from probscene.app.workers import cluster as clusters
+from probscene.app.workers import crew as crews
 from probscene.app.workers.cluster import Cluster
 from probscene.errors import MachineError, ModelError, ProbsceneError
 
@@ -39,7 +39,7 @@ def said():
 @pytest.fixture
 def nodes(simulated, said, monkeypatch):
     """A connection to the cluster; what is late is soon found to be."""
-    monkeypatch.setattr(clusters, "LATE", 2.0)
+    monkeypatch.setattr(crews, "LATE", 2.0)
     with Cluster(simulated.address, said.append) as connected:
         yield connected
 
@@ -83,7 +83,7 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_pa
 def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_path, monkeypatch):
     words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "num_scenes=150"]
     assert call(*words, "--out", tmp_path / "alone").code == 0
-    parts, run = [], clusters.Crew.run
+    parts, run = [], crews.Crew.run
 
     def disturbed(crew, tasks, done):
         def each(result):
@@ -94,7 +94,7 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
 
         return run(crew, tasks, each)
 
-    monkeypatch.setattr(clusters.Crew, "run", disturbed)
+    monkeypatch.setattr(crews.Crew, "run", disturbed)
     result = call(*words, "--out", tmp_path / "out", "--cluster", simulated.address)
     assert result.code == 0, result.err
     assert len(parts) == 4 * 3
@@ -108,8 +108,8 @@ def test_what_a_task_raises_is_told_with_its_node(nodes):
 
 
 def test_other_versions_are_refused(nodes, monkeypatch):
-    here = clusters.versions()
-    monkeypatch.setattr(clusters, "versions", lambda: {**here, "torch": "1.0"})
+    here = crews.versions()
+    monkeypatch.setattr(crews, "versions", lambda: {**here, "torch": "1.0"})
     with pytest.raises(ProbsceneError, match="Expected torch 1.0 on node .*, as on this machine, actual 2"):
         nodes.crew(doubling, ()).run([1], lambda result: None)
 

@@ -24,7 +24,8 @@ from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
 
 from ...progress import Progress
-from ...workers.cluster import Cluster, Crew
+from ...workers.cluster import Cluster
+from ...workers.crew import Crew
 from ..observer import Observe, Observer, Part
 from ..parts import inner
 from ..run import RunFolder
