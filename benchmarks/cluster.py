@@ -80,7 +80,7 @@ def main():
     target = out / "target"
     ps.generate(model.target(0), 300, target, format="images", progress=False)
     shutil.rmtree(out / "alone", ignore_errors=True)
-    fit = {"preset": "quick", "features": "count", "settings": SHORT, "cache": out / "cache"}
+    fit = {"preset": "quick", "features": "count", "settings": SHORT, "threads": 1, "cache": out / "cache"}
     alone = ps.fit("multi_mnist", target / "images", out=out / "alone", **fit)
     run = RunFolder.at(alone.path)
 
