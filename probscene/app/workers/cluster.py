@@ -47,16 +47,16 @@ class Cluster:
         vars(import_module("ray._private.worker"))["_worker_logs_enabled"] = False  # many lines on stdout of dead nodes
         quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
         try:
-            if address != AUTO:
-                _knock(address)  # Ray itself tries for many minutes, and then ends the process
-            ray.init(address=address, **quiet)
+            found = _running() if address == AUTO else _knocked(address)
+            if found is None:
+                ray.init(address="local", num_cpus=cores(), include_dashboard=False, **quiet)
+            else:
+                ray.init(address=found, **quiet)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-            if address != AUTO or not isinstance(error, ConnectionError):
-                raise MachineError(
-                    f"Expected a Ray cluster at {address}, actual none ({first_line(error)}). Start one with "
-                    "ray start --head and name its address, HOST:6379; or let one be started here: --cluster auto."
-                ) from error
-            ray.init(address="local", num_cpus=cores(), include_dashboard=False, **quiet)
+            raise MachineError(
+                f"Expected a Ray cluster at {address}, actual none ({first_line(error)}). Start one with "
+                "ray start --head and name its address, HOST:6379; or let one be started here: --cluster auto."
+            ) from error
 
     def __enter__(self) -> Self:
         return self
@@ -79,9 +79,19 @@ def connected(address: str | None, say: Callable[[str], None]) -> AbstractContex
     return nullcontext() if address is None else Cluster(address, say)
 
 
-def _knock(address: str) -> None:
-    """See that something listens at ``HOST:PORT`` or ``ray://HOST:PORT``."""
+def _running() -> str | None:
+    """The address of the cluster that this machine belongs to, where there is one and it answers."""
+    try:
+        return _knocked(import_module("ray._private.services").get_ray_address_from_environment(AUTO, None))
+    except (ConnectionError, ValueError, OSError):  # what Ray remembers may be long gone
+        return None
+
+
+def _knocked(address: str) -> str:
+    """``HOST:PORT`` or ``ray://HOST:PORT``, where something listens; else Ray tries for many minutes, and then ends the
+    process."""
     host, _, port = address.rpartition("//")[2].rpartition(":")
     if not host or not port.isdecimal():
         raise ValueError("no HOST:PORT")
     socket.create_connection((host, int(port)), timeout=CONNECT).close()
+    return address

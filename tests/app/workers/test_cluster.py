@@ -138,6 +138,14 @@ def test_a_cluster_that_is_not_there_is_one_line(call, fitted, tmp_path, address
     assert f"Expected a Ray cluster at {address}, actual none" in result.err and not (tmp_path / "out").exists()
 
 
+def test_auto_starts_one_where_what_ray_remembers_is_gone(monkeypatch):
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    found = []
+    with Cluster("auto") as cluster:
+        cluster.crew(doubling, ()).run([1, 2], found.append)
+    assert sorted(found) == [(1, 2), (2, 4)]
+
+
 def test_workers_or_a_cluster(fitted, tmp_path):
     with pytest.raises(ProbsceneError, match="Expected workers or a cluster"):
         generate(RunFolder.at(fitted), 4, tmp_path / "out", workers=2, cluster=SimpleNamespace())
