@@ -85,7 +85,8 @@ def generate(
         if isinstance(source, SceneModel):
             if workers != 1 or cluster is not None:
                 raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
-            return generate_scenes(source, policy or source.prior, num, out, seed, format, said, min_visible, shard)
+            policy = policy or source.prior
+            return generate_scenes(source, policy, num, out, seed, format, said, min_visible, shard, flat)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
         with connected(cluster, show.say) as nodes:
             return generate_run(run, num, out, seed, workers, format, said, min_visible, shard, nodes, flat)

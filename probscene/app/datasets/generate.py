@@ -125,12 +125,13 @@ def generate_scenes(
     progress: Done | None = None,
     min_visible: float = 0.0,
     shard: str | None = None,
+    flat: bool = False,
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
 
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
-    job = Job(model, policy, num, out, seed, format, min_visible=min_visible)
+    job = Job(model, policy, num, out, seed, format, min_visible=min_visible, flat=flat)
     return job.run(job.each, progress, WHOLE if shard is None else Shard.of(shard))
 
 

@@ -244,3 +244,10 @@ def test_many_images_share_folders_of_a_thousand_unless_one_is_asked_for(run, tm
     for name in names:
         usual = tmp_path / "usual" / "images" / f"{name.rpartition('/')[2]}.png"
         assert (out / "images" / f"{name}.png").read_bytes() == usual.read_bytes()
+
+
+def test_a_models_images_are_in_one_folder_where_that_is_asked_for(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("probscene.app.datasets.folder.FLAT", 3)
+    for flat in (False, True):
+        probscene.generate(run.model, 4, tmp_path / str(flat), format="images", progress=False, flat=flat)
+        assert (tmp_path / str(flat) / "images" / "000003.png").exists() == flat
