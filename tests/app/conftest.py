@@ -102,3 +102,20 @@ def fitted(tmp_path_factory, target) -> Path:
     done = probscene("fit", DISCS, "--target", target.images, "--out", out, *SETTINGS)
     assert done.code == 0, done.err
     return out
+
+
+def copied(target, folder: Path, number: int = 10) -> Path:
+    """A folder with some of the target's images."""
+    folder.mkdir()
+    for file in sorted(target.images.iterdir())[:number]:
+        (folder / file.name).write_bytes(file.read_bytes())
+    return folder
+
+
+def check_fault(result, code: int, *parts: str) -> None:
+    """One line on stderr after what progress says, and nothing that only a programmer reads."""
+    assert result.code == code, result.err
+    (line,) = [line for line in result.err.splitlines() if line.startswith("probscene: ")]
+    assert result.err.endswith(line + "\n") and "Traceback" not in result.err
+    for part in parts:
+        assert part in line

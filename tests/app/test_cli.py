@@ -3,15 +3,11 @@
 import errno
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import safetensors.torch
-import torch
 from PIL import Image
 
 import probscene
@@ -20,28 +16,12 @@ from probscene.app.fitting import fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import OBJECTIVES
 from probscene.app.fitting.presets import PRESETS, QUICK
-from probscene.app.fitting.run import RunFolder
 from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES
 
+from .conftest import check_fault, copied
+
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def copied(target, folder: Path, number: int = 10) -> Path:
-    """A folder with some of the target's images."""
-    folder.mkdir()
-    for file in sorted(target.images.iterdir())[:number]:
-        (folder / file.name).write_bytes(file.read_bytes())
-    return folder
-
-
-def check_fault(result, code: int, *parts: str) -> None:
-    """One line on stderr after what progress says, and nothing that only a programmer reads."""
-    assert result.code == code, result.err
-    (line,) = [line for line in result.err.splitlines() if line.startswith("probscene: ")]
-    assert result.err.endswith(line + "\n") and "Traceback" not in result.err
-    for part in parts:
-        assert part in line
 
 
 def test_help_is_quick_because_it_imports_nothing_heavy():
@@ -102,97 +82,6 @@ def test_generate_and_its_refusal_of_another_seed(call, fitted, tmp_path):
     assert first.code == 0 and "3 images" in first.out
     assert len(list((tmp_path / "d" / "images").iterdir())) == 3
     check_fault(call("generate", fitted, "--num", 3, "--out", tmp_path / "d", "--seed", 1), 2, "seed 0", "seed 1")
-
-
-# What is wrong with the images.
-
-
-def spoil_empty(folder):
-    for file in folder.iterdir():
-        file.unlink()
-
-
-def spoil_no_images(folder):
-    spoil_empty(folder)
-    (folder / "notes.txt").write_text("none")
-
-
-def spoil_corrupt(folder):
-    (folder / "000003.png").write_bytes(b"not a picture")
-
-
-def spoil_truncated(folder):
-    file = folder / "000003.png"
-    file.write_bytes(file.read_bytes()[:-20])
-
-
-def spoil_file(folder):
-    spoil_empty(folder)
-    folder.rmdir()
-    folder.write_text("a file")
-
-
-def spoil_gone(folder):
-    spoil_empty(folder)
-    folder.rmdir()
-
-
-IMAGES = {
-    spoil_empty: "an empty folder",
-    spoil_no_images: "notes.txt",
-    spoil_corrupt: "000003.png",
-    spoil_truncated: "000003.png is truncated",
-    spoil_file: "which is a file",
-    spoil_gone: "which is not there",
-}
-
-
-@pytest.mark.parametrize("spoil", IMAGES, ids=lambda spoil: spoil.__name__[6:])
-def test_bad_images(spoil, call, discs, target, fitted, tmp_path):
-    folder = copied(target, tmp_path / "images")
-    spoil(folder)
-    check_fault(call("fit", discs.file, "--target", folder, "--out", tmp_path / "run"), 2, IMAGES[spoil])
-    assert not (tmp_path / "run").exists()
-    check_fault(call("evaluate", fitted, "--target", folder, "--json", tmp_path / "e.json"), 2, IMAGES[spoil])
-    assert not (tmp_path / "e.json").exists()
-
-
-def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, discs, target, tmp_path):
-    folder = copied(target, tmp_path / "images", 40)
-    spoil_corrupt(folder)
-    Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(folder / "small.png")
-    words = ["fit", discs.file, "--target", folder, "--out", tmp_path / "run", *discs.settings, "--learn", "structure"]
-    words += ["--set", "batches=1"]
-    result = call(*words, "--skip-bad", "--set", "count.steps=16")
-    assert result.code == 0, result.err
-    assert result.err.count("000003.png") == 1 and result.err.count("resized to 64x64") == 1
-    lines = [line for line in result.err.splitlines() if not line.startswith(("Note: ", "Warning: "))]
-    stages = [line.split(":")[0] for line in lines]
-    assert stages == ["Target's images", "Feature network", "Target's features", "Pretraining", "Structure", "Outcome"]
-    assert len(RunFolder.at(tmp_path / "run").read_tensors("real")["features"]) == 40
-
-
-def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp_path):
-    few, same = copied(target, tmp_path / "few", 39), tmp_path / "same"
-    same.mkdir()
-    for i in range(50):
-        shutil.copy(target.images / "000000.png", same / f"{i}.png")
-    out = tmp_path / "run"
-    check_fault(call("fit", discs.file, "--target", few, "--out", out), 2, "at least 40 images", "actual 39")
-    check_fault(call("fit", discs.file, "--target", same, "--out", out), 2, "images that differ", "50 that are all the")
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("setting", "where"),
-    [("count.learning_rate=1e38", "at step"), ("pretrain_rate=1e37", "epoch "), ("learning_rate=1e37", "At batch ")],
-)
-def test_what_is_no_longer_finite_stops_with_the_step_and_a_remedy(call, discs, target, tmp_path, setting, where):
-    out = tmp_path / "run"
-    result = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, "--set", setting)
-    check_fault(result, 2, where, "egin again with", "lower rate")
-    for kept in out.glob("*.safetensors"):
-        assert all(torch.isfinite(tensor).all() for tensor in safetensors.torch.load_file(kept).values())
 
 
 # What is wrong with the model.
