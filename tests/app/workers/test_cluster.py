@@ -1,10 +1,14 @@
 """A Ray cluster makes what one process makes, whatever becomes of its nodes."""
 
+import errno
+import os
 import time
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
+from probscene.app.datasets import generate as datasets
 from probscene.app.datasets.generate import _actor, generate
 from probscene.app.fitting.run import RunFolder
 from probscene.app.workers import crew as crews
@@ -25,6 +29,19 @@ def doubling(pause=0.0, fault=None):
         return task, 2 * task
 
     return do
+
+
+def unwritable(node, code, *task):
+    """The work of ``generate``, where one node's disk takes no files."""
+    import ray
+
+    def fails(*_):
+        raise OSError(code, os.strerror(code))
+
+    make = _actor(*task)
+    if ray.get_runtime_context().get_node_id() == node:
+        os.replace = fails
+    return make
 
 
 def contents(folder):
@@ -105,6 +122,20 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
 def test_what_a_task_raises_is_told_with_its_node(nodes):
     with pytest.raises(ModelError, match="^On node .*: this one cannot be drawn$"):
         nodes.crew(doubling, (0.0, 3)).run([3], lambda result: None)
+
+
+@pytest.mark.parametrize("code, what", [(errno.ENOSPC, "The disk is full"), (errno.EROFS, "Read-only file system")])
+def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, tmp_path, monkeypatch, code, what):
+    run, node, out = RunFolder.at(fitted), simulated.nodes[1].node_id, tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(datasets, "_actor", partial(unwritable, node, code))
+        with pytest.raises(MachineError, match=f"On node .*: .*{what}"):
+            generate(run, 700, out, seed=3, cluster=nodes)
+    generate(run, 700, tmp_path / "alone", seed=3)
+    shown = {name: data for name, data in contents(out).items() if not name.startswith(".")}
+    assert shown.items() <= contents(tmp_path / "alone").items()  # whole or absent
+    generate(run, 700, out, seed=3, cluster=nodes)
+    assert contents(out) == contents(tmp_path / "alone")
 
 
 def test_other_versions_are_refused(nodes, monkeypatch):
