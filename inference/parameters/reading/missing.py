@@ -86,6 +86,7 @@ class Missing(NamedTuple):
         return (
             Found(
                 torch.cat([found.image, image]),
+                torch.cat([found.mass, found.mass.new_zeros(len(which))]),
                 torch.cat([found.label, self.label[which]]),
                 torch.cat([found.centre, self.centre[which]]),
                 torch.cat([found.parent, self.parent[which]]),

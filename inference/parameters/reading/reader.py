@@ -21,7 +21,7 @@ from .eyes import WIDTH, Eye
 from .overall import Overall
 
 HIDDEN = 96
-LEAST_MASS = 0.4  # of an object's unit, in four cells
+LEAST_MASS = 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6  # of an object's unit, in four cells; one of these
 MOST = 200  # objects in an image
 LOG_SD = -6.0, 0.5  # of u, least and largest
 HARMONICS = 4  # cosine and sine of one turn, and of two
@@ -32,6 +32,7 @@ class Found(NamedTuple):
 
     Attributes:
         image: ``(K,)`` int64 which image.
+        mass: ``(K,)`` how much of an object's unit was found.
         label: ``(K,)`` int64 class.
         centre, parent: ``(K, 2)`` x and y of its middle, and of its parent's, pixels.
         raw: ``(K, S, 2 + HARMONICS)`` what the network says of u.
@@ -39,11 +40,16 @@ class Found(NamedTuple):
     """
 
     image: Tensor
+    mass: Tensor
     label: Tensor
     centre: Tensor
     parent: Tensor
     raw: Tensor
     overall: Tensor
+
+    def those(self, which: Tensor) -> "Found":
+        """Some of the objects, ``(K,)`` bool."""
+        return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "overall"})
 
 
 class Reader(nn.Module):
@@ -52,7 +58,13 @@ class Reader(nn.Module):
     Args:
         eye: what it sees by.
         classes, sites, scene_sites: C, S and G.
+
+    Attributes:
+        leasts: how much of an object's unit may have to be found.
+        least: how much has to be; one of these.
     """
+
+    least: Tensor
 
     def __init__(self, eye: Eye, classes: int, sites: int, scene_sites: int):
         super().__init__()
@@ -61,6 +73,8 @@ class Reader(nn.Module):
         self.hidden = nn.Linear(WIDTH + 2, HIDDEN)
         self.values = nn.Linear(HIDDEN, 2 + sites * (2 + HARMONICS))
         self.overall = Overall(max(1, scene_sites), 2 + HARMONICS)
+        self.leasts = LEAST_MASS
+        self.register_buffer("least", torch.tensor(LEAST_MASS[0]))
         with torch.no_grad():  # nearly every cell holds nothing
             self.what.weight.mul_(0.3)
             bias = cast(Tensor, self.what.bias)
@@ -84,6 +98,12 @@ class Reader(nn.Module):
     @torch.no_grad()
     def find(self, images: Tensor) -> Found:
         """Objects in ``(N, 1 or 3, H, W)`` uint8 images."""
+        found = self.find_all(images)
+        return found.those(found.mass > self.least)
+
+    @torch.no_grad()
+    def find_all(self, images: Tensor) -> Found:
+        """With those of which less is found, but more than the first of ``leasts``."""
         parts = [self._find(some, i * 64) for i, some in enumerate(images.split(64))]
         return Found(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
@@ -91,7 +111,7 @@ class Reader(nn.Module):
         entered = self.eye.enter(images)
         seen, logits = self(entered)
         mass = logits.softmax(1)[:, 1:]
-        n, y, x = blocks(mass.sum(1))
+        n, y, x, inside = blocks(mass.sum(1), self.leasts[0])
         rows, columns = torch.stack([y, y, y + 1, y + 1], 1), torch.stack([x, x + 1, x, x + 1], 1)  # (K, 4)
         image = n[:, None].expand(-1, 4)
         label = mass[image, :, rows, columns].sum(1).argmax(1)
@@ -102,6 +122,7 @@ class Reader(nn.Module):
         scale = self.eye.cell
         return Found(
             n + first,
+            inside,
             label,
             scale * (share * here).sum(1),
             scale * (share * (here + parent)).sum(1),
@@ -110,29 +131,34 @@ class Reader(nn.Module):
         )
 
 
-def blocks(mass: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Image, row and column of the first cell ``(K,)`` of blocks of 2 x 2 cells that hold an object each, image by
-    image: the fullest first, without the cells that were taken before.
+def blocks(mass: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image, row and column of the first cell ``(K,)`` of blocks of 2 x 2 cells that hold an object each, and how much
+    they hold, image by image: the fullest first, without the cells that were taken before. With a larger least the
+    blocks are those of them that hold more.
 
     Args:
         mass: ``(N, h, w)`` how much of an object is in each cell; an object has its unit in four cells.
+        least: that a block has to hold more than.
     """
     N, h, w = mass.shape
     left, found = mass.clone(), []
     for _ in range(MOST):
         inside = 4 * F.avg_pool2d(left.unsqueeze(1), 2, 1).flatten(1)
         most, at = inside.max(1)
-        there = most > LEAST_MASS
+        there = most > least
         if not there.any():
             break
         n, y, x = there.nonzero().flatten(), at[there] // (w - 1), at[there] % (w - 1)
-        found.append((n, y, x))
+        found.append((n, y, x, most[there]))
         for i in (0, 1):
             for j in (0, 1):
                 left[n, y + i, x + j] = 0.0
-    n, y, x = (torch.cat(part) for part in zip(*found, strict=True)) if found else torch.zeros(3, 0, dtype=torch.int64)
+    if not found:
+        none = torch.zeros(0, dtype=torch.int64)
+        return none, none, none, mass.new_zeros(0)
+    n, y, x, inside = (torch.cat(part) for part in zip(*found, strict=True))
     order = n.argsort(stable=True)
-    return n[order], y[order], x[order]
+    return n[order], y[order], x[order], inside[order]
 
 
 def value_loss(said: Tensor, u: Tensor) -> Tensor:

@@ -3,6 +3,8 @@
 Axis letters: L images, M nodes, K objects, S sites of nodes, G sites of scenes.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -40,8 +42,23 @@ class TriedReader:
         self.skill: Skill | None = None
         self.readings_of = torch.zeros(0, dtype=torch.int64)
 
+    def settle(self, valued: Valued) -> None:
+        """Settle how much of an object's unit has to be found: so little that in some renders the fewest objects are
+        missed, found twice or found where there is none; up to chance, as of a target's objects less is found."""
+        found, drawn = self.reader.find_all(valued.drawn.image), valued.drawn
+        which, mistakes = matched(found, valued), []
+        node, number = found.image * drawn.label.shape[1] + which, int(visible(valued).sum())
+        for least in self.reader.leasts:
+            enough = found.mass > least
+            hit = len(node[enough & (which >= 0)].unique())
+            mistakes.append(number + int(enough.sum()) - 2 * hit)
+        most = min(mistakes) + math.sqrt(min(mistakes))
+        as_good = [least for least, some in zip(self.reader.leasts, mistakes, strict=True) if some <= most]
+        self.reader.least.fill_(as_good[0])
+
     def on(self, valued: Valued, images: Tensor) -> None:
         """Try it on renders of the prior, and see how often it finds each class in the target's images."""
+        self.settle(valued)
         found = self.reader.find(valued.drawn.image)
         which = matched(found, valued)
         of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
@@ -127,7 +144,8 @@ class TriedReader:
         return assembly(self.model.grammar, self.model.classes, graph, centre, valued.group)
 
     def missing(self, valued: Valued) -> Missing:
-        """Objects that it does not find in some renders."""
+        """Objects that it does not find in some renders; by these is settled first how much has to be found."""
+        self.settle(valued)
         found = self.reader.find(valued.drawn.image)
         which, there = matched(found, valued), torch.zeros_like(valued.kind, dtype=torch.bool)
         is_it = (which >= 0) & (found.label == valued.drawn.label[found.image, which])
@@ -146,10 +164,14 @@ def kinds_of(model: SceneModel, label: Tensor) -> Tensor:
     return torch.tensor([*(model.grammar.kind(name) for name in model.classes), -1])[label]
 
 
+def visible(valued: Valued) -> Tensor:
+    """``(N, M)`` bool, the nodes that can be seen."""
+    return (valued.drawn.label >= 0) & (valued.drawn.visible >= MIN_VISIBLE)
+
+
 def matched(found: Found, valued: Valued) -> Tensor:
     """``(K,)`` the node nearest to each object that was found; -1 where none is near."""
-    drawn = valued.drawn
-    there = (drawn.label >= 0) & (drawn.visible >= MIN_VISIBLE)
-    away = (drawn.centre[found.image] - found.centre[:, None]).norm(dim=-1).masked_fill(~there[found.image], torch.inf)
+    away = (valued.drawn.centre[found.image] - found.centre[:, None]).norm(dim=-1)
+    away = away.masked_fill(~visible(valued)[found.image], torch.inf)
     least, which = away.min(1)
     return torch.where(least < NEAR_ENOUGH, which, -1)

@@ -30,7 +30,7 @@ PRIOR = StructurePrior(ROW, Dots=counts(0, 1, 1, 1))
 def anything_is_read(patch):
     """Also what a reader of six steps says; and it is kept."""
     patch.setattr(skill, "READABLE", -1e9)
-    patch.setattr(reader, "LEAST_MASS", 1e-3)
+    patch.setattr(reader, "LEAST_MASS", (1e-3,))
     patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
     patch.setattr(judged, "passed", lambda *_: frozenset())
 

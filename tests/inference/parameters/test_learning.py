@@ -104,7 +104,7 @@ def test_one_layout_in_all_images_is_learnt_as_such():
 
 def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     """Nothing is learnt of a site that was hardly read, and it is said."""
-    monkeypatch.setattr(reader, "LEAST_MASS", 10.0)  # no object is found
+    monkeypatch.setattr(reader, "LEAST_MASS", (10.0,))  # no object is found
     counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=0, energy_steps=0, reader_images=2)
@@ -120,7 +120,7 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
 
 def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
     """In the middle of likelihood, which looks at objects that the guide of before was missing."""
-    monkeypatch.setattr(reader, "LEAST_MASS", 0.1)  # an untrained reader finds something
+    monkeypatch.setattr(reader, "LEAST_MASS", (0.1,))  # an untrained reader finds something
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
     monkeypatch.setattr(missing, "FEWEST", 1)
     monkeypatch.setattr(missing, "TOLD", 0.0)

@@ -28,7 +28,7 @@ def seen(valued: Valued) -> Tensor:
 
 def found_of(image: Tensor, label: Tensor) -> Found:
     place = torch.zeros(len(label), 2)
-    return Found(image, label, place, place, torch.zeros(len(label), 2, 6), torch.zeros(0))
+    return Found(image, torch.ones(len(label)), label, place, place, torch.zeros(len(label), 2, 6), torch.zeros(0))
 
 
 def test_only_what_is_not_found_and_only_the_sites_by_which_finding_goes():

@@ -49,7 +49,7 @@ def test_objects_apart_are_all_found(seed, number):
     places = torch.tensor(np.array(centre).reshape(1, -1, 2), dtype=torch.float32)
     label = torch.zeros(places.shape[:2], dtype=torch.int64)
     mass = cells(places * CELL, label, 1, 20, 20)[:, 1]
-    n, y, x = blocks(mass)
+    n, y, x, inside = blocks(mass, 0.4)
     assert len(n) == len(centre)
     found = {(int(i), int(j)) for i, j in zip(x, y, strict=True)}
     wanted = {tuple(np.floor(at - 0.5).astype(int).tolist()) for at in centre}
@@ -59,7 +59,7 @@ def test_objects_apart_are_all_found(seed, number):
 def test_objects_come_image_by_image():
     mass = torch.zeros(3, 6, 6)
     mass[0, 1, 1] = mass[2, 4, 4] = mass[2, 1, 1] = 1.0
-    assert blocks(mass)[0].tolist() == [0, 2, 2] and len(blocks(torch.zeros(2, 6, 6))[0]) == 0
+    assert blocks(mass, 0.4)[0].tolist() == [0, 2, 2] and len(blocks(torch.zeros(2, 6, 6), 0.4)[0]) == 0
 
 
 def said(u, error=0.02, way=LINE):
@@ -134,6 +134,7 @@ def test_graphs_are_those_that_were_drawn(trays):
     shuffled = torch.randperm(len(n))
     found = Found(
         n[shuffled],
+        torch.ones(len(n)),
         label[shuffled],
         place[n, m][shuffled],
         place[n, parent.clamp(min=0)][shuffled],
@@ -158,7 +159,7 @@ def test_siblings_of_groups_that_cannot_be_seen_come_in_any_order():
         n, m = (seen.kind >= 0).nonzero(as_tuple=True)
         label = (seen.kind[n, m] == grammar.kind("sun")).long()
         nothing = torch.zeros(len(n), 0, 6)
-        found = Found(n, label, place[n, m], torch.zeros(len(n), 2), nothing, torch.zeros(20, 0, 6))
+        found = Found(n, torch.ones(len(n)), label, place[n, m], torch.zeros(len(n), 2), nothing, torch.zeros(20, 0, 6))
         made = along_the_widest(made, found)
         orders = []
         for seed in (0, 1):

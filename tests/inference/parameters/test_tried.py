@@ -1,0 +1,64 @@
+"""How much of an object has to be found is what renders say."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from probscene.inference.features.base import Examples
+from probscene.inference.parameters.reading.reader import LEAST_MASS, Found, blocks
+from probscene.inference.parameters.reading.training import MIN_VISIBLE, Valued
+from probscene.inference.parameters.reading.tried import NEAR_ENOUGH, TriedReader
+
+seeds = st.integers(0, 2**31)
+
+
+@given(seeds, st.floats(0.1, 0.5), st.floats(0.0, 0.5))
+def test_blocks_that_hold_more_are_among_those_that_hold_less(seed, least, more):
+    rng = np.random.default_rng(seed)
+    mass = torch.from_numpy(rng.uniform(0, 1, (3, 9, 7)) ** 4).float()
+    n, y, x, inside = blocks(mass, least)
+    enough = inside > least + more
+    again = blocks(mass, least + more)
+    for part, other in zip((n, y, x, inside), again, strict=True):
+        assert torch.equal(part[enough], other)
+
+
+@given(seeds, st.integers(0, 60))
+def test_the_least_mass_makes_the_fewest_mistakes_up_to_chance(seed, number):
+    """As a loop over images, objects and nodes counts them."""
+    rng = np.random.default_rng(seed)
+    N, M = 4, 5
+    label = torch.from_numpy(rng.integers(-1, 2, (N, M)))
+    centre = torch.from_numpy(rng.uniform(0, 60, (N, M, 2))).float()
+    seen = torch.from_numpy(rng.uniform(0, 1, (N, M))).float()
+    nothing = torch.zeros(N, M, 0)
+    drawn = Examples(*(torch.zeros(N),) * len(Examples._fields))._replace(label=label, centre=centre, visible=seen)
+    valued = Valued(drawn, label, label, label, nothing, torch.zeros(N, 0))
+    image = torch.from_numpy(np.sort(rng.integers(0, N, number)))
+    place = torch.from_numpy(rng.uniform(0, 60, (number, 2))).float()
+    mass = torch.from_numpy(rng.uniform(0.2, 1, number))
+    found = Found(image, mass, image, place, place, torch.zeros(number, 0, 6), torch.zeros(N, 0, 6))
+    reader = SimpleNamespace(find_all=lambda images: found, leasts=LEAST_MASS, least=torch.tensor(0.0))
+    TriedReader.settle(SimpleNamespace(reader=reader), valued)
+
+    def mistakes(least: float) -> int:
+        hit, spare = set(), 0
+        for k in range(number):
+            if mass[k] > least:
+                away = {
+                    m: float((centre[image[k], m] - place[k]).norm())
+                    for m in range(M)
+                    if label[image[k], m] >= 0 and seen[image[k], m] >= MIN_VISIBLE
+                }
+                node = min(away, key=away.get, default=None)
+                near = node is not None and away[node] < NEAR_ENOUGH and (int(image[k]), node) not in hit
+                spare += not near
+                hit |= {(int(image[k]), node)} if near else set()
+        return int(((label >= 0) & (seen >= MIN_VISIBLE)).sum()) - len(hit) + spare
+
+    fewest = min(map(mistakes, LEAST_MASS))
+    wanted = min(least for least in LEAST_MASS if mistakes(least) <= fewest + fewest**0.5)
+    assert float(reader.least) == np.float32(wanted)
