@@ -34,8 +34,8 @@ SHORT = {
     "parameters.energy_steps": 2,
     "parameters.energy_scenes": 6,
 }
-SETTINGS = ["--preset", "quick", "--threads", "1", "--no-cache", "--no-verdict"]
-SETTINGS += [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+WORDS = ["--preset", "quick", "--threads", "1", "--no-cache", "--no-verdict"]
+SETTINGS = WORDS + [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -80,8 +80,14 @@ def idx_folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def discs() -> SimpleNamespace:
-    """``file``: a model; ``settings``: words that make a fit of it short; ``short``: the preset's fields among them."""
-    return SimpleNamespace(file=DISCS, settings=SETTINGS, short=SHORT)
+    """``file``: a model; ``settings``: words that make a fit of it short; ``short``: the preset's fields among them;
+    ``without``: the words without those of fields that begin so, for fits that do not read them."""
+    return SimpleNamespace(file=DISCS, settings=SETTINGS, short=SHORT, without=_without)
+
+
+def _without(*begins: str) -> list[str]:
+    left = {key: value for key, value in SHORT.items() if not key.startswith(begins)}
+    return [*WORDS, *(word for key, value in left.items() for word in ("--set", f"{key}={value}"))]
 
 
 @pytest.fixture(scope="session")

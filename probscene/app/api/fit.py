@@ -145,10 +145,16 @@ def chosen_preset(
     divergence: str | Divergence | None,
     guide: str | GuideMaker | None,
     settings: Mapping[str, Any] | Sequence[str],
+    instead: str = FOR_PHOTOGRAPHS,
 ) -> tuple[Preset, Parts]:
     """The preset with all that was chosen beside it, and the user's own parts of it, of objects and of files; arguments
-    as of ``fit``."""
+    as of ``fit``.
+
+    Args:
+        instead: features that the fit may take where none are chosen, or had before; their settings are read, too.
+    """
     chosen = preset if isinstance(preset, Preset) else preset_of(preset)
+    is_open = instead == FOR_RENDERS or (features is None and chosen.features == FOR_RENDERS)
     imported: dict[Path, ModuleType] = {}
     given = (features, divergence, guide)
     own = parts_of(*(_part(part, imported) for part in given))
@@ -161,11 +167,12 @@ def chosen_preset(
         chosen = replace(chosen, guide=of_guide or in_memory(_name(own.guide)))
     elif of_guide:
         chosen = chosen.with_guide(of_guide)
+    other = chosen.with_features(instead) if is_open else None
     if own.features is not None:
         chosen = chosen.with_features_of(own.features, of_features or in_memory(own.features.name))
     elif of_features:
         chosen = chosen.with_features(of_features)
-    return override(chosen, with_learn(settings, None)), own
+    return override(chosen, with_learn(settings, None), other), own
 
 
 def with_learn(
@@ -199,7 +206,7 @@ def preset_for_photographs(
     chosen = preset if isinstance(preset, Preset) else preset_of(preset)
     if features is not None or chosen.features != FOR_RENDERS:
         return None
-    made = chosen_preset(preset, FOR_PHOTOGRAPHS, divergence, guide, settings)[0]
+    made = chosen_preset(preset, FOR_PHOTOGRAPHS, divergence, guide, settings, FOR_RENDERS)[0]
     return made if made.features == FOR_PHOTOGRAPHS else None
 
 

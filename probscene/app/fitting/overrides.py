@@ -21,15 +21,18 @@ FIRST = {"objective": Preset.with_objective, "guide": Preset.with_guide, "featur
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate", "difference")
 
 
-def override(preset: Preset, settings: list[str]) -> Preset:
+def override(preset: Preset, settings: list[str], other: Preset | None = None) -> Preset:
     """A preset with ``settings`` such as ``"batches=2"``, ``"count.steps=32"`` or ``"width=8,16,32"``.
 
     ``none`` stands for no value, ``true`` and ``false`` for themselves. Objective, guide and features come first, with
     all that suits them, as by ``Preset.with_objective`` and the like.
 
+    Args:
+        other: another preset that the fit may come to take, or began with: what this one reads may be set, too.
+
     Raises:
-        ProbsceneError: no ``=``, an unknown field, a value of another type or out of range, a setting that the chosen
-            guide or objective does not read, or one that leaves nothing to learn.
+        ProbsceneError: no ``=``, an unknown field, a value of another type or out of range, a setting that nothing
+            reads, or one that leaves nothing to learn.
     """
     pairs = []
     for setting in settings:
@@ -37,21 +40,27 @@ def override(preset: Preset, settings: list[str]) -> Preset:
         if not equals:
             raise ProbsceneError(f"Expected --set key=value, actual {setting!r}.")
         pairs.append((key.strip(), text.strip()))
-    for key, text in sorted(pairs, key=lambda pair: pair[0] not in FIRST):
-        if key in FIRST:
-            preset = FIRST[key](preset, lasting_word(text))
-        else:
-            preset = _replaced(preset, key.split("."), text, key)
+    preset = _applied(preset, pairs)
+    unread = preset.unread()
+    if other is not None:
+        unread = {name: because for name, because in unread.items() if name in _applied(other, pairs).unread()}
     for key, _ in pairs:
-        if key in (unread := preset.unread()):
-            raise ProbsceneError(
-                f"Expected settings that are read, actual --set {key}=...: {unread[key]}; leave it out."
-            )
+        if because := unread.get(key.partition(".")[0]):
+            raise ProbsceneError(f"Expected settings that are read, actual --set {key}=...: {because}; leave it out.")
     if preset.objective == "mmd" and preset.baseline == "leave_one_out":
         raise ProbsceneError(
             "Expected a baseline of moving_average or none with objective=mmd, actual leave_one_out: all scenes share "
             "one cost, so that their advantages would all be 0."
         )
+    return preset
+
+
+def _applied(preset: Preset, pairs: list[tuple[str, str]]) -> Preset:
+    for key, text in sorted(pairs, key=lambda pair: pair[0] not in FIRST):
+        if key in FIRST:
+            preset = FIRST[key](preset, lasting_word(text))
+        else:
+            preset = _replaced(preset, key.split("."), text, key)
     return preset
 
 

@@ -16,14 +16,21 @@ from probscene.inference.guides.lstm import GUIDES
 from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.schedule import ParameterSchedule
 
-from .parts import CheckedDivergence, as_divergence, as_features, is_file_part, load_part
+from .parts import IN_MEMORY, CheckedDivergence, as_divergence, as_features, is_file_part, load_part
 
 FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
 TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, PRESENCE, PRESENCE_COUNTS)  # on the prior's renders
 _RENAMED = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
 STRUCTURE, BOTH = "structure", "structure,parameters"
 LIKELIHOOD, META_SIM = "likelihood", "meta-sim"  # by which parameters are learnt
+_OF_PRESENCE = ("presence_images", "presence_epochs", "presence_width", "presence_hidden")
 OBJECTIVES = ("kde", "js", "witness", "mmd")
+_FEATURE_SETTINGS = {
+    FOR_RENDERS: ("count", "width", "blocks"),
+    FOR_PHOTOGRAPHS: ("pairs", "head_epochs", "photographs"),
+    PRESENCE: _OF_PRESENCE,
+    PRESENCE_COUNTS: _OF_PRESENCE,
+}
 
 
 @dataclass(frozen=True)
@@ -224,8 +231,18 @@ class Preset:
         return self.make_features().images + structure + self.parameters.drawn + again
 
     def unread(self) -> dict[str, str]:
-        """Settings that the chosen guide or objective does not read, and why."""
+        """Settings that the chosen guide, objective, features or way of learning do not read, and why."""
         guide, found = set(self.guide_settings()), {}
+        if not is_file_part(self.features) and not self.features.startswith(IN_MEMORY):
+            own = _FEATURE_SETTINGS.get(self.features, ("pairs", "directions"))
+            others = {name for names in _FEATURE_SETTINGS.values() for name in (*names, "directions")}
+            found |= dict.fromkeys(others.difference(own), f"the features {self.features!r} have no such setting")
+        if self.learn != BOTH:
+            settings = ("parameters", "meta_sim", "parameter_method", "batches_again")
+            found |= dict.fromkeys(settings, f"the fit learns {self.learn} alone")
+        else:
+            other = "parameters" if self.parameter_method == META_SIM else "meta_sim"
+            found[other] = f"parameters are learnt by {self.parameter_method}"
         for name in ("hidden", "num_latents", "index"):
             if name not in guide:
                 found[name] = f"the guide {self.guide!r} has no such setting"

@@ -30,7 +30,7 @@ def fitted(tmp_path_factory, call, discs, target) -> Path:
     out = tmp_path_factory.mktemp("meta-sim") / "run"
     with pytest.MonkeyPatch.context() as patch:
         it_is_kept(patch)
-        done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
+        done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
     assert done.code == 0, done.err
     assert "Sites that are learnt: x, y." in " ".join(done.err.split())
     return out
@@ -63,7 +63,16 @@ def test_all_that_draws_takes_them(fitted, call, tmp_path):
 
 
 def test_a_fit_goes_on_to_the_same_bytes(fitted, call, discs, target, tmp_path, monkeypatch):
-    words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
+    words = (
+        "fit",
+        discs.file,
+        "--target",
+        target.images,
+        "--out",
+        tmp_path / "run",
+        *discs.without("parameters"),
+        *LEARN,
+    )
     monkeypatch.setattr(storage, "SAVE_EVERY", 0)
     it_is_kept(monkeypatch)
     run = MetaSimLearning.run
@@ -83,8 +92,8 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, discs, target, tmp_path, 
     done = call("fit", "--resume", "--out", tmp_path / "run")
     assert done.code == 0, done.err
     assert (tmp_path / "run" / "guide.safetensors").read_bytes() == (fitted / "guide.safetensors").read_bytes()
-    other = [word if word != "meta-sim" else "likelihood" for word in LEARN]
-    again = call("fit", "--resume", "--out", tmp_path / "run", *discs.settings, *other)
+    other = ["likelihood" if word == "meta-sim" else word for word in LEARN[: -len(SETTINGS)]]
+    again = call("fit", "--resume", "--out", tmp_path / "run", *discs.without("parameters"), *other)
     assert again.code != 0 and "parameter_method" in again.err
 
 

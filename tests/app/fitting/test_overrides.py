@@ -1,11 +1,23 @@
 """``--set``: what is chosen brings what suits it, and what nothing reads is an error."""
 
+from dataclasses import fields
+
 import pytest
 
 from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.preset import (
+    BOTH,
+    FOR_PHOTOGRAPHS,
+    FOR_RENDERS,
+    LIKELIHOOD,
+    META_SIM,
+    OBJECTIVES,
+    STRUCTURE,
+    Preset,
+)
 from probscene.app.fitting.presets import DEFAULT, PRESETS, QUICK
 from probscene.errors import ProbsceneError
+from probscene.inference.guides.lstm import GUIDES
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
@@ -37,6 +49,14 @@ def test_what_is_set_beside_a_choice_wins_whatever_comes_first():
         (["num_latents=2", "guide=pcfg"], "the guide 'pcfg' has no such setting"),
         (["guide=grammar-vae", "index=false"], "the guide 'grammar-vae' has no such setting"),
         (["objective=mmd", "marginal_variance=1"], "only the objectives kde and js estimate densities"),
+        (["features=efficientnet", "count.steps=9"], "the features 'efficientnet' have no such setting"),
+        (["features=presence", "blocks=1,2"], "the features 'presence' have no such setting"),
+        (["features=count", "head_epochs=2"], "the features 'count' have no such setting"),
+        (["features=count", "directions=2"], "the features 'count' have no such setting"),
+        (["learn=structure", "parameters.rounds=1"], "the fit learns structure alone"),
+        (["learn=structure", "batches_again=5"], "the fit learns structure alone"),
+        (["parameter_method=meta-sim", "parameters.rounds=1"], "parameters are learnt by meta-sim"),
+        (["meta_sim.hidden=8"], "parameters are learnt by likelihood"),
         (["objective=witness", "leave_one_out=true"], "only the objectives kde and js estimate densities"),
         (
             ["objective=mmd", "baseline=leave_one_out"],
@@ -48,6 +68,34 @@ def test_settings_that_do_nothing_are_errors(settings, because):
     with pytest.raises(ProbsceneError) as caught:
         override(DEFAULT, settings)
     assert because in str(caught.value)
+
+
+def test_every_field_is_read_by_some_choice():
+    """No setting is one that nothing reads, and none is named that there is not."""
+    choices = [
+        *(
+            [f"features={name}"]
+            for name in ("count", "count=efficientnet", "presence", "presence=counts", "efficientnet")
+        ),
+        *([f"objective={name}", "baseline=none"] for name in OBJECTIVES),
+        *([f"guide={name}"] for name in GUIDES),
+        [f"learn={STRUCTURE}"],
+        *([f"learn={BOTH}", f"parameter_method={name}"] for name in (LIKELIHOOD, META_SIM)),
+    ]
+    unread = [set(override(QUICK, settings).unread()) for settings in choices]
+    assert set.intersection(*unread) == set()
+    assert set.union(*unread) <= {field.name for field in fields(Preset)}
+
+
+def test_what_features_for_photographs_read_may_be_set_before_they_are_chosen():
+    for settings in (["head_epochs=2"], ["count.steps=9"], ["parameters.rounds=1"]):
+        for features in (FOR_RENDERS, FOR_PHOTOGRAPHS):
+            instead = FOR_RENDERS if features == FOR_PHOTOGRAPHS else FOR_PHOTOGRAPHS
+            override(QUICK.with_features(features), settings, QUICK.with_features(instead))
+    with pytest.raises(ProbsceneError, match="the features 'count' have no such setting"):
+        override(QUICK, ["directions=2"], QUICK.with_features(FOR_PHOTOGRAPHS))
+    with pytest.raises(ProbsceneError, match="the guide 'pcfg' has no such setting"):
+        override(QUICK.with_guide("pcfg"), ["hidden=2"], QUICK.with_guide("pcfg").with_features(FOR_PHOTOGRAPHS))
 
 
 def test_settings_that_are_read_are_none():

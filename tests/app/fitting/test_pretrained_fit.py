@@ -17,14 +17,14 @@ from probscene.errors import RunError
 from probscene.inference.features.base import embed_all
 from probscene.inference.features.projection import SHARE
 
-FEW = {"pairs": 40, "directions": 3, "batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
+FEW = {"batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
 WORDS = ["--preset", "quick", "--threads", "1", *(w for k, v in FEW.items() for w in ("--set", f"{k}={v}"))]
 
 
 @pytest.fixture(scope="module")
 def run(call, discs, target, tmp_path_factory):
     out = tmp_path_factory.mktemp("pretrained") / "run"
-    words = ["fit", discs.file, "--target", target.images, "--out", out, "--features", "efficientnet", *WORDS]
+    words = ["fit", discs.file, "--target", target.images, "--out", out, *PROJECTED, *WORDS]
     done = call(*words)
     assert done.code == 0, done.err
     return RunFolder.at(out), words
@@ -139,6 +139,7 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
         net.load_state_dict(state)
 
 
+PROJECTED = ["--features", "efficientnet", "--set", "pairs=40", "--set", "directions=3"]
 COUNTING = ["--features", "count=efficientnet", "--set", "pairs=60", "--set", "head_epochs=12"]
 
 
