@@ -39,7 +39,8 @@ from .reading.valued import Label, ValuedRenders, joined
 from .schedule import ParameterSchedule
 from .sites import Site, find_sites
 
-TRIED = 200  # renders that a reader is tried on
+TRIED = 500  # renders that a reader is tried on
+ASSEMBLED = 200  # renders in which it is seen how objects of a scene go together
 MISSED = 400  # renders in which it is seen what is not found
 OWN = 0.65  # of a round's renders are the guide's own
 AHEAD = 8  # steps for which they are drawn together
@@ -291,7 +292,7 @@ class ParameterLearning:
     def _assembly(self) -> Assembly:
         """What the prior's scenes have in common; the same in every phase."""
         seed_everything(batch_seed(self.seed, 4))
-        return self.tried.assembly(self.renders.draw(TRIED, self.model.pretraining_policy))
+        return self.tried.assembly(self.renders.draw(ASSEMBLED, self.model.pretraining_policy))
 
 
 def _within(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
