@@ -1,12 +1,14 @@
 """What a Ray cluster costs, and what a node costs that dies or freezes.
 
-    python benchmarks/cluster.py [--out FOLDER] [--images 20000] [--disturbed 6000]
+    python benchmarks/cluster.py [--out FOLDER] [--images 20000] [--repeats 3] [--disturbed 6000]
 
-First one process, two workers and ``--cluster auto`` make the same Multi-MNIST images: seconds, and seconds of CPU of
-all processes, those of Ray among them; and what a cluster costs with one chunk. Then three simulated nodes of one core
-each make fewer images, undisturbed, and with a node killed after a quarter and another frozen after a half: seconds,
-and how long the longest wait between two chunks was. A fit's structure is learnt on the same nodes, disturbed likewise.
-Whatever was disturbed is compared with the bytes of one process. Digits are those that come with the install.
+First one process, two workers and ``--cluster auto`` make the same Multi-MNIST images, in turn and several times:
+seconds, and seconds of CPU of all processes, those of Ray among them; and what workers and a cluster cost with a chunk
+for each. ``more`` is by how much the CPU of a cluster exceeds that of two workers, each without its start, each time.
+Then three simulated nodes of one core each make fewer images, undisturbed, and with a node killed after a quarter and
+another frozen after a half: seconds, and how long the longest wait between two chunks was. A fit's structure is learnt
+on the same nodes, disturbed likewise. Whatever was disturbed is compared with the bytes of one process. Digits are
+those that come with the install.
 """
 
 import argparse
@@ -23,6 +25,7 @@ from given import command, out_option
 from simulated_cluster import Simulated
 
 import probscene as ps
+from probscene.app.chunks import CHUNK
 from probscene.app.datasets.generate import generate
 from probscene.app.files import write_json
 from probscene.app.fitting.run import RunFolder
@@ -73,6 +76,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     out_option(parser, __file__)
     parser.add_argument("--images", type=int, default=20_000)
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--disturbed", type=int, default=6_000)
     args = parser.parse_args()
     out, found = args.out, {"command": command(__file__)}
@@ -92,15 +96,20 @@ def main():
                     generate(run, number, out / name, 0, cluster=cluster)
             else:
                 generate(run, number, out / name, 0, **how)
-        found[name] = {"images": number, "seconds": cost.wall, "cpu": cost.seconds}
-        print(name, json.dumps(found[name]), flush=True)
+        found.setdefault(name, []).append({"images": number, "seconds": cost.wall, "cpu": cost.seconds})
+        print(name, json.dumps(found[name][-1]), flush=True)
+        return cost.seconds
 
-    made("cluster of one chunk", 64, auto=True)
-    if args.images:
+    more = []
+    for _ in range(args.repeats if args.images else 0):
+        start = [made("two workers' start", 2 * CHUNK, workers=2), made("a cluster's start", 2 * CHUNK, auto=True)]
         made("one process", args.images)
-        made("two workers", args.images, workers=2)
-        made("cluster", args.images, auto=True)
-        found["same bytes"] = same(out / "one process", out / "cluster")
+        whole = [made("two workers", args.images, workers=2), made("cluster", args.images, auto=True)]
+        workers, cluster = (all - some for all, some in zip(whole, start, strict=True))
+        more.append(cluster / workers - 1)
+        found["same bytes"] = found.get("same bytes", True) and same(out / "one process", out / "cluster")
+    found["more"] = more
+    print("more", *(f"{part:.1%}" for part in more), flush=True)
     made("fewer", args.disturbed)
     simulated = Simulated()
     for name, disturb in (("three nodes", False), ("one killed, one frozen", True)):
