@@ -107,14 +107,23 @@ class Reader(nn.Module):
         parts = [self._find(some, i * 64) for i, some in enumerate(images.split(64))]
         return Found(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
+    @torch.no_grad()
+    def count(self, images: Tensor) -> Tensor:
+        """How many objects of each class it finds, ``(N, C)``, in ``(N, 1 or 3, H, W)`` uint8 images."""
+        counts = torch.zeros(len(images), self.classes)
+        for i, some in enumerate(images.split(64)):
+            mass = self(self.eye.enter(some))[1].softmax(1)[:, 1:]
+            n, y, x, inside = blocks(mass.sum(1), float(self.least))
+            label = held(mass, n, y, x)[0]
+            counts.index_put_((n + 64 * i, label), torch.ones(len(n)), accumulate=True)
+        return counts
+
     def _find(self, images: Tensor, first: int) -> Found:
         entered = self.eye.enter(images)
         seen, logits = self(entered)
         mass = logits.softmax(1)[:, 1:]
         n, y, x, inside = blocks(mass.sum(1), self.leasts[0])
-        rows, columns = torch.stack([y, y, y + 1, y + 1], 1), torch.stack([x, x + 1, x, x + 1], 1)  # (K, 4)
-        image = n[:, None].expand(-1, 4)
-        label = mass[image, :, rows, columns].sum(1).argmax(1)
+        label, image, rows, columns = held(mass, n, y, x)
         share = mass[image, label[:, None], rows, columns]
         share = (share / share.sum(1, keepdim=True).clamp(min=1e-6)).unsqueeze(-1)  # of what each of the cells says
         parent, values = self.at(seen, image, rows, columns)
@@ -159,6 +168,17 @@ def blocks(mass: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     n, y, x, inside = (torch.cat(part) for part in zip(*found, strict=True))
     order = n.argsort(stable=True)
     return n[order], y[order], x[order], inside[order]
+
+
+def held(mass: Tensor, n: Tensor, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The class of which blocks ``(K,)`` hold most, and their cells: image, row and column ``(K, 4)``.
+
+    Args:
+        mass: ``(N, C, h, w)``.
+    """
+    rows, columns = torch.stack([y, y, y + 1, y + 1], 1), torch.stack([x, x + 1, x, x + 1], 1)
+    image = n[:, None].expand(-1, 4)
+    return mass[image, :, rows, columns].sum(1).argmax(1), image, rows, columns
 
 
 def value_loss(said: Tensor, u: Tensor) -> Tensor:

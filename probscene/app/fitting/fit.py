@@ -28,7 +28,7 @@ from ..progress import Progress
 from ..workers.cluster import Cluster
 from .cache import NetworkCache
 from .learnt.outcome import compared, conclude, give_up
-from .learnt.parameters import learn_parameters
+from .learnt.parameters import READER, learn_parameters
 from .learnt.structure import AGAIN, FIRST, learn_structure, learn_structure_again
 from .observer import RENDERED_AT_ONCE, Observer
 from .parts import inner
@@ -89,10 +89,10 @@ def fit(
             if "parameters" in run.preset.learn:
                 with threads(run.record["threads"]):
                     learn_parameters(run, observer, net.net, guide, images, progress, say or (lambda text: None))
-                learn_structure_again(run, net.net, real, guide, progress, cluster)
+                learn_structure_again(run, net.net, real, guide, images, progress, cluster)
             said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
-    for name in (FIRST, AGAIN):
-        (run.path / f"{name}-checkpoint.safetensors").unlink(missing_ok=True)
+    for name in (f"{FIRST}-checkpoint", f"{AGAIN}-checkpoint", READER):
+        (run.path / f"{name}.safetensors").unlink(missing_ok=True)
     if said and say is not None:
         say(said)
     return run.guide

@@ -134,6 +134,20 @@ def test_a_fit_goes_on_to_the_same_bytes(both, of, stop, call, discs, target, tm
     assert not list((tmp_path / "run").glob("*-checkpoint.safetensors"))
 
 
+@pytest.mark.parametrize("wins", [True, False])
+def test_structure_is_learnt_again_by_what_tells_more_of_it(call, discs, target, tmp_path, monkeypatch, wins):
+    """By the objects that the reader finds, or by the network's sums."""
+    anything_is_read(monkeypatch)
+    errors = iter((1.0, 2.0) if wins else (2.0, 1.0))
+    monkeypatch.setattr(structure, "_wrong", lambda seen, drawn: next(errors))
+    by, learn = [], structure._trainer
+    monkeypatch.setattr(structure, "_trainer", lambda *args: by.append(args[4]) or learn(*args))
+    words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
+    assert call(*words).code == 0
+    whole = by[1] == by[1].round()
+    assert bool(whole.all()) == wins and not (tmp_path / "run" / "reader.safetensors").exists()
+
+
 def test_structure_is_learnt_again_in_the_learnt_layout(both):
     lines = [json.loads(line) for line in (both / "log.jsonl").read_text().splitlines()]
     assert [line["batch"] for line in lines if line["stage"] == "structure-again"] == [1, 2, 3]
@@ -147,7 +161,7 @@ def test_structure_is_learnt_again_in_the_learnt_layout(both):
 def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_path):
     words = ("--target", target.images, "--out", tmp_path / "run", "--features", "presence")
     short = ["--set", "presence_images=40", "--set", "presence_epochs=1"]
-    done = call("fit", discs.file, *words, *discs.settings, *LEARN, *short)
+    done = call("fit", discs.file, *words, *discs.without("count", "width"), *LEARN, *short)
     assert done.code == 0, done.err
     assert "keeps the prior: presence features are not read for it yet" in " ".join(done.err.split())
     assert RunFolder.at(tmp_path / "run").parameters == {}

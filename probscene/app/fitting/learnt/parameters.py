@@ -17,7 +17,8 @@ from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
-from probscene.inference.parameters.reading.eyes import Eye
+from probscene.inference.parameters.reading.counts import of_counts
+from probscene.inference.parameters.reading.eyes import Eye, RenderEye
 from probscene.inference.parameters.sites import Site
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from ..run import RunFolder
 
 NAME = "parameters"  # of the file with the record, and before the names of tensors beside a guide's
+READER = "reader"  # of the file with what finds objects, until structure was learnt again
 HELD = 5  # one image of the target in so many is not learnt from, and judges
 JUDGED = 200  # images of each side, at most
 
@@ -92,6 +94,8 @@ def learn_parameters(
 
         learning.run(each)
         keep.finish()
+        if isinstance(learning, ParameterLearning) and isinstance(eye, RenderEye):
+            run.write_tensors(READER, of_counts(learning.tried.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
         run.write_parameters(_record(run, guide, learning, _some(target, held, JUDGED)))
         run.write_tensors(NAME, kept)

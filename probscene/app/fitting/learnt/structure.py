@@ -11,12 +11,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from probscene.inference.features.base import FeatureNet
+from probscene.dataset import Images
+from probscene.inference.features.base import FeatureNet, embed_all
+from probscene.inference.features.counting.net import CountNet
 from probscene.inference.guides.base import Guide
 from probscene.inference.holding import Held
 from probscene.inference.judging.farther import farther
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
+from probscene.inference.parameters.reading.counts import ReaderCounts
 from probscene.inference.pretrain import pretrain
 from probscene.inference.reuse import RenderPool
 from probscene.inference.training import Training, batch_seed
@@ -26,12 +29,12 @@ from probscene.sampling import sample, seed_everything
 from ...progress import Progress
 from ...workers.cluster import Cluster
 from ...workers.crew import Crew
-from ..observer import Observe, Observer, Part
+from ..observer import RENDERED_AT_ONCE, Observe, Observer, Part
 from ..parts import inner
 from ..run import RunFolder
 from ..storage import Keeper
 from .outcome import compared
-from .parameters import NAME, beside, with_parameters
+from .parameters import NAME, READER, beside, with_parameters
 
 FIRST, AGAIN = "guide", "structure-again"  # of the checkpoints
 BEFORE = "guide-first"  # of the guide that parameters are learnt with
@@ -61,7 +64,7 @@ def learn_structure(
     if known is not None:
         guide.load_state_dict(known)
         return guide
-    pool, crew = _pool(run, run.model), _crew(run, cluster, preset.draws_per_structure, again=False)
+    pool, crew = _pool(run, run.model), _crew(run, cluster, preset.draws_per_structure)
     observe = observer.observe_anew(net, preset.draws_per_structure, crew)
     objective = _objective(run, run.model, observe, net, guide, pool)
     rate, seeds = preset.learning_rate, batch_seed(seed, 3)
@@ -88,14 +91,17 @@ def learn_structure_again(
     net: FeatureNet,
     real: Tensor,
     guide: Guide,
+    images: Callable[[], Images],
     progress: Progress,
     cluster: Cluster | None = None,
 ) -> None:
     """Go on with a guide whose scenes have learnt parameters; as it is where they have none, and as it was where its
-    scenes end farther from the target.
+    scenes end farther from the target. Both are seen by what the reader of parameters finds, where that tells more of
+    the scenes' structures than the network.
 
     Args:
         real: ``(L, D)``.
+        images: opens the target.
         cluster: see ``learn_structure``.
 
     Raises:
@@ -107,7 +113,10 @@ def learn_structure_again(
     seed_everything(batch_seed(seed, 8))
     model = guide.suits(run.model)
     observer, before = Observer(model, run.record["threads"]), {k: v.clone() for k, v in guide.state_dict().items()}
-    pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True)
+    finder = _finder(run, net, observer, guide)
+    if finder is not None:
+        net, real = finder, embed_all(finder, images().batches(RENDERED_AT_ONCE))
+    pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True, finder=finder is not None)
     objective = _objective(run, model, observer.observe_anew(net, 1, crew), net, guide, pool)
     rate, seeds = SLOWER * preset.learning_rate, batch_seed(seed, 7)
     trainer = _trainer(run, model, guide, objective, real, preset.batches_again, rate, seeds, pool)
@@ -127,22 +136,52 @@ def _seen(run: RunFolder, observer: Observer, net: FeatureNet, guide: Guide) -> 
         return observer.observe(net)(sample(run.model, guide, run.preset.num_scenes))
 
 
+def _finder(run: RunFolder, net: FeatureNet, observer: Observer, guide: Guide) -> ReaderCounts | None:
+    """Counts of what the reader finds, where they are nearer to those of a guide's scenes than the network's are."""
+    counts = inner(net)
+    finder = _reader_counts(run, counts)
+    if finder is None or not isinstance(counts, CountNet):
+        return None
+    seed_everything(batch_seed(run.record["seed"], 10))
+    with torch.no_grad():
+        scenes = sample(run.model, guide, run.preset.num_scenes)
+        found = [observer.observe(one)(scenes) for one in (finder, counts)]
+    kinds = [run.model.grammar.kind(name) for name in counts.classes]
+    drawn = scenes.derivation.counts(len(run.model.grammar.kinds))[:, kinds]
+    of_finder, of_network = (_wrong(some[:, : len(kinds)], drawn) for some in found)
+    return finder if of_finder < of_network else None
+
+
+def _wrong(seen: Tensor, drawn: Tensor) -> float:
+    """By how much counts are wrong, in the mean."""
+    return float((seen - drawn).abs().mean())
+
+
+def _reader_counts(run: RunFolder, net: FeatureNet) -> ReaderCounts | None:
+    """None where there is no reader, or classes are counted group by group."""
+    state = run.read_tensors(READER)
+    return ReaderCounts(net, state) if state and isinstance(net, CountNet) and net.groups is None else None
+
+
 def _pool(run: RunFolder, model: SceneModel) -> RenderPool | None:
     return RenderPool(model, run.preset.reuse) if run.preset.reuse else None
 
 
-def _crew(run: RunFolder, cluster: Cluster | None, draws_per_structure: int, again: bool) -> Crew | None:
-    task = run.path.resolve(), draws_per_structure, again
+def _crew(
+    run: RunFolder, cluster: Cluster | None, draws_per_structure: int, again: bool = False, finder: bool = False
+) -> Crew | None:
+    task = run.path.resolve(), draws_per_structure, again, finder
     return None if cluster is None else cluster.crew(_actor, task, run.record["threads"])
 
 
-def _actor(path: Path, draws_per_structure: int, again: bool) -> Callable[[Part], tuple[int, Tensor]]:
+def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> Callable[[Part], tuple[int, Tensor]]:
     """What a node of a cluster does with a part of a batch."""
     run = RunFolder.at(path)
     model, net = run.model, run.network()
     assert net is not None
     if again and (suits := with_parameters(run, run.new_guide(), beside(run.read_tensors(NAME) or {})).suits):
         model = suits(model)
+    net = (_reader_counts(run, inner(net)) if finder else None) or net
     observer = Observer(model, run.record["threads"])
     return lambda part: observer.part(part, net, draws_per_structure)
 
