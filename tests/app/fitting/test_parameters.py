@@ -8,6 +8,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from pyro.util import get_rng_state, set_rng_state
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
@@ -134,18 +135,40 @@ def test_a_fit_goes_on_to_the_same_bytes(both, of, stop, call, discs, target, tm
     assert not list((tmp_path / "run").glob("*-checkpoint.safetensors"))
 
 
-@pytest.mark.parametrize("wins", [True, False])
-def test_structure_is_learnt_again_by_what_tells_more_of_it(call, discs, target, tmp_path, monkeypatch, wins):
-    """By the objects that the reader finds, or by the network's sums."""
+class Node:
+    """What a cluster does, in this process."""
+
+    def __init__(self, run, _, draws_per_structure, again=False, finder=False):
+        before = get_rng_state()
+        self.do = structure._actor(run.path, draws_per_structure, again, finder)
+        set_rng_state(before)  # a node has random numbers of its own
+
+    def run(self, tasks, done):
+        for task in tasks:
+            done(self.do(task))
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_structure_is_learnt_again_by_what_tells_more_of_it(call, discs, target, tmp_path, monkeypatch, found):
+    """By the objects that the reader finds, or by the network's sums; on nodes of a cluster as here."""
     anything_is_read(monkeypatch)
-    errors = iter((1.0, 2.0) if wins else (2.0, 1.0))
-    monkeypatch.setattr(structure, "_wrong", lambda seen, drawn: next(errors))
-    by, learn = [], structure._trainer
-    monkeypatch.setattr(structure, "_trainer", lambda *args: by.append(args[4]) or learn(*args))
-    words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
-    assert call(*words).code == 0
-    whole = by[1] == by[1].round()
-    assert bool(whole.all()) == wins and not (tmp_path / "run" / "reader.safetensors").exists()
+    learn = structure._trainer
+    ways = {"here": structure._crew, "nodes": Node} if found else {"here": structure._crew}
+    for path, crew in ways.items():
+        errors, real = iter((1.0, 2.0) if found else (2.0, 1.0)), []
+        with monkeypatch.context() as patch:
+            patch.setattr(structure, "_wrong", lambda seen, drawn, errors=errors: next(errors))
+            patch.setattr(structure, "_trainer", lambda *args, real=real: real.append(args[4]) or learn(*args))
+            patch.setattr(structure, "_crew", crew)
+            words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / path, *discs.settings, *LEARN)
+            assert call(*words).code == 0
+        assert (
+            bool((real[1] == real[1].round()).all()) == found and not (tmp_path / path / "reader.safetensors").exists()
+        )
+    assert len({(tmp_path / path / "guide.safetensors").read_bytes() for path in ways}) == 1
 
 
 def test_structure_is_learnt_again_in_the_learnt_layout(both):

@@ -138,17 +138,15 @@ def _seen(run: RunFolder, observer: Observer, net: FeatureNet, guide: Guide) -> 
 
 def _finder(run: RunFolder, net: FeatureNet, observer: Observer, guide: Guide) -> ReaderCounts | None:
     """Counts of what the reader finds, where they are nearer to those of a guide's scenes than the network's are."""
-    counts = inner(net)
-    finder = _reader_counts(run, counts)
-    if finder is None or not isinstance(counts, CountNet):
+    finder = _reader_counts(run, net)
+    if finder is None:
         return None
     seed_everything(batch_seed(run.record["seed"], 10))
+    kinds = [run.model.grammar.kind(name) for name in run.model.classes]
     with torch.no_grad():
         scenes = sample(run.model, guide, run.preset.num_scenes)
-        found = [observer.observe(one)(scenes) for one in (finder, counts)]
-    kinds = [run.model.grammar.kind(name) for name in counts.classes]
-    drawn = scenes.derivation.counts(len(run.model.grammar.kinds))[:, kinds]
-    of_finder, of_network = (_wrong(some[:, : len(kinds)], drawn) for some in found)
+        drawn = scenes.derivation.counts(len(run.model.grammar.kinds))[:, kinds]
+        of_finder, of_network = (_wrong(observer.observe(one)(scenes)[:, : len(kinds)], drawn) for one in (finder, net))
     return finder if of_finder < of_network else None
 
 
@@ -159,8 +157,8 @@ def _wrong(seen: Tensor, drawn: Tensor) -> float:
 
 def _reader_counts(run: RunFolder, net: FeatureNet) -> ReaderCounts | None:
     """None where there is no reader, or classes are counted group by group."""
-    state = run.read_tensors(READER)
-    return ReaderCounts(net, state) if state and isinstance(net, CountNet) and net.groups is None else None
+    state, counts = run.read_tensors(READER), inner(net)
+    return ReaderCounts(counts, state) if state and isinstance(counts, CountNet) and counts.groups is None else None
 
 
 def _pool(run: RunFolder, model: SceneModel) -> RenderPool | None:
@@ -181,7 +179,7 @@ def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> C
     assert net is not None
     if again and (suits := with_parameters(run, run.new_guide(), beside(run.read_tensors(NAME) or {})).suits):
         model = suits(model)
-    net = (_reader_counts(run, inner(net)) if finder else None) or net
+    net = (_reader_counts(run, net) if finder else None) or net
     observer = Observer(model, run.record["threads"])
     return lambda part: observer.part(part, net, draws_per_structure)
 
