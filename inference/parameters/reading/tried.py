@@ -42,9 +42,13 @@ class TriedReader:
         self.skill: Skill | None = None
         self.readings_of = torch.zeros(0, dtype=torch.int64)
 
-    def settle(self, valued: Valued) -> None:
+    def settle(self, valued: Valued) -> tuple[Found, Tensor]:
         """Settle how much of an object's unit has to be found: so little that in some renders the fewest objects are
-        missed, found twice or found where there is none; up to chance, as of a target's objects less is found."""
+        missed, found twice or found where there is none; up to chance, as of a target's objects less is found.
+
+        Returns:
+            what is found in the renders then, and the node that each is, see ``matched``.
+        """
         found, drawn = self.reader.find_all(valued.drawn.image), valued.drawn
         which, mistakes = matched(found, valued), []
         node, number = found.image * drawn.label.shape[1] + which, int(visible(valued).sum())
@@ -55,12 +59,12 @@ class TriedReader:
         most = min(mistakes) + math.sqrt(min(mistakes))
         as_good = [least for least, some in zip(self.reader.leasts, mistakes, strict=True) if some <= most]
         self.reader.least.fill_(as_good[0])
+        enough = found.mass > self.reader.least
+        return found.those(enough), which[enough]
 
     def on(self, valued: Valued, images: Tensor) -> None:
         """Try it on renders of the prior, and see how often it finds each class in the target's images."""
-        self.settle(valued)
-        found = self.reader.find(valued.drawn.image)
-        which = matched(found, valued)
+        found, which = self.settle(valued)
         of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
         of_scenes = Skill.of(found.overall, valued.overall)
         self.skill = Skill(*(torch.cat(pair) for pair in zip(of_nodes, of_scenes, strict=True)))
@@ -145,9 +149,8 @@ class TriedReader:
 
     def missing(self, valued: Valued) -> Missing:
         """Objects that it does not find in some renders; by these is settled first how much has to be found."""
-        self.settle(valued)
-        found = self.reader.find(valued.drawn.image)
-        which, there = matched(found, valued), torch.zeros_like(valued.kind, dtype=torch.bool)
+        found, which = self.settle(valued)
+        there = torch.zeros_like(valued.kind, dtype=torch.bool)
         is_it = (which >= 0) & (found.label == valued.drawn.label[found.image, which])
         there[found.image[is_it], which[is_it]] = True
         return Missing.of(valued, kinds_of(self.model, torch.arange(len(self.model.classes))), there, self.columns[0])
