@@ -35,7 +35,14 @@ SHORT = {
     "parameters.energy_scenes": 6,
 }
 WORDS = ["--preset", "quick", "--threads", "1", "--no-cache", "--no-verdict"]
-SETTINGS = WORDS + [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+
+
+def _without(*begins: str) -> list[str]:
+    left = {key: value for key, value in SHORT.items() if not key.startswith(begins)}
+    return [*WORDS, *(word for key, value in left.items() for word in ("--set", f"{key}={value}"))]
+
+
+SETTINGS = _without()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -83,11 +90,6 @@ def discs() -> SimpleNamespace:
     """``file``: a model; ``settings``: words that make a fit of it short; ``short``: the preset's fields among them;
     ``without``: the words without those of fields that begin so, for fits that do not read them."""
     return SimpleNamespace(file=DISCS, settings=SETTINGS, short=SHORT, without=_without)
-
-
-def _without(*begins: str) -> list[str]:
-    left = {key: value for key, value in SHORT.items() if not key.startswith(begins)}
-    return [*WORDS, *(word for key, value in left.items() for word in ("--set", f"{key}={value}"))]
 
 
 @pytest.fixture(scope="session")

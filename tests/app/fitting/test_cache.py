@@ -81,7 +81,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("what", OTHERS)
 def test_another_one_is_another_entry(fit, discs, whole, what):
-    unread = ("count", "width") if what == "network" else ("nothing",)
+    unread = ("count", "width") if what == "network" else ()
     words = [word for word in discs.without(*unread) if word != "--no-cache"]
     assert not fit(discs.file, *OTHERS[what], words=words)[1]
     assert fit(discs.file, *OTHERS[what], words=words)[1]
