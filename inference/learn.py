@@ -16,7 +16,7 @@ from probscene.sampling import seed_everything
 from .guides.base import Guide
 from .objective import ScoreFunction
 from .reuse import RenderPool
-from .training import Report, batch_seed, check_finite, restore_training, training_state
+from .training import Report, batch_seed, check_finite, of_prefix, restore_training, training_state
 
 
 class Trainer:
@@ -116,7 +116,7 @@ class Trainer:
         self.done = int(numbers["done"])
         averages = {key: value for key, value in numbers.items() if key.startswith("average-")}
         if self.pool is not None:
-            self.pool.restore({k.removeprefix("pool."): v for k, v in tensors.items() if k.startswith("pool.")})
+            self.pool.restore(of_prefix(tensors, "pool."))
         self.objective.averages = {int(key.removeprefix("average-")): value for key, value in averages.items()}
 
     def _batch(self) -> None:

@@ -51,6 +51,11 @@ class Training(Protocol):
         ...
 
 
+def of_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with it, by the rest of their names."""
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+
 def check_finite(loss: float, parameters: Iterable[Tensor], what: str, where: str, remedy: str) -> None:
     """The guard of every training.
 

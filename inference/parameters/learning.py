@@ -23,7 +23,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
-from ..training import Report, Training, batch_seed
+from ..training import Report, Training, batch_seed, of_prefix
 from .best import Best, HeldOut
 from .energy import EnergyDistance, OwnReadings, site_rows
 from .guide import ParameterGuide
@@ -105,8 +105,7 @@ class ParameterLearning:
 
     @property
     def learnt(self) -> tuple[Site, ...]:
-        """The sites that can be read, and are in the target, in the order of the program; empty before the reader was
-        tried."""
+        """The sites that can be read, in the order of the program; none before the reader was tried."""
         return tuple(site for site in self.sites if site in self.tried.good_sites)
 
     def why_not(self, site: Site) -> str:
@@ -168,17 +167,17 @@ class ParameterLearning:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
         self.phase = int(tensors["phase"])
-        self.tried.reader.load_state_dict(_within(tensors, "reader."))
+        self.tried.reader.load_state_dict(of_prefix(tensors, "reader."))
         self.tried.reader.eval()
         if "skill.way" in tensors:
-            skill = Skill(tensors["skill.way"], tensors["skill.share"])
-            self.tried.skill, self.tried.readings_of = skill, tensors["readings"]
+            self.tried.skill = Skill(tensors["skill.way"], tensors["skill.share"])
+            self.tried.readings_of = tensors["readings"]
             self.guide = self._new_guide()
         if self.guide is not None:
-            self.guide.net.load_state_dict(_within(tensors, "guide."))
+            self.guide.net.load_state_dict(of_prefix(tensors, "guide."))
             if self.best is not None:
-                self.best.weights = _within(tensors, "best.")
-        missing, inner = _within(tensors, "missing."), _within(tensors, "inner.")
+                self.best.weights = of_prefix(tensors, "best.")
+        missing, inner = of_prefix(tensors, "missing."), of_prefix(tensors, "inner.")
         if missing:
             self.missing = Missing(**missing)
         if inner:
@@ -204,10 +203,8 @@ class ParameterLearning:
             self.missing = self.tried.missing(self._own_scenes(MISSED))
         values, made = self._read()
         if what == ENERGY:
-            scenes, rate = schedule.energy_scenes, schedule.energy_rate
-            return EnergyDistance(
-                guide.net, values, partial(self._own, made), self.tried.noisy, steps, scenes, rate, seed
-            )
+            own, scenes, rate = partial(self._own, made), schedule.energy_scenes, schedule.energy_rate
+            return EnergyDistance(guide.net, values, own, self.tried.noisy, steps, scenes, rate, seed)
         rate = schedule.rate if first else 0.6 * schedule.rate
         return MaximumLikelihood(guide.net, values, steps, learning_rate=rate, seed=seed)
 
@@ -273,11 +270,18 @@ class ParameterLearning:
         made = along_the_widest(self._assembly, found["target"])
         seed_everything(batch_seed(self.seed, 6))
         read = {name: self.tried.values(made, objects, len(images[name]))[0] for name, objects in found.items()}
-        sites = [site for site in (*self.node_sites, *self.scene_sites) if site in self.tried.good_sites]
-        return {
-            site.name: {name: site_rows(values.site(i)) for name, values in read.items()}
-            for i, site in enumerate(sites)
-        }
+        names = [site.name for site in (*self.node_sites, *self.scene_sites) if site in self.tried.good_sites]
+        return {s: {name: site_rows(values.site(i)) for name, values in read.items()} for i, s in enumerate(names)}
+
+    @torch.no_grad()
+    def lost(self) -> dict[str, float]:
+        """Sites that cannot be read in renders of the guide, where they have their prior; see ``TriedReader.lost``."""
+        if self.guide is None or not self.tried.unclear:
+            return {}
+        self.guide.passed = self.tried.unclear
+        valued = self._own_scenes(TRIED)
+        self.guide.passed = frozenset()
+        return self.tried.lost(valued)
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int) -> OwnReadings:
@@ -293,7 +297,3 @@ class ParameterLearning:
         """What the prior's scenes have in common; the same in every phase."""
         seed_everything(batch_seed(self.seed, 4))
         return self.tried.assembly(self.renders.draw(ASSEMBLED, self.model.pretraining_policy))
-
-
-def _within(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

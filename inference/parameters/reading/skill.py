@@ -15,6 +15,7 @@ from .reader import cut_mean, normal
 LINE, CIRCLE, TWICE = range(3)
 READABLE = 0.2  # least skill of a site that is learnt
 CLEARLY = 0.05, 0.15  # by how much a circle, and one gone round twice, must explain more than what is simpler
+ENOUGH = 20  # objects, or readings of a site in the target, from which something is concluded
 LEAST_SD = 2e-3
 GUESSES = 41  # values that a guess may have
 SURE = 2.0  # standard errors between a share as it was found and the least that it may be
@@ -64,6 +65,25 @@ class Skill(NamedTuple):
             ways.append(way)
             shares.append(each[way] - SURE * found[way][1])
         return Skill(torch.tensor(ways), torch.tensor(shares))
+
+    def told(self, raw: Tensor, u: Tensor) -> Tensor:
+        """``(S,)`` the share of u's variance that the readings of other objects ``(K, S, ...)`` tell, each in its way,
+        by linear regression: as a reader that has since learnt to expect some values guesses toward them. NaN of a site
+        that fewer than ``ENOUGH`` of the objects have."""
+        shares = []
+        for s, way in enumerate(self.way.tolist()):
+            there = ~u[:, s].isnan()
+            true, said = u[there, s], raw[there, s]
+            if len(true) < ENOUGH:
+                shares.append(torch.nan)
+                continue
+            turned = slice(2 * way, 2 * way + 2)
+            y = _direction(way * true) if way else true.unsqueeze(1)
+            x = said[:, turned] if way else cut_mean(*normal(said)).unsqueeze(1)
+            x, y = x - x.mean(0), y - y.mean(0)
+            left = y - x @ torch.linalg.lstsq(x, y, driver="gelsd").solution
+            shares.append(1 - float(left.square().sum() / y.square().sum()))
+        return torch.tensor(shares)
 
     def read(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation, ``(K, S)`` each, of what a reader says of u ``(K, S, ...)``. Where two values

@@ -16,10 +16,10 @@ from ..sites import Site, having
 from .assembly import Assembly, assembly
 from .missing import Missing
 from .reader import Found, Reader
-from .skill import LEAST_SD, Skill
+from .skill import ENOUGH, LEAST_SD, Skill
 from .training import MIN_VISIBLE, Valued
 
-ENOUGH = 20  # readings of a site in the target, from which it is learnt
+UNCLEAR = 0.5  # share of a site's variance up to which it is doubtful whether it can be read in the target
 SHARP = 0.9  # share of a site's variance from which on it is read sharply
 NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
 
@@ -97,6 +97,26 @@ class TriedReader:
         """Of the sites that are learnt, in the order of ``columns``, which are read with an error of some size."""
         assert self.skill is not None
         return self.skill.share[self.good] < SHARP
+
+    @property
+    def unclear(self) -> frozenset[str]:
+        """Names of the sites that are learnt, but read with little skill."""
+        assert self.skill is not None
+        each = zip((*self.node_sites, *self.scene_sites), self.skill.share.tolist(), strict=True)
+        return frozenset(site.name for site, share in each if site in self.good_sites and share < UNCLEAR)
+
+    def lost(self, valued: Valued) -> dict[str, float]:
+        """Which of these cannot be read in renders that look like the target, but have the prior's values of them: what
+        the prior's renders show may be hidden there, as a sun behind clouds. By name, the share of its variance that is
+        read."""
+        assert self.skill is not None
+        found = self.reader.find(valued.drawn.image)
+        which, (nodes, scenes) = matched(found, valued), self._skills()
+        of_nodes = nodes.told(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
+        there = Skill(self.skill.way, torch.cat([of_nodes, scenes.told(found.overall, valued.overall)]))
+        seen = (there.readable | there.share.isnan()).tolist()
+        each = zip((*self.node_sites, *self.scene_sites), there.share.tolist(), seen, strict=True)
+        return {site.name: share for site, share, seen in each if site.name in self.unclear and not seen}
 
     def why_not(self, site: Site) -> str:
         """Why a site is not learnt; empty where it is."""

@@ -18,6 +18,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.judging.farther import Farther
+from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.reading import reader, skill
 from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
@@ -280,6 +281,23 @@ def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, tar
         return
     assert (record["x"]["learnt"], record["y"]["learnt"], run.parameters["kept"]) == (False, True, "learnt")
     assert record["x"]["because"] == "scenes come no nearer to held-out images by it"
+    x_keeps_the_prior(run)
+
+
+def test_a_site_that_cannot_be_read_where_the_target_is_keeps_the_prior(call, discs, target, tmp_path, monkeypatch):
+    anything_is_read(monkeypatch)
+    monkeypatch.setattr(ParameterLearning, "lost", lambda _: {"x": 0.123})
+    out = tmp_path / "run"
+    done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
+    assert done.code == 0, done.err
+    run = RunFolder.at(out)
+    record = {site["name"]: site for site in run.parameters["sites"]}
+    assert (record["x"]["learnt"], record["x"]["fitted"], record["y"]["learnt"]) == (False, True, True)
+    assert record["x"]["because"] == "in renders that look like the target 12% of its variance can be read"
+    x_keeps_the_prior(run)
+
+
+def x_keeps_the_prior(run):
     found = []
     for model in (run.guide.suits(run.model), run.model):
         seed_everything(0)

@@ -97,6 +97,30 @@ def test_what_says_nothing_is_not_readable():
     assert not Skill.of(raw, torch.full((600, 1), torch.nan)).readable.any()
 
 
+@given(seeds, st.sampled_from([LINE, CIRCLE, TWICE]), st.floats(0.3, 1.0), st.floats(0.02, 0.4))
+def test_what_is_told_of_others_is_that_of_a_regression_however_far_guesses_are_drawn_in(seed, way, much, error):
+    """As numpy's least squares say; half of the objects have no such site."""
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(0, 1, 200)
+    u[::2] = np.nan
+    read = torch.from_numpy(u + error * rng.standard_normal(200)).float().nan_to_num(0.5)
+    raw = torch.zeros(200, 1, 6)
+    raw[:, 0, 0], raw[:, 0, 1] = 0.5 + much * 0.2 * (read - 0.5), -6.0
+    raw[:, 0, 2:] = much * circles(read) + torch.tensor([0.1, 0.2, 0.3, 0.4])
+    told = Skill(torch.tensor([way]), torch.ones(1)).told(raw, torch.from_numpy(u).float()[:, None])
+    there = ~np.isnan(u)
+    true, said = u[there], read.numpy()[there]
+    if way:
+        y = np.stack([np.cos(2 * np.pi * way * true), np.sin(2 * np.pi * way * true)], 1)
+        x = np.stack([np.cos(2 * np.pi * way * said), np.sin(2 * np.pi * way * said), np.ones(100)], 1)
+    else:
+        y, x = true[:, None], np.stack([said, np.ones(100)], 1)
+    left = np.linalg.lstsq(x, y, rcond=None)[1].sum()
+    assert float(told) == pytest.approx(1 - left / (y.var(0).sum() * 100), abs=2e-3)
+    few = torch.from_numpy(u).float()[:38, None]
+    assert Skill(torch.tensor([way]), torch.ones(1)).told(raw[:38], few).isnan().all()
+
+
 @given(seeds, st.integers(0, 40))
 def test_what_is_the_same_for_all_says_nothing_however_few_they_are(seed, number):
     rng = torch.Generator().manual_seed(seed)

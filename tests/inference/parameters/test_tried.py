@@ -11,6 +11,7 @@ from probscene.inference.features.base import Examples
 from probscene.inference.parameters.reading.reader import LEAST_MASS, Found, blocks
 from probscene.inference.parameters.reading.training import MIN_VISIBLE, Valued
 from probscene.inference.parameters.reading.tried import NEAR_ENOUGH, TriedReader
+from probscene.inference.parameters.sites import Site
 
 seeds = st.integers(0, 2**31)
 
@@ -62,3 +63,33 @@ def test_the_least_mass_makes_the_fewest_mistakes_up_to_chance(seed, number):
     fewest = min(map(mistakes, LEAST_MASS))
     wanted = min(least for least in LEAST_MASS if mistakes(least) <= fewest + fewest**0.5)
     assert float(reader.least) == np.float32(wanted)
+
+
+def test_a_sun_behind_clouds_is_lost(smeared):
+    """Its brightness is read with some skill in renders of any weather, and not at all where it is always cloudy."""
+    sun, cloud = Site("sun", ()), Site("cloud", ())
+    of_all = torch.zeros(0, dtype=torch.int64)
+    nothing = Found(of_all, torch.zeros(0), of_all, *torch.zeros(2, 0, 2), torch.zeros(0, 0, 6), torch.zeros(0))
+
+    def find(images):
+        """What shines through, as if it were the sun, and the clouds."""
+        overall = torch.full((len(images), 2, 6), -6.0)
+        overall[..., 0] = images
+        return nothing._replace(overall=overall)
+
+    def drawn(cloud, seed):
+        sun, noise = torch.rand(2, 2000, generator=torch.Generator().manual_seed(seed))
+        u = torch.stack([sun, cloud.expand(2000)], 1)
+        image = torch.stack([0.5 + (1 - cloud) * (sun - 0.5) + 0.5 * (noise - 0.5), u[:, 1]], 1)
+        none = torch.full((2000, 1), -1)
+        seen = Examples(*(torch.zeros(2000, 1),) * len(Examples._fields))
+        seen = seen._replace(image=image, label=none, centre=torch.zeros(2000, 1, 2))
+        return Valued(seen, none, none, none, torch.zeros(2000, 1, 0), u)
+
+    reader = SimpleNamespace(find=find, find_all=find, leasts=LEAST_MASS, least=torch.tensor(0.0))
+    tried = TriedReader(smeared, reader, (), (sun, cloud))
+    any_weather = drawn(torch.rand(2000, generator=torch.Generator().manual_seed(0)), 1)
+    tried.on(any_weather, any_weather.drawn.image)
+    assert tried.good_sites == {sun, cloud} and tried.unclear == {"sun"}
+    assert tried.lost(any_weather) == tried.lost(drawn(torch.tensor(0.5), 2)) == {}
+    assert {name: round(share, 1) for name, share in tried.lost(drawn(torch.tensor(0.95), 3)).items()} == {"sun": 0.0}

@@ -39,11 +39,14 @@ class Judged(NamedTuple):
             farther from what is read in the images; where renders are no nearer, or the schedule says so, all of which
             it is not surely nearer; and where they are surely farther all the same, all but those that bring them
             nearer alone. With the others it is kept, unless its renders are surely farther then.
+        lost: by learnt site that cannot be read in scenes like the target's and keeps its prior therefore, the share of
+            its variance that is read there.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
 
     distances: dict[str, Any]
+    lost: dict[str, float]
     sites: dict[str, dict[str, Any]]
 
 
@@ -51,7 +54,7 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features."""
     learnt = learning.guide
     if learnt is None:
-        return Judged({"kept": "prior"}, {})
+        return Judged({"kept": "prior"}, {}, {})
     judge = learning.best.held if isinstance(learning, ParameterLearning) and learning.best is not None else None
     look, images = _embed(), {"target": held}
     real = look(held) if judge is None else judge.real
@@ -67,21 +70,23 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         return farther(drawn("learnt", learnt.suited(run.model)), of_prior, real)
 
     apart = compared()
-    kept = "learnt" if apart.one < apart.other else "prior"
+    kept, lost = "learnt" if apart.one < apart.other else "prior", dict[str, float]()
     careful = kept == "prior" or run.preset.parameters.sure
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
-        learnt.passed = passed(learning, images, careful)
+        seed_everything(batch_seed(run.record["seed"], 6, 4))
+        lost = learning.lost()
+        learnt.passed = passed(learning, images, careful) | lost.keys()
         if learnt.passed:
             apart = compared()
         if apart.sure and judge is not None:
-            learnt.passed = useless(learnt, judge)
+            learnt.passed = useless(learnt, judge) | lost.keys()
             apart = compared()
         kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
         if kept == "prior":
             learnt.passed = frozenset()
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if isinstance(learning, MetaSimLearning):  # which reads nothing
-        return Judged(distances, {})
+        return Judged(distances, {}, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
     readings = {name: learning.tried.readings(some) for name, some in images.items()}
     halves = [learning.tried.readings(held[i::2]) for i in (0, 1)]
@@ -92,7 +97,7 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
             name: _distance(readings[name][site.name], readings["target"][site.name]) for name in ("prior", "learnt")
         }
         sites[site.name] = each | {"distance": away | {"floor": _distance(*(half[site.name] for half in halves))}}
-    return Judged(distances, sites)
+    return Judged(distances, lost, sites)
 
 
 def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool) -> frozenset[str]:

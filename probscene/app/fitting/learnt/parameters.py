@@ -164,6 +164,8 @@ def _record(
     for site in learning.sites:
         share, fitted = skill.get(site, torch.nan), site in learning.learnt
         because = "scenes come no nearer to held-out images by it" if site.name in passed else learning.why_not(site)
+        if site.name in passed & found.lost.keys():
+            because = f"in renders that look like the target {found.lost[site.name]:.0%} of its variance can be read"
         about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}
         about |= {"fitted": fitted, "skill": share if share == share else None, "because": because}
         sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
