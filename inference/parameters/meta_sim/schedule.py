@@ -29,3 +29,8 @@ class MetaSimSchedule:
     feature_size: int = 160
     hidden: int = 64
     rounds: int = 3
+
+    @property
+    def drawn(self) -> int:
+        """About how many renders are drawn in all."""
+        return self.steps * (self.scenes + 2 * (self.values or self.scenes))

@@ -71,8 +71,8 @@ def fit(
         out: the folder of the run; a temporary one where None, which ``Run.save`` copies.
         learn: ``"structure"``, or ``"structure,parameters"``, where things stand and how they look as well; the
             preset's where None.
-        parameters: how the latter are learnt: ``"likelihood"`` of what is read in the images, or ``"meta-sim"``, the
-            way of that paper, a baseline; the preset's where None.
+        parameters: how the latter are learnt: ``"likelihood"`` of what is read in the images; ``"tilting"``, by how
+            images look as wholes, for photographs; or ``"meta-sim"``, a baseline; what suits the features where None.
         settings: other values of the preset's fields, ``{"batches": 20, "count.steps": 300}``.
         skip_bad: leave out files that do not decode.
         threads: of torch; all cores where None. Another number rounds differently.

@@ -40,7 +40,11 @@ def fit(
         typer.Option(metavar="WHAT", help="structure, or structure,parameters: where things stand and how they look."),
     ] = None,
     parameters: Annotated[
-        str | None, typer.Option(metavar="NAME", help="How the latter are learnt: likelihood, or meta-sim, a baseline.")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="How the latter are learnt: likelihood; tilting, for photographs; or meta-sim, a baseline.",
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")

@@ -9,12 +9,12 @@ from probscene.errors import ProbsceneError
 from probscene.inference.objective import BASELINES
 
 from .parts import lasting_word
-from .preset import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, Preset
+from .preset import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, TILTING, Preset
 
 CHOICES = {
     "baseline": BASELINES,
     "learn": (STRUCTURE, BOTH),
-    "parameter_method": (LIKELIHOOD, META_SIM),
+    "parameter_method": (LIKELIHOOD, TILTING, META_SIM),
 }
 LEAST = {"num_scenes": 2, "scenes": 2, "batches_again": 0, "rounds": 0, "energy_steps": 0, "directions": 0, "reuse": 0}
 FIRST = {"objective": Preset.with_objective, "guide": Preset.with_guide, "features": Preset.with_features}

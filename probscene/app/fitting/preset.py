@@ -15,6 +15,7 @@ from probscene.inference.features.projected import ProjectedFeatures
 from probscene.inference.guides.lstm import GUIDES
 from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.schedule import ParameterSchedule
+from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 
 from .parts import IN_MEMORY, CheckedDivergence, as_divergence, as_features, is_file_part, load_part
 
@@ -22,7 +23,8 @@ FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
 TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, PRESENCE, PRESENCE_COUNTS)  # on the prior's renders
 _RENAMED = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
 STRUCTURE, BOTH = "structure", "structure,parameters"
-LIKELIHOOD, META_SIM = "likelihood", "meta-sim"  # by which parameters are learnt
+LIKELIHOOD, TILTING, META_SIM = "likelihood", "tilting", "meta-sim"  # by which parameters are learnt
+_SCHEDULES = {LIKELIHOOD: "parameters", TILTING: "tilting", META_SIM: "meta_sim"}
 _OF_PRESENCE = ("presence_images", "presence_epochs", "presence_width", "presence_hidden")
 OBJECTIVES = ("kde", "js", "witness", "mmd")
 _FEATURE_SETTINGS = {
@@ -68,8 +70,9 @@ class Preset:
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
         prior_if_worse: keep the prior where what was learnt is farther from the target, beyond chance.
         learn: ``"structure"``, or ``"structure,parameters"``, where things stand and how they look as well.
-        parameter_method: of the latter: ``"likelihood"`` of what is read in the target, or Meta-Sim's way, a baseline.
-        parameters, meta_sim: the schedules of both.
+        parameter_method: of the latter: ``"likelihood"`` of what is read in the target; ``"tilting"``, by how images
+            look as wholes, for photographs; or ``"meta-sim"``, a baseline.
+        parameters, tilting, meta_sim: their schedules.
         batches_again: of structure's second pass, whose scenes have learnt parameters; none where 0.
     """
 
@@ -114,6 +117,7 @@ class Preset:
     learn: str = STRUCTURE
     parameter_method: str = LIKELIHOOD
     parameters: ParameterSchedule = field(default_factory=ParameterSchedule)
+    tilting: TiltingSchedule = field(default_factory=TiltingSchedule)
     meta_sim: MetaSimSchedule = field(default_factory=MetaSimSchedule)
     batches_again: int = 40
 
@@ -123,10 +127,8 @@ class Preset:
         record = {_RENAMED.get(key, key): value for key, value in record.items()}
         whole = {key: tuple(value) if isinstance(value, list) else value for key, value in record.items()}
         nested: dict[str, Any] = {"count": CountSchedule(**record["count"])}
-        if "parameters" in record:
-            nested["parameters"] = ParameterSchedule(**record["parameters"])
-        if "meta_sim" in record:
-            nested["meta_sim"] = MetaSimSchedule(**record["meta_sim"])
+        schedules = {"parameters": ParameterSchedule, "tilting": TiltingSchedule, "meta_sim": MetaSimSchedule}
+        nested |= {name: made(**record[name]) for name, made in schedules.items() if name in record}
         return Preset(**{**whole, **nested})
 
     def with_objective(self, objective: str) -> "Preset":
@@ -228,7 +230,8 @@ class Preset:
         if self.learn != BOTH:
             return self.make_features().images + structure
         again = self.batches_again * self.num_scenes
-        return self.make_features().images + structure + self.parameters.drawn + again
+        of_parameters = getattr(self, _SCHEDULES[self.parameter_method]).drawn
+        return self.make_features().images + structure + of_parameters + again
 
     def unread(self) -> dict[str, str]:
         """Settings that the chosen guide, objective, features or way of learning do not read, and why."""
@@ -238,11 +241,11 @@ class Preset:
             others = {name for names in _FEATURE_SETTINGS.values() for name in (*names, "directions")}
             found |= dict.fromkeys(others.difference(own), f"the features {self.features!r} have no such setting")
         if self.learn != BOTH:
-            settings = ("parameters", "meta_sim", "parameter_method", "batches_again")
+            settings = (*_SCHEDULES.values(), "parameter_method", "batches_again")
             found |= dict.fromkeys(settings, f"the fit learns {self.learn} alone")
         else:
-            other = "parameters" if self.parameter_method == META_SIM else "meta_sim"
-            found[other] = f"parameters are learnt by {self.parameter_method}"
+            others = [name for method, name in _SCHEDULES.items() if method != self.parameter_method]
+            found |= dict.fromkeys(others, f"parameters are learnt by {self.parameter_method}")
         for name in ("hidden", "num_latents", "index"):
             if name not in guide:
                 found[name] = f"the guide {self.guide!r} has no such setting"

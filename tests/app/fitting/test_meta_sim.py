@@ -99,4 +99,4 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, discs, target, tmp_path, 
 
 def test_another_word_is_named(call, discs, target, tmp_path):
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--parameters", "magic")
-    assert done.code != 0 and "likelihood, meta-sim" in done.err and "magic" in done.err
+    assert done.code != 0 and "likelihood, tilting, meta-sim" in done.err and "magic" in done.err

@@ -13,6 +13,7 @@ from probscene.app.fitting.preset import (
     META_SIM,
     OBJECTIVES,
     STRUCTURE,
+    TILTING,
     Preset,
 )
 from probscene.app.fitting.presets import DEFAULT, PRESETS, QUICK
@@ -80,7 +81,7 @@ def test_every_field_is_read_by_some_choice():
         *([f"objective={name}", "baseline=none"] for name in OBJECTIVES),
         *([f"guide={name}"] for name in GUIDES),
         [f"learn={STRUCTURE}"],
-        *([f"learn={BOTH}", f"parameter_method={name}"] for name in (LIKELIHOOD, META_SIM)),
+        *([f"learn={BOTH}", f"parameter_method={name}"] for name in (LIKELIHOOD, TILTING, META_SIM)),
     ]
     unread = [set(override(QUICK, settings).unread()) for settings in choices]
     assert set.intersection(*unread) == set()

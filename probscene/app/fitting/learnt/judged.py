@@ -17,12 +17,13 @@ from probscene.inference.judging.two_sample import Features
 from probscene.inference.parameters.best import HeldOut, useless
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
-from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
+from probscene.inference.parameters.tilting.learning import TiltingLearning
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
 
 from ..observer import RENDERED_AT_ONCE, Observer
+from .wholes import WholeLearning
 
 if TYPE_CHECKING:
     from ..run import RunFolder
@@ -50,7 +51,7 @@ class Judged(NamedTuple):
     sites: dict[str, dict[str, Any]]
 
 
-def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSimLearning, held: Tensor) -> Judged:
+def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLearning, held: Tensor) -> Judged:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features."""
     learnt = learning.guide
     if learnt is None:
@@ -84,8 +85,10 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSim
         kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
         if kept == "prior":
             learnt.passed = frozenset()
+    if isinstance(learning, TiltingLearning) and not learning.learnt:
+        kept = "prior"
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
-    if isinstance(learning, MetaSimLearning):  # which reads nothing
+    if not isinstance(learning, ParameterLearning):  # which reads nothing
         return Judged(distances, {}, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
     readings = {name: learning.tried.readings(some) for name, some in images.items()}

@@ -15,7 +15,6 @@ from probscene.inference.features.base import FeatureNet
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
-from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
 from probscene.inference.parameters.reading.counts import of_counts
 from probscene.inference.parameters.reading.eyes import Eye, RenderEye
@@ -28,10 +27,10 @@ from probscene.scenarios import JointGrammar
 from ...progress import Progress
 from ..observer import Observer
 from ..parts import inner
-from ..preset import META_SIM
+from ..preset import LIKELIHOOD, META_SIM
 from ..storage import Keeper
 from .judged import held_out, judged
-from .meta_sim import meta_sim_learning, sites_record
+from .wholes import WholeLearning, meta_sim_learning, sites_record, tilting_learning
 
 if TYPE_CHECKING:
     from ..run import RunFolder
@@ -63,8 +62,8 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     seed_everything(batch_seed(run.record["seed"], 5))
-    eye, by_reading = Eye.of(inner(net)), run.preset.parameter_method != META_SIM
-    joint = not by_reading and isinstance(run.model.grammar, JointGrammar)
+    eye, method = Eye.of(inner(net)), run.preset.parameter_method
+    by_reading, joint = method == LIKELIHOOD, method == META_SIM and isinstance(run.model.grammar, JointGrammar)
     if joint or (by_reading and eye is None):
         who = "models of several scenarios are" if joint else f"{run.features.name} features are"
         say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
@@ -84,8 +83,10 @@ def learn_parameters(
                 batch_seed(run.record["seed"], 5),
                 held_out(run, guide, _some(target, held, JUDGED)),
             )
-        else:
+        elif method == META_SIM:
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
+        else:
+            learning = tilting_learning(run, observer, guide, _some(target, ~held, run.preset.tilting.images))
         keep = Keeper(run, NAME, learning)
 
         def each(training: Training, line: dict[str, float]) -> None:
@@ -149,11 +150,11 @@ def _some(images: Images, which: Tensor, most: int) -> Tensor:
 
 
 def _record(
-    run: "RunFolder", guide: Guide, learning: ParameterLearning | MetaSimLearning, held: Tensor
+    run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLearning, held: Tensor
 ) -> dict[str, Any]:
     """For JSON."""
     method = {"method": run.preset.parameter_method}
-    if isinstance(learning, MetaSimLearning):
+    if not isinstance(learning, ParameterLearning):
         return method | {"sites": sites_record(learning), **judged(run, guide, learning, held).distances}
     assert learning.tried.skill is not None
     shares = learning.tried.skill.share.tolist()
@@ -173,7 +174,7 @@ def _record(
 
 
 def _said(record: dict[str, Any]) -> str:
-    sites, read = record["sites"], record.get("method") != META_SIM
+    sites, read = record["sites"], record.get("method", LIKELIHOOD) == LIKELIHOOD
     named = [site["name"] + (f" ({site['skill']:.2f})" if read else "") for site in sites if site["learnt"]]
     others = ", ".join(site["name"] for site in sites if not site["learnt"])
     if not named:

@@ -1,0 +1,1 @@
+"""Parameters by how images look as wholes: the way for photographs."""

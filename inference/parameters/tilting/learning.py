@@ -1,0 +1,247 @@
+"""Parameters by how images look as wholes, without a reader: what it reads in photographs, of which it has seen none,
+may be anything.
+
+A round draws scenes x of the guide q, renders them, and moves q downhill in the energy distance [1] of their features
+from the target's images r. With own renders x', that distance changes with the probability of a scene by
+
+    w(x) = E |x - r| - E |x - x'|
+
+so that exp(-eta w) q is a step of mirror descent on it, a natural gradient step of length eta [2]. The guide is fitted
+to it by maximum likelihood, on scenes drawn in proportion to exp(-eta w), as in the cross-entropy method [3]; eta is
+as large as leaves a given effective share of them. Distances to the target that no parameter changes, as photographs
+are not renders, are the same for all scenes and weigh nothing.
+
+Several sorts of features each have a w, in units of the gradient's norm; along their sum none of the distances grows,
+as in multiple-gradient descent [4].
+
+Only sites of the whole scene are moved, such as light and camera: were places left to whole images, objects would stand
+where photographs are dark. A site keeps its prior until w has depended on it beyond chance; as its values were drawn
+from the prior, whatever the others', that can be told exactly. Axis letters: N scenes, M nodes, G sites of scenes, L
+images, D features.
+
+References:
+    [1] Székely and Rizzo, *Energy statistics: a class of statistics based on distances*, 2013.
+    [2] Amari, *Natural gradient works efficiently in learning*, Neural Computation 1998.
+    [3] Rubinstein, *The cross-entropy method for combinatorial and continuous optimization*, 1999.
+    [4] Désidéri, *Multiple-gradient descent algorithm for multiobjective optimization*, 2012.
+    [5] Benjamini and Hochberg, *Controlling the false discovery rate*, 1995.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import root_scalar
+from scipy.spatial.distance import cdist
+from scipy.stats import chi2, false_discovery_control
+from torch import Tensor
+
+from probscene.model import SceneModel
+from probscene.policy import Policy
+from probscene.sampling import seed_everything
+
+from ...judging.two_sample import Features
+from ...training import Report, batch_seed, check_finite, of_prefix
+from ..guide import ParameterGuide
+from ..likelihood import MaximumLikelihood, Values, log_density
+from ..net import ParameterNet
+from ..reading.valued import Label, ValuedRenders, joined
+from ..sites import NEAR, Site, find_sites
+from .schedule import TiltingSchedule
+
+AT_ONCE = 100  # scenes that are drawn and rendered together
+CHANCE = 0.05  # of the sites that are moved, at most, say nothing of images in the mean [5]
+STRONGEST = 1e3  # eta, in standard deviations of w
+SMALL = 0.1  # share of w's standard deviation
+LEAST = 1e-5  # standard deviation of a number that tells scenes apart
+EXACT = 1e-6  # standard deviation of u that is known
+Look = Callable[[Tensor], Tensor]
+
+
+class TiltingLearning:
+    """A ``Training`` of a ``ParameterGuide``.
+
+    Args:
+        model: the scene model.
+        structure: the policy of the structures.
+        label: renders and labels scenes.
+        looks: give features ``(N, D)`` of images, of several sorts.
+        real: the target's features ``(L, D)`` by each.
+        schedule: how long.
+        seed: of everything random.
+
+    Attributes:
+        unit, total, done: see ``Training``.
+        sites: of the model.
+        open_to: sites of scenes that can be moved.
+        dependence: ``(G, 2)`` how much w has depended on each, and by how many degrees of freedom, until it was moved.
+        chosen: ``(G,)`` bool, which are moved.
+        guide: what is learnt, of all of them; None where there are none.
+    """
+
+    unit = "rounds"
+
+    def __init__(
+        self,
+        model: SceneModel,
+        structure: Policy,
+        label: Label,
+        looks: tuple[Look, ...],
+        real: tuple[Tensor, ...],
+        schedule: TiltingSchedule,
+        seed: int = 0,
+    ):
+        self.model, self.structure, self.looks, self.schedule, self.seed = model, structure, looks, schedule, seed
+        self.real = [features.double().numpy() for features in real]
+        seed_everything(batch_seed(seed, 0))
+        self.sites = find_sites(model)
+        self.open_to = tuple(site for site in self.sites if site.of_scene and not site.keeps)
+        self.renders = ValuedRenders(model, label, (), self.open_to)
+        self.guide = ParameterGuide(model, self.open_to, structure) if self.open_to else None
+        self.dependence = torch.zeros(len(self.open_to), 2)
+        self.chosen = torch.zeros(len(self.open_to), dtype=torch.bool)
+        self.total, self.done = schedule.rounds if self.open_to else 0, 0
+
+    @property
+    def learnt(self) -> tuple[Site, ...]:
+        """The sites that are chosen, in the order of the program."""
+        return tuple(site for site, chosen in zip(self.open_to, self.chosen.tolist(), strict=True) if chosen)
+
+    def run(self, each: Report | None = None) -> None:
+        """Take the rounds that are left; ``each`` hears the energy distance after every one.
+
+        Raises:
+            ProbsceneError: the loss is no longer finite.
+        """
+        self._pass()
+        while self.done < self.total:
+            assert self.guide is not None
+            seed_everything(batch_seed(self.seed, 1, self.done))
+            apart = self._round(self.guide)
+            self.done += 1
+            where = f"in round {self.done}"
+            check_finite(apart, self.guide.net.parameters(), "the parameters", where, "begin again with a lower rate")
+            if each is not None:
+                each(self, {"loss": apart})
+
+    def summary(self) -> dict[str, Any]:
+        """Nothing more for the log."""
+        return {}
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        net = {} if self.guide is None else self.guide.net.state_dict()
+        own = {"done": torch.tensor(self.done), "chosen": self.chosen, "dependence": self.dependence}
+        return {key: value.clone() for key, value in (own | {f"guide.{key}": net[key] for key in net}).items()}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        self.done, self.chosen = int(tensors["done"]), tensors["chosen"].clone()
+        self.dependence = tensors["dependence"].clone()
+        if self.guide is not None:
+            self.guide.net.load_state_dict(of_prefix(tensors, "guide."))
+
+    def _round(self, guide: ParameterGuide) -> float:
+        """The sum of the squared energy distances of the renders that were drawn, in units of the target's spread."""
+        features, values = self._drawn(guide, self.schedule.scenes if self.done else self.schedule.first)
+        each = [witness(own, real) for own, real in zip(features, self.real, strict=True)]
+        freed = [beside_structure(values.kind, w) for w, _ in each]
+        w = np.stack([w / unit(values.scene, w) for w in freed]).sum(0)
+        self.dependence += dependence(values.scene, w).where(~self.chosen.unsqueeze(1), 0.0)
+        p = chi2.sf(self.dependence[:, 0].numpy(), self.dependence[:, 1].numpy().clip(min=1))
+        self.chosen |= torch.from_numpy(false_discovery_control(p) < CHANCE)
+        self._pass()
+        if self.chosen.any():
+            seed = batch_seed(self.seed, 2, self.done)
+            _Weighted(guide.net, values, tilted(w, self.schedule.kept), self.chosen, self.schedule, seed).run()
+        return sum(apart for _, apart in each)
+
+    def _pass(self) -> None:
+        if self.guide is not None:
+            self.guide.passed = frozenset(site.name for site in self.open_to if site not in self.learnt)
+
+    @torch.no_grad()
+    def _drawn(self, guide: ParameterGuide, num: int) -> tuple[list[Features], Values]:
+        """Features ``(N, D)`` of the guide's renders by each look, and their scenes' values of all sites."""
+        model, features, parts = guide.suited(self.model), [], []
+        for first in range(0, num, AT_ONCE):
+            some = self.renders.draw(min(AT_ONCE, num - first), self.structure, model)
+            features.append([look(some.drawn.image) for look in self.looks])
+            parts.append(some._replace(drawn=some.drawn._replace(image=some.drawn.image[..., :0])))  # to save memory
+        of, turns = joined(parts), torch.zeros(len(self.chosen), dtype=torch.bool)
+        scene, none = of.overall.clamp(NEAR, 1 - NEAR), of.u
+        values = Values(of.kind, of.parent, none, none, scene, torch.full_like(scene, EXACT), turns)
+        return [torch.cat(part).double().numpy() for part in zip(*features, strict=True)], values
+
+
+class _Weighted(MaximumLikelihood):
+    """On values that are known, of scenes in proportion to their weight ``(N,)``; of the chosen sites."""
+
+    def __init__(
+        self, net: ParameterNet, values: Values, weight: Features, chosen: Tensor, schedule: TiltingSchedule, seed: int
+    ):
+        super().__init__(net, values, schedule.steps, learning_rate=schedule.rate, seed=seed)
+        self.weight, self.chosen = torch.from_numpy(weight), chosen
+
+    def loss(self) -> Tensor:
+        """See ``StepTraining``."""
+        rows = torch.multinomial(self.weight, self._number(), replacement=True)
+        return -log_density(self.net, self.values.of(rows))[:, self.chosen].sum(1).mean()
+
+
+def witness(own: Features, real: Features) -> tuple[Features, float]:
+    """w of each scene ``(N,)``, by features ``(N, D)`` of all and of the target ``(L, D)``; and the squared energy
+    distance, without bias. Both in units of how far the target's images are apart."""
+    toward, among, within = cdist(own, real), cdist(own, own), cdist(real, real)
+    among, within = (each.sum(1) / max(1, len(each) - 1) for each in (among, within))
+    spread = max(float(within.mean()), LEAST)
+    return (toward.mean(1) - among) / spread, float(2 * toward.mean() - among.mean() - within.mean()) / spread
+
+
+def beside_structure(kind: Tensor, w: Features) -> Features:
+    """w without what a linear regression on the number and the presence of each kind of node ``(N, M)`` explains: it is
+    structure's, which is not moved here."""
+    number = np.stack([(kind == k).sum(1).numpy() for k in kind.unique()], 1)
+    x = np.concatenate([number, number > 0, np.ones((len(w), 1))], 1).astype(np.float64)
+    return w - x @ np.linalg.lstsq(x, w, rcond=None)[0]
+
+
+def unit(u: Tensor, w: Features) -> float:
+    """The standard deviation of what a linear regression on numbers of all sites' u ``(N, G)`` explains of w: the norm
+    of the gradient that a guide can follow. A tenth of w's own, if that is more."""
+    x = np.concatenate([numbers(one) for one in u.unbind(1)], 1)
+    said = x @ np.linalg.lstsq(x, w - w.mean(), rcond=None)[0]
+    return max(float(said.std()), SMALL * float(w.std()), LEAST)
+
+
+def numbers(u: Tensor) -> Features:
+    """``(N, 4)`` of a site's u ``(N,)``, by which anything may depend on it: smooth on a line or on a circle."""
+    x = torch.stack([u, u.square(), (2 * torch.pi * u).cos(), (2 * torch.pi * u).sin()], 1).double().numpy()
+    return x - x.mean(0)
+
+
+def tilted(w: Features, kept: float) -> Features:
+    """Weights ``(N,)`` in proportion to exp(-eta w), of which so many are effective as ``kept`` says, a share."""
+    z = -(w - w.mean()) / max(float(w.std()), 1e-12)
+
+    def weight(eta: float) -> Features:
+        found = np.exp(eta * (z - z.max()))
+        return found / found.sum()
+
+    def more(eta: float) -> float:
+        return 1 / np.square(weight(eta)).sum() / len(w) - kept
+
+    return weight(root_scalar(more, bracket=(0.0, STRONGEST)).root if more(STRONGEST) < 0 else STRONGEST)
+
+
+def dependence(u: Tensor, w: Features) -> Tensor:
+    """``(G, 2)``: N times the share of w's variance that a linear regression on numbers of each site's u ``(N, G)``
+    explains, and the degrees of freedom; if w does not depend on the site, a draw of their chi-squared distribution."""
+    rows, y = [], w - w.mean()
+    for one in u.unbind(1):
+        left, singular, _ = np.linalg.svd(numbers(one), full_matrices=False)
+        left = left[:, singular > LEAST * len(y) ** 0.5]
+        explained, whole = np.square(left.T @ y).sum(), np.square(y).sum()
+        rows.append((len(y) * float(explained / whole) if whole else 0.0, float(left.shape[1])))
+    return torch.tensor(rows).reshape(-1, 2)

@@ -1,0 +1,29 @@
+"""What a photographer would say of images: light, colour, sharpness and noise. Photographs and renders, which a network
+sees as two worlds, are on one scale here. Axis letters: N images, D numbers."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+ROWS = 8  # parts of an image from top to bottom
+FINE = 10.0  # noise and edges are so many times smaller than light
+
+
+def plain(images: Tensor) -> Tensor:
+    """``(N, D)`` of ``(N, 1 or 3, H, W)`` uint8 images, all about 0 to 1: mean and deviation of each colour, brightness
+    of each part from top to bottom, saturation, how strong edges are, and noise, by the Laplacian [1].
+
+    References:
+        [1] Immerkær, *Fast noise variance estimation*, Computer Vision and Image Understanding 1996.
+    """
+    x = images.expand(-1, 3, -1, -1) / 255
+    grey, most = x.mean(1, keepdim=True), x.amax(1)
+    kernel = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+    rough = F.conv2d(grey, kernel[None, None]).abs().mean((1, 2, 3))
+    edges = grey.diff(dim=2).abs().mean((1, 2, 3)) + grey.diff(dim=3).abs().mean((1, 2, 3))
+    saturation = ((most - x.amin(1)) / most.clamp(min=1 / 255)).mean((1, 2))
+    rows = F.adaptive_avg_pool2d(grey, (ROWS, 1)).flatten(1)
+    fine = torch.stack([saturation, FINE * edges, FINE * math.sqrt(math.pi / 2) / 6 * rough], 1)
+    return torch.cat([x.mean((2, 3)), x.std((2, 3)), rows, fine], 1)

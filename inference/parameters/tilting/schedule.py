@@ -1,0 +1,31 @@
+"""How long tilting learns."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TiltingSchedule:
+    """The defaults were chosen on blood smears.
+
+    Args:
+        rounds: of drawing, tilting and fitting.
+        first: scenes of the first round, in which it is seen which sites tell; each is rendered.
+        scenes: of each other round.
+        kept: effective share of a round's scenes that is left when they are weighted, 0 to 1.
+        steps: of maximum likelihood on them.
+        rate: its largest learning rate.
+        images: of the target, at most.
+    """
+
+    rounds: int = 20
+    first: int = 2000
+    scenes: int = 500
+    kept: float = 0.4
+    steps: int = 60
+    rate: float = 5e-3
+    images: int = 1000
+
+    @property
+    def drawn(self) -> int:
+        """How many renders are drawn in all."""
+        return self.first + (self.rounds - 1) * self.scenes

@@ -1,0 +1,120 @@
+"""``fit --parameters tilting``: kept, used by all that draws, and resumed; for photographs it is the way."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from probscene.app.fitting import storage
+from probscene.app.fitting.learnt import judged
+from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.presets import preset
+from probscene.app.fitting.run import RunFolder
+from probscene.inference.judging.farther import Farther
+from probscene.inference.parameters.guide import ParameterGuide
+from probscene.inference.parameters.tilting import learning
+from probscene.sampling import sample, seed_everything
+
+SCHEDULE = {"rounds": 3, "first": 50, "scenes": 20, "steps": 4, "images": 20}
+SETTINGS = [word for key, value in SCHEDULE.items() for word in ("--set", f"tilting.{key}={value}")]
+LEARN = ("--learn", "structure,parameters", "--parameters", "tilting", "--set", "batches_again=2", *SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory, discs) -> Path:
+    """The model's file with a light of the whole scene."""
+    text = discs.file.read_text().replace("import pyro\n", "import pyro\nimport torch\n", 1)
+    place = '            y = pyro.sample("y", dist.Uniform(8.0, 56.0))\n'
+    text = text.replace(place, place + '        light = pyro.sample("light", dist.Uniform(0.2, 1.0))\n')
+    for tint in ("(1.0, 0.2, 0.2)", "(0.2, 0.2, 1.0)"):
+        text = text.replace(f"tint={tint}", f"tint=light[..., None] * torch.tensor({tint})")
+    assert text.count("light") == 4
+    file = tmp_path_factory.mktemp("lit") / "lit.py"
+    file.write_text(text)
+    return file
+
+
+def it_is_kept(patch):
+    patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
+    patch.setattr(learning, "CHANCE", 1.1)  # of so few scenes, whatever they say
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory, call, lit, discs, target) -> Path:
+    """A finished run."""
+    out = tmp_path_factory.mktemp("tilting") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        it_is_kept(patch)
+        done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
+    assert done.code == 0, done.err
+    assert "Sites that are learnt: light. Keeping the prior: x, y." in " ".join(done.err.split())
+    return out
+
+
+def test_a_run_keeps_what_it_has_learnt(fitted):
+    run = RunFolder.at(fitted)
+    assert run.preset.parameter_method == run.parameters["method"] == "tilting"
+    assert [(site["name"], site["learnt"], site["because"]) for site in run.parameters["sites"]] == [
+        ("x", False, "it is not of the whole scene"),
+        ("y", False, "it is not of the whole scene"),
+        ("light", True, ""),
+    ]
+    assert run.parameters["kept"] == "learnt" and isinstance(run.guide.suits.__self__, ParameterGuide)
+    assert Preset.of(run.record["preset"]).tilting.rounds == 3
+    log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in log if line["stage"] == "parameters"] == [1, 2, 3]
+
+
+def test_all_that_draws_takes_them(fitted, call, tmp_path):
+    run = RunFolder.at(fitted)
+    guide = run.guide
+    seed_everything(0)
+    moved = sample(run.model, guide, 40).parameters
+    guide.suits = None
+    seed_everything(0)
+    still = sample(run.model, guide, 40).parameters
+    assert torch.equal(moved["x"], still["x"]) and not torch.equal(moved["light"], still["light"])
+    assert call("preview", fitted, "--out", tmp_path / "p.png").code == 0
+    assert call("report", fitted).code == 0
+
+
+def test_a_fit_goes_on_to_the_same_bytes(fitted, call, lit, discs, target, tmp_path, monkeypatch):
+    it_is_kept(monkeypatch)
+    monkeypatch.setattr(storage, "SAVE_EVERY", 0)
+    run, out = learning.TiltingLearning.run, tmp_path / "run"
+
+    def interrupted(self, each=None):
+        def heard(training, line):
+            each(training, line)
+            if training.done == 2:
+                raise KeyboardInterrupt
+
+        run(self, heard)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learning.TiltingLearning, "run", interrupted)
+        words = ("--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
+        assert call("fit", lit, *words).code != 0
+    assert (out / "parameters-checkpoint.safetensors").exists()
+    done = call("fit", "--resume", "--out", out)
+    assert done.code == 0, done.err
+    for name in ("guide.safetensors", "parameters.json"):
+        assert (out / name).read_bytes() == (fitted / name).read_bytes()
+
+
+def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tmp_path, monkeypatch):
+    monkeypatch.setattr(learning, "CHANCE", 0.0)
+    out = tmp_path / "run"
+    done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
+    assert done.code == 0, done.err
+    said = " ".join(done.err.split())
+    assert "No site can be moved, so where things stand and how they look keeps the prior." in said
+    run = RunFolder.at(out)
+    assert run.parameters["kept"] == "prior" and run.guide.suits is None
+    assert run.parameters["sites"][2]["because"] == "how near images look does not depend on it"
+
+
+def test_it_is_the_way_for_photographs():
+    assert preset("street").with_features("count=efficientnet").parameter_method == "tilting"
+    assert preset("street").with_features("count").parameter_method == "likelihood"
