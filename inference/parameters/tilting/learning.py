@@ -15,9 +15,8 @@ Several sorts of features each have a w, in units of the gradient's norm; along 
 as in multiple-gradient descent [4].
 
 Only sites of the whole scene are moved, such as light and camera: were places left to whole images, objects would stand
-where photographs are dark. A site keeps its prior until w has depended on it beyond chance; as its values were drawn
-from the prior, whatever the others', that can be told exactly. Axis letters: N scenes, M nodes, G sites of scenes, L
-images, D features.
+where photographs are dark. A site keeps its prior until w has depended on it beyond chance. Axis letters: N scenes, M
+nodes, G sites of scenes, L images, D features.
 
 References:
     [1] Székely and Rizzo, *Energy statistics: a class of statistics based on distances*, 2013.

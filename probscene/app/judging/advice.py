@@ -4,13 +4,23 @@ from typing import Any
 
 from probscene.inference.judging.nearness import CLEARLY, Nearness, Word
 
-from ..fitting.preset import BOTH
+from ..fitting.preset import BOTH, LIKELIHOOD, META_SIM, TILTING
 from ..fitting.run import RunFolder
 
 PHOTO = (
     "Put scene.photo(...), with light, colour, focus and noise, into the model, or sprites and textures nearer to the "
     "images."
 )
+LONGER = {
+    LIKELIHOOD: "Fit longer: the default preset, or --set parameters.steps and parameters.rounds.",
+    TILTING: "Fit longer: --set tilting.rounds and tilting.scenes.",
+    META_SIM: "Fit longer: --set meta_sim.steps.",
+}
+NONE = {
+    LIKELIHOOD: "Train the reader longer: the default preset, or --set parameters.reader_steps.",
+    TILTING: "Give the model sites of the whole scene that images show.",
+    META_SIM: "Give the model continuous sites.",
+}
 FARTHER = 2.0  # floors, from which on a site is named
 UNSURE = 0.7  # of the distance is left, and it is not sure that it is less than all
 
@@ -32,14 +42,14 @@ def _learn(run: RunFolder) -> str:
     if not record:
         if run.preset.learn != BOTH:
             return f"Learn parameters, too: fit again with --learn {BOTH}."
-        return "Parameters are not learnt by these features: fit again with --features count."
+        return f"These features read no parameters: fit again with --features count, or --parameters {TILTING}."
     if not any(site["learnt"] for site in record["sites"]):
-        return "Train the reader longer: the default preset, or --set parameters.reader_steps."
+        return NONE[record.get("method", LIKELIHOOD)]
     if record["kept"] != "learnt":
         return (
             "What was learnt came no nearer to held-out images, and is unused: take the default preset or more images."
         )
-    return "Fit longer: the default preset, or --set parameters.steps and parameters.rounds."
+    return LONGER[record.get("method", LIKELIHOOD)]
 
 
 def _unread(record: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 import functools
 import io
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,8 +18,12 @@ from rich.console import Console
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.judge import judge
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.preset import LIKELIHOOD, META_SIM, TILTING
+from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.judging import looked
+from probscene.app.judging.advice import remedy
 from probscene.app.judging.aspects import KINDS, Aspect, Aspects, called
 from probscene.app.views import verdict_text
 from probscene.dataset import ImageFolder
@@ -158,8 +163,22 @@ def test_sites_that_could_not_be_read_are_named(fitted):
     finally:
         (run.path / "parameters.json").unlink()
     assert "Sites that keep the prior: dot.x, as it cannot be read in renders." in printed(found)
-    remedy = found.aspects.parts["layout"].remedy
-    assert "dot.off (0.120, floor 0.020)" in remedy and "Not learnt: dot.x" in remedy
+    said = found.aspects.parts["layout"].remedy
+    assert "dot.off (0.120, floor 0.020)" in said and "Not learnt: dot.x" in said
+
+
+@pytest.mark.parametrize("method", [LIKELIHOOD, TILTING, META_SIM])
+@pytest.mark.parametrize("learnt", [True, False])
+def test_the_remedy_names_settings_that_the_fit_reads(method, learnt):
+    """Whatever it tells to be set is a setting of the way that was taken."""
+    site = {"name": "light", "kinds": [], "learnt": learnt, "skill": None, "because": ""}
+    run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]})
+    figures = SimpleNamespace(left=None, high=None)
+    said = remedy(run, "looks", Word.NO_BETTER, figures)
+    named = re.findall(r"(\w+)\.(\w+)", said.replace("scene.photo", ""))
+    chosen = override(preset("quick"), [f"parameter_method={method}"])
+    assert learnt <= bool(named) and all(hasattr(getattr(chosen, part), field) for part, field in named)
+    assert not {part for part, _ in named} & set(chosen.unread())
 
 
 def printed(found) -> str:
