@@ -13,6 +13,7 @@ import os, signal, sys
 from probscene.app import cli, files
 from probscene.app.fitting import storage as checkpoints
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so its children
 kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
 checkpoints.SAVE_EVERY = 0.0
 line, replace = [{}], os.replace

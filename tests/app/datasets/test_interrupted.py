@@ -102,7 +102,7 @@ def test_a_full_disk_leaves_nothing_half_written(run, undisturbed, tmp_path, mon
 
 
 PROGRAM = """
-import multiprocessing, sys, time
+import multiprocessing, signal, sys, time
 from pathlib import Path
 from probscene.app.datasets.generate import generate
 from probscene.app.fitting.run import RunFolder
@@ -113,6 +113,7 @@ def progress(done, num):
         time.sleep(300)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so its children
     generate(RunFolder.at(Path(sys.argv[1])), 130, Path(sys.argv[2]), seed=3, workers=2, progress=progress)
 """
 
