@@ -76,7 +76,9 @@ def package_of(module: str, path: Path) -> str:
 
 
 def floor(module: str) -> str:
-    """The folder that a module belongs to: probscene.app, a spoke, or the hub."""
+    """The folder that a module belongs to: probscene.app, a spoke, or the hub; ``python -m`` is the app's."""
+    if module == "probscene.__main__":
+        return "probscene.app"
     rooms = [room for room in ("probscene.app", *PACKAGES) if f"{module}.".startswith(f"{room}.")]
     return max(rooms, key=len)
 

@@ -274,14 +274,15 @@ class ParameterLearning:
         return {s: {name: site_rows(values.site(i)) for name, values in read.items()} for i, s in enumerate(names)}
 
     @torch.no_grad()
-    def lost(self) -> dict[str, float]:
-        """Sites that cannot be read in renders of the guide, where they have their prior; see ``TriedReader.lost``."""
+    def lost(self) -> tuple[dict[str, float], Tensor]:
+        """Sites that cannot be read in renders of the guide, where unclear sites have their prior, see
+        ``TriedReader.lost``; and these renders, ``(L, C, H, W)`` uint8, none where no site is unclear."""
         if self.guide is None or not self.tried.unclear:
-            return {}
+            return {}, torch.zeros(0)
         self.guide.passed = self.tried.unclear
         valued = self._own_scenes(TRIED)
         self.guide.passed = frozenset()
-        return self.tried.lost(valued)
+        return self.tried.lost(valued), valued.drawn.image
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int) -> OwnReadings:

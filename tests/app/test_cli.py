@@ -36,6 +36,11 @@ def test_help_is_quick_because_it_imports_nothing_heavy():
     assert "--skip-bad" in run.stdout
 
 
+def test_it_can_be_called_as_a_module():
+    run = subprocess.run([sys.executable, "-m", "probscene", "version"], cwd=ROOT, capture_output=True, text=True)
+    assert (run.returncode, run.stdout.strip()) == (0, f"probscene {probscene.__version__}"), run.stderr
+
+
 def test_version_and_help(call):
     assert call("version").out == f"probscene {probscene.__version__}\n"
     commands = ("check", "preview", "fit", "generate", "evaluate", "report", "compare", "demo", "version")

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pyro
 import pyro.distributions as dist
@@ -237,32 +238,32 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
 
 
 def test_sites_keep_the_prior_by_what_is_read_of_them():
-    """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target."""
+    """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target. Both of the
+    unclear ``u`` and ``v`` are nearer than the prior's; ``u`` is nearer still where it alone has its prior."""
 
     class Learning:
+        tried = SimpleNamespace(unclear=frozenset("uv"))
+
         def site_rows(self, images):
-            assert set(images) == {"learnt", "prior", "target"}
+            assert set(images) == {"learnt", "without", "prior", "target"}
             torch.manual_seed(0)
             where = {
-                "learnt": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0},
-                "prior": {"x": 1.0, "y": 0.0, "z": 0.0, "w": -2.0},
+                "learnt": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0, "u": 0.0, "v": 0.0},
+                "prior": {"x": 1.0, "y": 0.0, "z": 0.0, "w": -2.0, "u": 1.0, "v": 1.0},
+                "without": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0, "u": 0.2, "v": 1.0},
+                "target": {"x": 0.2, "y": 0.0, "z": 0.0, "w": -1.5, "u": 0.2, "v": 0.2},
             }
-            where["target"] = {"x": 0.2, "y": 0.0, "z": 0.0, "w": -1.5}
-            number = {"learnt": 120, "prior": 120, "target": 120}
             return {
-                site: {
-                    name: rows(where[name][site], 0 if (name, site) == ("target", "z") else number[name])
-                    for name in images
-                }
-                for site in "xyzw"
+                site: {name: rows(where[name][site], 0 if (name, site) == ("target", "z") else 120) for name in images}
+                for site in "xyzwuv"
             }
 
     def rows(mean, number):
         return mean + torch.randn(number, 2), torch.arange(number) // 3
 
-    images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert judged.passed(Learning(), images, careful=True) == {"y", "z", "w"}
-    assert judged.passed(Learning(), images, careful=False) == {"w"}
+    images = {name: torch.zeros(0) for name in ("learnt", "without", "prior", "target")}
+    assert judged.passed(Learning(), images, careful=True) == {"y", "z", "w", "u"}
+    assert judged.passed(Learning(), images, careful=False) == {"w", "u"}
 
 
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
@@ -286,7 +287,7 @@ def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, tar
 
 def test_a_site_that_cannot_be_read_where_the_target_is_keeps_the_prior(call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
-    monkeypatch.setattr(ParameterLearning, "lost", lambda _: {"x": 0.123})
+    monkeypatch.setattr(ParameterLearning, "lost", lambda _: ({"x": 0.123}, torch.zeros(0)))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
     assert done.code == 0, done.err

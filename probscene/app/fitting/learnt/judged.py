@@ -75,8 +75,9 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLe
     careful = kept == "prior" or run.preset.parameters.sure
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         seed_everything(batch_seed(run.record["seed"], 6, 4))
-        lost = learning.lost()
-        learnt.passed = passed(learning, images, careful) | lost.keys()
+        lost, without = learning.lost()
+        beside = {"without": without} if len(without) else {}
+        learnt.passed = passed(learning, images | beside, careful) | lost.keys()
         if learnt.passed:
             apart = compared()
         if apart.sure and judge is not None:
@@ -106,16 +107,16 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLe
 def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool) -> frozenset[str]:
     """Sites that keep their prior, by what is read in learnt renders, in the prior's and in the target: those of which
     learnt renders are surely farther from the target; where one is careful, those of which they are not surely nearer,
-    as there is nothing to be learnt of them, or it was not."""
-    return frozenset(
-        name
-        for name, of in learning.site_rows(images).items()
-        if (
-            not _surely_nearer(of["learnt"], of["prior"], of["target"])
-            if careful
-            else _surely_nearer(of["prior"], of["learnt"], of["target"])
-        )
-    )
+    as there is nothing to be learnt of them, or it was not. What is read of unclear sites is mostly what other sites
+    make of it: they are learnt where renders with the other learnt sites alone, ``"without"``, are surely farther."""
+
+    def passes(of: dict[str, tuple[Tensor, Tensor]], unclear: bool) -> bool:
+        if careful or unclear:
+            return not _surely_nearer(of["learnt"], of["without" if unclear else "prior"], of["target"])
+        return _surely_nearer(of["prior"], of["learnt"], of["target"])
+
+    read, unclear = learning.site_rows(images), learning.tried.unclear
+    return frozenset(name for name, of in read.items() if passes(of, name in unclear))
 
 
 def _surely_nearer(*sources: tuple[Tensor, Tensor]) -> bool:
