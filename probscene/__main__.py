@@ -1,6 +1,6 @@
 """``python -m probscene``: the command line, for an environment whose scripts are not on the path."""
 
-from .app.cli import main
+from probscene.app.cli import main
 
 if __name__ == "__main__":
     main()
