@@ -96,7 +96,7 @@ def main():
     for format in args.formats:
         out = args.out / format
         shutil.rmtree(out, ignore_errors=True)
-        words = [sys.executable, "-m", "probscene.app.cli", "generate", str(path), "--num", str(args.images)]
+        words = [sys.executable, "-m", "probscene", "generate", str(path), "--num", str(args.images)]
         words += ["--out", str(out), "--format", format, "--workers", str(args.workers)]
         third = out / ".parts" / f"{args.images // 64 // 3:06d}.json"
         first, before, ended = watched(words, third)

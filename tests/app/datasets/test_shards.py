@@ -45,7 +45,7 @@ def test_the_whole_makes_what_shards_lack(run, undisturbed, tmp_path):
 def test_shards_at_once_two_of_them_killed_and_run_again(run, tmp_path):
     out, num, shards = tmp_path / "out", 1000, 8
     environment = {**os.environ, "PYTHONPATH": str(Path(probscene.__file__).parents[1])}
-    command = [sys.executable, "-m", "probscene.app.cli", "generate", run.path, "--num", num, "--out", out]
+    command = [sys.executable, "-m", "probscene", "generate", run.path, "--num", num, "--out", out]
 
     def start(number):
         shard = [*map(str, command), "--seed", "3", "--shard", f"{number}/{shards}"]

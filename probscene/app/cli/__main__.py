@@ -1,5 +1,0 @@
-"""``python -m probscene.app.cli``."""
-
-from . import main
-
-main()
