@@ -75,10 +75,9 @@ class PretrainedCountFeatures(Features):
     def settings(self, preset: Any) -> dict[str, Any]:
         """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
         each structure is drawn once. Photographs' counts are noisy, and few: the prior of a preset that has such a
-        weight holds them more. Parameters are learnt where that is asked for, and not by what a reader reads in
-        photographs, of which it has seen none."""
+        weight holds them more. Parameters are not learnt by what a reader reads in photographs, of which it has
+        seen none."""
         return {
-            "learn": "structure",
             "parameter_method": "tilting",
             "pairs": 1000,
             "batches": 40,

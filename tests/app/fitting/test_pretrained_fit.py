@@ -140,7 +140,8 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
 
 
 PROJECTED = ["--features", "efficientnet", "--set", "pairs=40", "--set", "directions=3"]
-COUNTING = ["--features", "count=efficientnet", "--set", "pairs=60", "--set", "head_epochs=12"]
+ALONE = ["--learn", "structure", "--features", "count=efficientnet"]
+COUNTING = [*ALONE, "--set", "pairs=60", "--set", "head_epochs=12"]
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +191,7 @@ def test_labels_choose_how_classes_are_read(counting, call, discs, target, tmp_p
 
 def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs, target, tmp_path):
     """Heads that are hardly trained."""
-    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=1"]
+    words = [*WORDS, *ALONE, "--set", "pairs=12", "--set", "head_epochs=1"]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
     assert done.code == 0 and done.err.count("not readable") == 2 and "the prior is kept" in done.err, done.err
     run = RunFolder.at(tmp_path / "run")
@@ -204,7 +205,7 @@ def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs,
 def test_readings_are_of_the_runs_images(call, discs, target, tmp_path):
     images = tmp_path / "images"
     shutil.copytree(target.images, images)
-    words = [*WORDS, "--features", "count=efficientnet", "--set", "pairs=12", "--set", "head_epochs=1"]
+    words = [*WORDS, *ALONE, "--set", "pairs=12", "--set", "head_epochs=1"]
     assert call("fit", discs.file, "--target", images, "--out", tmp_path / "run", *words).code == 0
     for name in ("guide", "real"):
         (tmp_path / f"run/{name}.safetensors").unlink()

@@ -116,5 +116,6 @@ def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tm
 
 
 def test_it_is_the_way_for_photographs():
-    assert preset("street").with_features("count=efficientnet").parameter_method == "tilting"
+    street = preset("street").with_features("count=efficientnet")
+    assert (street.learn, street.parameter_method) == ("structure,parameters", "tilting")
     assert preset("street").with_features("count").parameter_method == "likelihood"
