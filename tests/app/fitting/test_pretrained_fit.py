@@ -190,8 +190,10 @@ def test_labels_choose_how_classes_are_read(counting, call, discs, target, tmp_p
 
 
 def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs, target, tmp_path):
-    """Heads that are hardly trained."""
-    words = [*WORDS, *ALONE, "--set", "pairs=12", "--set", "head_epochs=1"]
+    """Heads that are hardly trained; parameters are learnt as well."""
+    few = {"pairs": 12, "head_epochs": 1, "batches_again": 2} | {f"tilting.{k}": 20 for k in ("first", "scenes")}
+    chosen = [word for key, value in (few | {"tilting.rounds": 1}).items() for word in ("--set", f"{key}={value}")]
+    words = [*WORDS, "--features", "count=efficientnet", *chosen]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
     assert done.code == 0 and done.err.count("not readable") == 2 and "the prior is kept" in done.err, done.err
     run = RunFolder.at(tmp_path / "run")
