@@ -22,7 +22,7 @@ class Picture(NamedTuple):
         image: ``(H, W, 3)`` uint8.
         instance: ``(H, W)`` int16, ids of nodes.
         depth: ``(H, W)`` float32 or None.
-        amodal_box: ``(M, 4)`` float32 or None; zeros where nothing was said.
+        amodal_box: ``(M, 4)`` float32 or None; zeros of nodes that cannot be seen and of which nothing was said.
     """
 
     image: np.ndarray
@@ -62,7 +62,7 @@ def read(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
     depth = _array(arrays, "depth", (height, width)) if "depth" in arrays else None
     if depth is not None and np.isnan(depth).any():
         raise Fault("expected depth without NaN, actual NaN; infinity where there is sky")
-    return Picture(image, ids.astype(np.int16), depth, None if boxes is None else _boxes(boxes, most))
+    return Picture(image, ids.astype(np.int16), depth, None if boxes is None else _boxes(boxes, most, ids))
 
 
 def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -80,7 +80,7 @@ def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> 
     return value
 
 
-def _boxes(boxes: Any, most: int) -> np.ndarray:
+def _boxes(boxes: Any, most: int, ids: np.ndarray) -> np.ndarray:
     found = np.zeros((most, 4), np.float32)
     try:
         for id, box in boxes:
@@ -93,4 +93,11 @@ def _boxes(boxes: Any, most: int) -> np.ndarray:
             f"expected amodal_box as a dict of a node's id and x0, y0, x1, y1 in pixels with x0 <= x1 and y0 <= y1, "
             f"actual {error}"
         ) from error
+    shown = np.setdiff1d(ids, 0)
+    empty = shown[(found[shown - 1, 2:] <= found[shown - 1, :2]).any(1)]
+    if len(empty):
+        raise Fault(
+            f"expected amodal_box of each node that instance shows, larger than 0, actual none of node {empty[0]}; give "
+            "all of them, or none"
+        )
     return found

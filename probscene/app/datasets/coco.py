@@ -8,6 +8,7 @@ know is left out, see ``RenderBatch.unknown``.
 """
 
 import json
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -144,5 +145,7 @@ def _in_space(batch: RenderBatch, i: int, node: int) -> dict[str, Any]:
 
 
 def _corner_and_size(box: Tensor) -> list[int]:
-    x0, y0, x1, y1 = (int(v) for v in box)
+    """Of the whole pixels that a box touches; a generator's may end between them."""
+    x0, y0 = (math.floor(v) for v in box[:2])
+    x1, y1 = (math.ceil(v) for v in box[2:])
     return [x0, y0, x1 - x0, y1 - y0]

@@ -50,7 +50,7 @@ def render(scene):
     boxes = {}
     for node in scene.nodes:
         x, y, size = int(node.values["x"]), int(node.values["y"]), 4 if node.kind == "plate" else 2
-        boxes[node.id] = x - size, y - size, x + size, y + size
+        boxes[node.id] = x - size - 0.4, y - size - 0.4, x + size + 0.4, y + size + 0.4
         for row in range(max(0, y - size), min(scene.height, y + size)):
             for column in range(max(0, x - size), min(scene.width, x + size)):
                 at = row * scene.width + column

@@ -120,6 +120,8 @@ def test_arrays_of_other_kinds_are_the_same(model, request_of):
         (lambda d: d | {"depth": np.full((32, 40), np.nan, np.float32)}, "depth without NaN"),
         (lambda d: d | {"amodal_box": {1: (5, 0, 4, 1)}}, "x0 <= x1"),
         (lambda d: d | {"amodal_box": {99: (0, 0, 4, 1)}}, "99"),
+        (lambda d: d | {"amodal_box": {}}, "each node that instance shows.*actual none of node"),
+        (lambda d: d | {"amodal_box": dict.fromkeys(np.unique(d["instance"])[1:], (2, 2, 2, 5))}, "larger than 0"),
     ],
 )
 def test_what_is_no_picture_is_named(model, change, said):

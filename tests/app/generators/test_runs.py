@@ -72,6 +72,9 @@ def test_what_the_generator_does_not_know_is_not_in_the_labels(model, tmp_path, 
     assert plain and not any(key in one for one in plain for key in ("visible_fraction", "amodal_bbox"))
     assert all("amodal_bbox" in one and "visible_fraction" not in one for one in boxed)
     assert [one["bbox"] for one in plain] == [one["bbox"] for one in boxed]
+    for one in boxed:  # which ends between pixels, and holds all that it touches
+        (x, y, w, h), (X, Y, W, H) = one["bbox"], one["amodal_bbox"]
+        assert X < x and Y < y and X + W > x + w and Y + H > y + h
     for name in ("plain", "boxes"):
         files = sorted((tmp_path / name).rglob("label_2/*"))
         lines = [line.split() for file in files for line in file.read_text().splitlines()]
