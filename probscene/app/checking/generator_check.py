@@ -72,6 +72,7 @@ def check_generator(model: SceneModel) -> GeneratorReport:
 
     Raises:
         ModelError: the model has no generator.
+        DataError: a file that it is made of cannot be read.
         GeneratorError: it cannot draw them.
     """
     if model.generator is None:
@@ -80,6 +81,8 @@ def check_generator(model: SceneModel) -> GeneratorReport:
             "out."
         )
     generator = _unkept(model.generator)
+    if isinstance(generator, Command):
+        generator.fingerprint()
     _end(generator)
     spent, first = _drawn(generator, model, range(SCENES))
     _end(generator)
@@ -158,8 +161,7 @@ def _differs(first: list[RenderBatch], again: list[RenderBatch]) -> tuple[str, .
 
 
 def _presets() -> dict[str, Preset]:
-    chosen = {name: PRESETS[name] for name in ("quick", "default", "street")}
-    return chosen | {"quick with count=efficientnet": PRESETS["quick"].with_features("count=efficientnet")}
+    return PRESETS | {"quick with count=efficientnet": PRESETS["quick"].with_features("count=efficientnet")}
 
 
 def _told(seconds: float) -> str:

@@ -18,10 +18,11 @@ from probscene.app.checking.generator_check import check_generator, cost
 from probscene.app.datasets.generate import generate, generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.datasets.scene_dataset import SceneDataset
-from probscene.app.fitting.presets import preset
+from probscene.app.fitting.overrides import override
+from probscene.app.fitting.presets import PRESETS, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
-from probscene.errors import GeneratorError, ModelError, ProbsceneError, RunError
+from probscene.errors import DataError, GeneratorError, ModelError, ProbsceneError, RunError
 from probscene.generator import Command
 from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import pool_for
@@ -154,6 +155,28 @@ def test_the_check_draws_again_in_another_order(model, call):
     assert "another image" in check_generator(replace(model, generator=counting)).fault
     with pytest.raises(ModelError, match="Expected a model with a generator, actual 'multi_mnist'"):
         check_generator(load_model("multi_mnist"))
+    assert all(f"{name} " in str(report) for name in PRESETS)
+    command = replace(model.generator, files=(HERE / "none.png",))
+    with pytest.raises(DataError, match="none.png.*take it out of files="):
+        check_generator(replace(model, generator=command))
+
+
+def test_the_page_says_what_a_fit_has_drawn():
+    page = (HERE.parents[2] / "docs" / "generators.md").read_text(encoding="utf-8")
+    quick = preset("quick")
+    for chosen in (quick, override(quick, ["learn=structure"]), quick.with_features("count=efficientnet")):
+        features = chosen.make_features().images
+        structure = chosen.batches * chosen.num_scenes * chosen.draws_per_structure
+        row = re.search(rf"\| {features:,} \| {structure:,} \|([^|]*)\|([^|]*)\|", page[page.index(_called(chosen)) :])
+        assert row is not None
+        rest = sum(int(number.replace(",", "")) for number in row.groups() if number.strip())
+        assert features + structure + rest == chosen.images
+
+
+def _called(chosen):
+    if chosen.learn == "structure":
+        return "the same, `--learn structure`"
+    return "`--preset quick`" if chosen.features == "count" else "`--preset quick --features count=efficientnet`"
 
 
 def test_a_generator_may_say_that_it_is_not_reproducible(copied, model, tmp_path):
