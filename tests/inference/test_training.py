@@ -61,7 +61,8 @@ def counts_one_hot(dots, small):
 
 def pretrained_counting(dots, small):
     net = PretrainedCountNet(dots.classes, dots.canvas, held=8, sizes=(160, 160))
-    return PretrainedCountTraining(net, Observer(dots, 1).draw_twice, 8, 2, 4, seed=1), net
+    photographs = torch.randint(0, 256, (5, 3, *dots.canvas), dtype=torch.uint8)
+    return PretrainedCountTraining(net, Observer(dots, 1).draw_twice, 8, 2, 4, photographs=photographs, seed=1), net
 
 
 def projection(dots, small):

@@ -20,7 +20,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
     """Choose rules, scopes and what is compared, in place.
 
     Args:
-        net: with trained heads.
+        net: with heads that are trained and have learnt from photographs.
         most: photographs that are looked at, beside the labelled ones.
         each: see ``Features.adapt``.
 
@@ -30,9 +30,9 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
     images, labelled = photographs.some(most), photographs.labelled
     marked = images[:0] if labelled is None else labelled.images
     total = len(images) + len(marked)
-    whole, by_head = _look(net, images, 0, total, each)
-    of_labelled = _look(net, marked, len(images), total, each)[0] if len(marked) else whole[:0]
-    read = Read(whole, of_labelled, by_head, net.held_read, net.held_true)
+    whole = _look(net, images, 0, total, each)
+    of_labelled = _look(net, marked, len(images), total, each) if len(marked) else whole[:0]
+    read = Read(whole, of_labelled, net.apart, net.held_read, net.held_true)
     counts = {} if labelled is None else dict(zip(labelled.classes, labelled.counts.T, strict=True))
     records: dict[str, Any] = {}
     for c, name in enumerate(net.classes):
@@ -48,19 +48,18 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
             found = without_labels(read, c)
         _keep(net, c, found)
         records[name] = _record(net, c, found)
-    net.taught_by.copy_(torch.tensor(list(bytes.fromhex(photographs.fingerprint)), dtype=torch.uint8))
+    net.bind(photographs.fingerprint)
     return {"classes": records}
 
 
-def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: Seen) -> tuple[Tensor, Tensor]:
-    """Readings ``(L, S, R, C)``, and those of each head ``(heads, L, S, R, C)``."""
+def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: Seen) -> Tensor:
+    """Readings ``(L, S, R, C)``."""
     parts = []
     for some in images.split(LOOKED_AT_ONCE):
-        parts.append(net.readings(net.look(some)))
+        parts.append(net.readings(net.look(some))[0])
         done += len(some)
         each(done, total)
-    whole, by_head = zip(*parts, strict=True)
-    return torch.cat(whole), torch.cat(by_head, 1)
+    return torch.cat(parts)
 
 
 def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:

@@ -24,7 +24,7 @@ class PretrainedCountFeatures(Features):
     Args:
         pairs: structures that are drawn twice.
         epochs: of the heads.
-        photographs: images of the target, at most, by which rules are chosen.
+        photographs: images of the target, at most, from which heads learn and by which rules are chosen.
         scenes: in a batch of the fit, for which the unit of the counts is chosen.
     """
 
@@ -52,11 +52,15 @@ class PretrainedCountFeatures(Features):
         self, net: FeatureNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
     ) -> Training:
         """On renders of what guides are pretrained on: of the prior's few cars a head would learn that there are few,
-        and in photographs it must read many."""
+        and in photographs it must read many. Then on the photographs."""
         from .training import PretrainedCountTraining
 
-        heads, seed = cast("PretrainedCountNet", net), batch_seed(seed, 1)
-        return PretrainedCountTraining(heads, renders.draw_twice, self.pairs, self.epochs, seed=seed)
+        heads, target = cast("PretrainedCountNet", net), photographs()
+        heads.bind(target.fingerprint)
+        draw, images = renders.draw_twice, target.some(self.photographs)
+        return PretrainedCountTraining(
+            heads, draw, self.pairs, self.epochs, photographs=images, seed=batch_seed(seed, 1)
+        )
 
     def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
         """Choose how each class is read."""
@@ -69,7 +73,7 @@ class PretrainedCountFeatures(Features):
         return Blockwise(cast("PretrainedCountNet", net).blocks, (chosen, None))
 
     def taught_by(self, net: FeatureNet) -> str:
-        """The images by which rules were chosen."""
+        """The images that heads and rules are suited to."""
         return cast("PretrainedCountNet", net).taught_by_fingerprint
 
     def settings(self, preset: Any) -> dict[str, Any]:

@@ -27,6 +27,7 @@ class Kind(NamedTuple):
         hidden: channels.
         dropped: share of the maps' channels that is left out, so that none is relied upon.
         shift: standard deviation of what is added to a channel over a whole image, in its own.
+        teaches: whether it learns from what it reads in photographs, see ``training``.
     """
 
     stride: int
@@ -34,6 +35,7 @@ class Kind(NamedTuple):
     hidden: int
     dropped: float
     shift: float
+    teaches: bool
 
 
 def _of(stride: int) -> tuple[int, ...]:
@@ -41,7 +43,7 @@ def _of(stride: int) -> tuple[int, ...]:
 
 
 # Texture, which is in the finest maps, differs most between renders and photographs.
-KINDS = (Kind(16, _of(16), 64, 0.2, 0.2), Kind(8, _of(8), 32, 0.35, 0.5))
+KINDS = (Kind(16, _of(16), 64, 0.2, 0.2, True), Kind(8, _of(8), 32, 0.35, 0.5, False))
 
 
 class Head(nn.Module):

@@ -27,12 +27,13 @@ from ..pretrained import AT_ONCE, EfficientNetLite
 from ..projection import bandwidth
 from .head import KINDS, Head, Maps
 from .readability import rules_for_renders, scopes_without_labels
-from .reading import RULES, SCOPES, Scope, by_steps, read_all, read_each
+from .reading import RULES, SCOPES, Rule, Scope, by_steps, read_all, read_each, whole
 
 SIZES = 224, 342  # least and largest square whose area images enter with; a frame of 621 x 188 enters as 608 x 192
 SMALLEST = min(scope.pixels for scope in SCOPES)  # pixels of what enters; what is smaller is not counted
 LEAST_SPREAD, LEAST_UNIT = 0.3, 0.3  # objects
 HEADS = 4  # of each kind
+BELIEVED = Rule("soft", 3, 0.1, 0.5)  # by which heads learn from their own readings
 MOST = 200  # objects of a class that labels may count
 
 
@@ -49,9 +50,11 @@ class PretrainedCountNet(nn.Module):
     Attributes:
         unit: ``(D,)``, how many objects 1 in each feature stands for.
         blocks: how many features are counts of things and counts of stuff.
-        taught_by: fingerprint of the images whose rules were chosen, ``(32,)`` uint8; zeros for none.
+        taught_by: fingerprint of the images that heads and rules are suited to, ``(32,)`` uint8; zeros for none.
         rules: ``(2, C, R)`` bool, of ``RULES``, by whose median renders and photographs are read.
         scope: ``(C,)`` of ``SCOPES``.
+        apart: ``(S, R, C)``, how far heads were apart in those images before they learnt from them, see
+            ``readability.disagreement``; infinite where they did not.
         steps: ``(C, MOST)``, see ``readability.by_steps``; infinite for none.
         read: ``(D,)`` bool, whether a class can be read in photographs; features of others are 0.
         held_read, held_true: ``(V, S, R, C)`` and ``(V, S, C)``, what is read in those renders, and their counts.
@@ -63,6 +66,7 @@ class PretrainedCountNet(nn.Module):
     taught_by: Tensor
     rules: Tensor
     scope: Tensor
+    apart: Tensor
     steps: Tensor
     read: Tensor
     held_read: Tensor
@@ -93,6 +97,7 @@ class PretrainedCountNet(nn.Module):
         self.register_buffer("taught_by", torch.zeros(32, dtype=torch.uint8))
         self.register_buffer("rules", torch.ones(2, C, len(RULES), dtype=torch.bool))
         self.register_buffer("scope", torch.zeros(C, dtype=torch.int64))
+        self.register_buffer("apart", torch.full((len(SCOPES), len(RULES), C), math.inf))
         self.register_buffer("steps", torch.full((C, MOST), math.inf))
         self.register_buffer("read", torch.ones(len(self.names), dtype=torch.bool))
         self.register_buffer("held_read", torch.zeros(held, len(SCOPES), len(RULES), C))
@@ -111,6 +116,10 @@ class PretrainedCountNet(nn.Module):
     def taught_by_fingerprint(self) -> str:
         """``taught_by`` in hexadecimal; empty for none."""
         return bytes(self.taught_by.tolist()).hex() if self.taught_by.any() else ""
+
+    def bind(self, fingerprint: str) -> None:
+        """Say which images heads and rules are suited to, see ``taught_by``; in hexadecimal."""
+        self.taught_by.copy_(torch.tensor(list(bytes.fromhex(fingerprint)), dtype=torch.uint8))
 
     def places(self, stride: int) -> tuple[int, int]:
         """h and w of places so far apart."""
@@ -199,6 +208,18 @@ class PretrainedCountNet(nn.Module):
         """For each of ``KINDS``, probabilities of the classes in the places by each head, ``(HEADS, N, its scopes, C,
         h, w)``."""
         return [logits.softmax(3)[:, :, :, 1:] for logits in self(self.normal(maps))]
+
+    @torch.no_grad()
+    def believed(self, maps: Maps) -> list[Tensor]:
+        """For each of ``KINDS``, what the places hold by the mean of its heads, where what is surely an object is a
+        whole one and what is faint is none, ``(N, its scopes, 1 + C, h, w)``."""
+        out = []
+        for probability in self.by_head(maps):
+            mean = probability.mean(0)
+            held = whole(mean.flatten(0, 1), BELIEVED).unflatten(0, mean.shape[:2])
+            held = held / held.sum(2, keepdim=True).clamp(min=1)
+            out.append(torch.cat([1 - held.sum(2, keepdim=True), held], 2))
+        return out
 
     @torch.no_grad()
     def readings(self, maps: Maps) -> tuple[Tensor, Tensor]:

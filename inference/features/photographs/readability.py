@@ -1,11 +1,11 @@
 """Which classes can be counted in photographs, and by which rule: with a few labels, or without.
 
 Without labels all rules that count renders about as well as the best one are taken, and their median is read. It is
-believed where heads that agree on renders agree on the photographs too, where it counts right on renders that nothing
-was trained on, and where those rules read about as much as each other. With labels the rule is that with the least
-error on them, a little held by its error on renders, as ten labels alone would choose among many rules by luck; where
-they bear out what is read without them, nothing changes. Where the other labels' histogram predicts a label better than
-any rule does, that histogram is what is learnt.
+believed where heads that agree on renders agreed on the photographs too, before they learnt from one another, where it
+counts right on renders that nothing was trained on, and where those rules read about as much as each other. With labels
+the rule is that with the least error on them, a little held by its error on renders, as ten labels alone would choose
+among many rules by luck; where they bear out what is read without them, nothing changes. Where the other labels'
+histogram predicts a label better than any rule does, that histogram is what is learnt.
 
 Axis letters: L photographs, V renders, K labelled images, S scopes, R rules, C classes.
 """
@@ -41,14 +41,14 @@ class Read(NamedTuple):
     Attributes:
         photographs: ``(L, S, R, C)``.
         labelled: ``(K, S, R, C)``, those of the photographs that have labels.
-        by_head: ``(heads, L, S, R, C)``.
+        apart: ``(S, R, C)``, see ``disagreement``.
         renders: ``(V, S, R, C)``.
         true: ``(V, S, C)`` counts of those renders.
     """
 
     photographs: Tensor
     labelled: Tensor
-    by_head: Tensor
+    apart: Tensor
     renders: Tensor
     true: Tensor
 
@@ -102,6 +102,18 @@ def rules_for_renders(read: Tensor, true: Tensor) -> Tensor:
     return torch.arange(read.shape[2]) == least[:, None]
 
 
+def disagreement(by_head: Tensor) -> Tensor:
+    """``(S, R, C)`` how far the heads' counts of photographs are apart: the mean difference of two of them, over the
+    mean count and ``BASE``.
+
+    Args:
+        by_head: ``(heads, L, S, R, C)``.
+    """
+    pairs = torch.combinations(torch.arange(len(by_head))).unbind(1)
+    apart = torch.stack([(by_head[i] - by_head[j]).abs().mean(0) for i, j in zip(*pairs, strict=True)]).mean(0)
+    return apart / (by_head.mean((0, 1)) + BASE)
+
+
 def without_labels(read: Read, c: int) -> Reading:
     """How class number ``c`` is read where no image is labelled.
 
@@ -113,10 +125,8 @@ def without_labels(read: Read, c: int) -> Reading:
     error = (read.renders[:, s, :, c] - true[:, None]).abs().mean(0)
     rules = (error <= AS_WELL * error.min() + NEARLY).nonzero().flatten()
     counts = read.photographs[:, s, rules, c].double().quantile(0.5, 1)
-    heads = read.by_head[:, :, s, rules, c].double().quantile(0.5, 2).numpy()
     mean, means = float(counts.mean()), read.photographs[:, s, rules, c].double().mean(0)
-    pairs = [(i, j) for i in range(len(heads)) for j in range(i)]
-    apart = float(np.mean([np.abs(heads[i] - heads[j]).mean() for i, j in pairs])) / (mean + BASE)
+    apart = float(read.apart[s, rules, c].mean())
     spread = float((means.max() - means.min()) / (means.mean() + BASE))
     skill = _correlation(read.renders[:, s, rules, c].quantile(0.5, 1), true)
     good = apart <= AGREE and spread <= CLOSE and skill >= SKILL

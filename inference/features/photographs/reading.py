@@ -66,13 +66,19 @@ def read(probability: Tensor, rule: Rule) -> Tensor:
     """
     if rule.name == "sum":
         return probability.sum((2, 3))
-    mass = rule.window**2 * F.avg_pool2d(probability, rule.window, 1, rule.window // 2)
     if rule.name == "peaks":
+        mass = rule.window**2 * F.avg_pool2d(probability, rule.window, 1, rule.window // 2)
         top = F.max_pool2d(mass, 3, 1, 1) == mass
         return (top & (mass > rule.nothing)).float().sum((2, 3))
+    return whole(probability, rule).sum((2, 3))
+
+
+def whole(probability: Tensor, rule: Rule) -> Tensor:
+    """Probabilities ``(N, C, h, w)`` with objects taken to one, and faint ones to none, by a soft rule."""
+    mass = rule.window**2 * F.avg_pool2d(probability, rule.window, 1, rule.window // 2)
     part = ((mass - rule.nothing) / (rule.whole - rule.nothing)).clamp(0, 1)
-    whole = (1 / mass.clamp(min=rule.nothing)).clamp(min=1.0)
-    return (probability * part.square() * (3 - 2 * part) * whole).sum((2, 3))
+    to_one = (1 / mass.clamp(min=rule.nothing)).clamp(min=1.0)
+    return probability * part.square() * (3 - 2 * part) * to_one
 
 
 def read_all(probability: Tensor) -> Tensor:

@@ -5,7 +5,14 @@ The frozen network sees each image once; its maps stay in memory as half-precisi
 Photographs' maps are unlike renders' channel by channel, so the heads are kept from relying on any: channels are left
 out and shifted at random (``head.KINDS``).
 
-Axis letters: N images, M nodes, C classes, S scopes.
+Then heads teach themselves [1], those of some ``KINDS``: what they read in the target's unlabelled images, every object
+taken to a whole one, is what they learn to find there for one more epoch, beside the renders. How far heads are apart
+is noted before, since they learn from their mean.
+
+Axis letters: N images, L photographs, M nodes, C classes, S scopes.
+
+References:
+    [1] Xie et al., *Self-training with Noisy Student improves ImageNet classification*, CVPR 2020.
 """
 
 import math
@@ -24,9 +31,12 @@ from ..counting.training import relative_count_loss
 from .head import KINDS, Kind, Maps
 from .heads import PretrainedCountNet
 from .looks import photographed
+from .readability import disagreement
 from .reading import SCOPES, SMALL
 
 DRAWN_AT_ONCE = 32  # structures
+PHOTOGRAPHS = 12  # a step
+SLOWER = 0.4  # rate of the epoch with photographs, of the others'
 
 
 class PretrainedCountTraining:
@@ -36,8 +46,9 @@ class PretrainedCountTraining:
         net: trained in place.
         draw_twice: labelled renders of so many structures, then as many of the same structures.
         pairs: structures.
-        epochs: of the heads.
+        epochs: of the heads, on renders alone.
         batch_size, learning_rate: of AdamW, along a cosine.
+        photographs: images of the target, ``(L, 1 or 3, H, W)`` uint8, for one more epoch; None for none.
         seed: of everything random.
 
     Attributes:
@@ -56,9 +67,13 @@ class PretrainedCountTraining:
         epochs: int = 8,
         batch_size: int = 32,
         learning_rate: float = 5e-3,
+        photographs: Tensor | None = None,
         seed: int = 0,
     ):
-        self.net, self.draw_twice, self.pairs, self.total = net, draw_twice, pairs, epochs
+        self.net, self.draw_twice, self.pairs, self.epochs = net, draw_twice, pairs, epochs
+        none = photographs is None or not len(photographs)
+        self.photographs = () if none else photographs.split(2 * DRAWN_AT_ONCE)
+        self.total = epochs + (len(self.photographs) > 0)
         self.batch_size, self.learning_rate, self.seed, self.done = batch_size, learning_rate, seed, 0
         self.correlation: Tensor | None = None
         self.optimiser = torch.optim.AdamW(net.heads.parameters(), lr=learning_rate, weight_decay=5e-2)
@@ -74,16 +89,22 @@ class PretrainedCountTraining:
             ProbsceneError: the loss is no longer finite.
         """
         maps, targets, true, sizes = self._look(each)
+        photographs = self._look_at_photographs(each) if self.photographs and self.done < self.total else None
         n = 2 * self.pairs
         if self.done == 0:
             some = slice(0, n, max(1, n // 512))
             self.net.begin([part[some] for part in maps], [target[some] for target in targets])
         while self.done < self.total:
             seed_everything(batch_seed(self.seed, 1, self.done))
+            own = None
+            if self.done == self.epochs and photographs is not None:
+                self.net.eval()
+                self.net.apart.copy_(disagreement(self.net.readings(photographs)[1]))
+                own = photographs, [part.half() for part in self._believed(photographs)]
             self.net.train()
             batches = torch.randperm(n).split(self.batch_size)
             losses = [
-                self._step([part[rows] for part in maps], [target[rows] for target in targets], i / len(batches))
+                self._step([part[rows] for part in maps], [target[rows] for target in targets], i / len(batches), own)
                 for i, rows in enumerate(batches)
             ]
             self.done += 1
@@ -123,6 +144,7 @@ class PretrainedCountTraining:
         rng = np.random.default_rng(batch_seed(self.seed, 2))
         total = self.pairs + (len(self.net.held_true) + 1) // 2
         parts, sizes, done = [], [[] for _ in self.net.classes], 0
+        images = 2 * total + sum(map(len, self.photographs))
         while done < total:
             number = min(DRAWN_AT_ONCE, total - done, self.pairs - done if done < self.pairs else total)
             drawn = self.draw_twice(number)
@@ -134,7 +156,7 @@ class PretrainedCountTraining:
                 of_class.append((drawn.size * self.net.scale()).amax(-1)[shown == c])
             done += number
             if each is not None:
-                each(self, {"images": 2 * done, "of": 2 * total})
+                each(self, {"images": 2 * done, "of": images})
         last = 2 * self.pairs + len(self.net.held_true)
         *both, true = (torch.cat(column)[:last] for column in zip(*parts, strict=True))
         return both[: -len(KINDS)], both[-len(KINDS) :], true, [torch.cat(of_class) for of_class in sizes]
@@ -147,19 +169,48 @@ class PretrainedCountTraining:
             [cells(places * STRIDE, self.net.seen(drawn, SCOPES[s]), number, *size) for s in kind.scopes], 1
         )
 
-    def _step(self, maps: Maps, targets: list[Tensor], part: float) -> float:
+    def _look_at_photographs(self, each: Report | None) -> Maps:
+        """Maps, float16."""
+        parts, left = [], sum(map(len, self.photographs))
+        images = 2 * (self.pairs + (len(self.net.held_true) + 1) // 2) + left
+        for some in self.photographs:
+            parts.append([part.half() for part in self.net.look(some)])
+            left -= len(some)
+            if each is not None:
+                each(self, {"images": images - left, "of": images})
+        return [torch.cat(part) for part in zip(*parts, strict=True)]
+
+    def _believed(self, photographs: Maps) -> list[Tensor]:
+        """What their places hold as the heads read them, see ``PretrainedCountNet.believed``."""
+        parts = [self.net.believed(list(some)) for some in zip(*(part.split(64) for part in photographs), strict=True)]
+        return [torch.cat(part) for part in zip(*parts, strict=True)]
+
+    def _step(self, maps: Maps, targets: list[Tensor], part: float, own: tuple[Maps, list[Tensor]] | None) -> float:
+        over, rate = (self.done + part) / self.epochs, self.learning_rate
+        if own is not None:
+            over, rate = part, SLOWER * rate
         for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate * 0.5 * (1 + math.cos(math.pi * (self.done + part) / self.total))
+            group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * over))
+        loss = self._loss(maps, targets)
+        if own is not None:
+            rows = torch.randint(len(own[0][0]), (PHOTOGRAPHS,))
+            loss = loss + self._loss(*([each[rows] for each in part] for part in own), taught=True)
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+        return loss.item()
+
+    def _loss(self, maps: Maps, targets: list[Tensor], taught: bool = False) -> Tensor:
+        """Of all heads, or of those alone that teach themselves."""
         flipped = torch.rand(len(maps[0])) < 0.5
         seen = [torch.where(flipped[:, None, None, None], some.flip(3), some) for some in self.net.normal(maps)]
         loss = torch.zeros(())
         for kind, heads, target in zip(KINDS, self.net.heads, targets, strict=True):
+            if taught and not kind.teaches:
+                continue
             target = torch.where(flipped[:, None, None, None, None], target.flip(4), target).float()
             shifted = [some + kind.shift * torch.randn(*some.shape[:2], 1, 1) for some in seen]
             logits = torch.stack([head(shifted) for head in cast(nn.ModuleList, heads)])
             each = target.expand_as(logits)  # (heads, N, scopes, 1 + C, h, w)
             loss = loss + relative_count_loss(logits.flatten(0, 2), each.flatten(0, 2))
-        self.optimiser.zero_grad()
-        loss.backward()
-        self.optimiser.step()
-        return loss.item()
+        return loss

@@ -160,8 +160,8 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(count
     assert net.names == run.model.classes
     assert torch.allclose(seen, run.read_tensors("real")["features"][:9], atol=1e-3)
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
-    assert [line["stage"] for line in lines] == ["features"] * 12 + ["counts"] + ["structure"] * 2
-    assert len(lines[12]["correlation"]) == len(run.model.classes)
+    assert [line["stage"] for line in lines] == ["features"] * 13 + ["counts"] + ["structure"] * 2
+    assert len(lines[13]["correlation"]) == len(run.model.classes)
     assert all(f"{name}: {found['because']}." in said for name, found in run.readings["classes"].items())
     guide = (run.path / "guide.safetensors").read_bytes()
     for name in ("guide", "real", "features"):
@@ -191,7 +191,7 @@ def test_labels_choose_how_classes_are_read(counting, call, discs, target, tmp_p
 
 def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs, target, tmp_path):
     """Heads that are hardly trained; parameters are learnt as well."""
-    few = {"pairs": 12, "head_epochs": 1, "batches_again": 2} | {f"tilting.{k}": 20 for k in ("first", "scenes")}
+    few = {"pairs": 4, "head_epochs": 1, "batches_again": 2} | {f"tilting.{k}": 20 for k in ("first", "scenes")}
     chosen = [word for key, value in (few | {"tilting.rounds": 1}).items() for word in ("--set", f"{key}={value}")]
     words = [*WORDS, "--features", "count=efficientnet", *chosen]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)

@@ -11,7 +11,8 @@ from probscene.errors import ProbsceneError
 from probscene.inference.features.counting.training import relative_count_loss
 from probscene.inference.features.photographs.head import KINDS, STRIDES
 from probscene.inference.features.photographs.heads import LEAST_UNIT, PretrainedCountNet
-from probscene.inference.features.photographs.reading import LARGE, RULES, SCOPES, read
+from probscene.inference.features.photographs.readability import disagreement
+from probscene.inference.features.photographs.reading import LARGE, RULES, SCOPES, Rule, read
 from probscene.inference.features.photographs.training import PretrainedCountTraining
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.features.projection import bandwidth
@@ -248,3 +249,46 @@ def test_cells_hold_the_sum_of_probabilities(dots):
     cells = net.cells(images)
     assert cells.shape == (3, len(C), *net.places(min(STRIDES))) and net.classes == dots.classes
     torch.testing.assert_close(cells.sum((2, 3)), by_sum, rtol=1e-4, atol=1e-5)
+
+
+def test_what_is_believed_is_whole_objects_or_none(dots):
+    net = untrained(dots)
+    held = torch.zeros(1, len(SCOPES), 2, 14, 14)
+    held[..., 0, 3, 3], held[..., 0, 3, 10] = 0.6, 0.05  # surely one, and hardly one
+    held[..., 1, 8, 3:5] = 0.4  # one between two places
+    kinds = [held[:, list(kind.scopes)].expand(4, -1, -1, -1, -1, -1) for kind in KINDS]
+    net.by_head = lambda maps: kinds
+    for kind, found in zip(KINDS, net.believed([]), strict=True):
+        assert found.shape == (1, len(kind.scopes), 3, 14, 14)
+        assert torch.allclose(found.sum(2), torch.ones(1)) and (found >= 0).all()
+        counts = found[:, :, 1:].sum((3, 4))
+        assert torch.allclose(counts, torch.ones(1, len(kind.scopes), 2))
+        assert (found[:, :, 1, 3, 10] == 0).all() and (found[:, :, 1, 3, 3] == 1).all()
+
+
+def test_heads_teach_themselves_what_they_half_see(learnt, dots, draw_twice):
+    """Paler discs, which heads find in part, are found more nearly whole after an epoch on them."""
+    torch.manual_seed(7)
+    drawn = draw_twice(30)
+    pale = (drawn.image.float() * 0.15).byte()
+    taught = training(dots, draw_twice, 80, 15, 64, 8, photographs=pale)
+    taught.run()
+    assert taught.total == 16 and taught.done == 16
+    true = taught.net.true_counts(drawn)[:, LARGE].mean(0)
+    before, after = (read_of(net, pale)[:, LARGE].mean(0) for net in (learnt[0].net, taught.net))
+    assert ((after - true).abs() < 0.5 * (before - true).abs()).all()
+
+
+def read_of(net: PretrainedCountNet, images: torch.Tensor) -> torch.Tensor:
+    """Sums of probabilities ``(N, S, C)``."""
+    return net.readings(net.look(images))[0][:, :, RULES.index(Rule("sum"))]
+
+
+def test_how_far_heads_are_apart_is_noted_before_they_teach_one_another(learnt, dots, draw_twice):
+    torch.manual_seed(3)
+    images = draw_twice(6).image
+    taught = training(dots, draw_twice, 80, 15, 64, 8, photographs=images)
+    taught.restore(learnt[0].state())
+    taught.run()
+    before = disagreement(learnt[0].net.readings([part.half() for part in learnt[0].net.look(images)])[1])
+    assert taught.done == 16 and torch.equal(taught.net.apart, before)

@@ -12,6 +12,7 @@ from hypothesis.extra.numpy import arrays
 from probscene.inference.features.photographs.readability import (
     AGREE,
     Read,
+    disagreement,
     rules_for_renders,
     scopes_without_labels,
     with_labels,
@@ -118,7 +119,14 @@ def made(true: np.ndarray, seen: np.ndarray, apart: float = 0.02, ramp: float = 
     whole = torch.from_numpy(np.broadcast_to((seen[:, None] * level)[:, None, :, None], (L, S, R, 1)).copy()).float()
     heads = torch.stack([whole + apart * torch.from_numpy(rng.normal(size=(L, 1, 1, 1))).float() for _ in range(4)])
     drawn = torch.from_numpy(rng.integers(0, 6, (50, 1, 1))).float().expand(-1, S, -1)
-    return Read(whole, whole[: len(true)], heads, drawn[:, :, None].expand(-1, -1, R, -1), drawn)
+    return Read(whole, whole[: len(true)], disagreement(heads), drawn[:, :, None].expand(-1, -1, R, -1), drawn)
+
+
+def test_heads_are_apart_by_the_mean_difference_of_any_two():
+    by_head = torch.rand(4, 5, 2, 3, 1, generator=torch.Generator().manual_seed(0)) * 3
+    x = by_head.double().numpy()
+    apart = np.mean([np.abs(x[i] - x[j]).mean(0) for i in range(4) for j in range(i)], 0)
+    assert torch.allclose(disagreement(by_head), torch.from_numpy(apart / (x.mean((0, 1)) + 0.3)).float())
 
 
 COUNTS = np.random.default_rng(5).integers(0, 5, 60).astype(float)
