@@ -97,7 +97,7 @@ def _boxes(boxes: Any, most: int, ids: np.ndarray) -> np.ndarray:
     empty = shown[(found[shown - 1, 2:] <= found[shown - 1, :2]).any(1)]
     if len(empty):
         raise Fault(
-            f"expected amodal_box of each node that instance shows, larger than 0, actual none of node {empty[0]}; give "
-            "all of them, or none"
+            f"expected amodal_box of each node that instance shows, larger than 0, actual none of node {empty[0]}; "
+            "give all of them, or none"
         )
     return found
