@@ -71,8 +71,8 @@ class PretrainedCountTraining:
         seed: int = 0,
     ):
         self.net, self.draw_twice, self.pairs, self.epochs = net, draw_twice, pairs, epochs
-        none = photographs is None or not len(photographs)
-        self.photographs = () if none else photographs.split(2 * DRAWN_AT_ONCE)
+        some = () if photographs is None else photographs.split(2 * DRAWN_AT_ONCE)
+        self.photographs = [part for part in some if len(part)]
         self.total = epochs + (len(self.photographs) > 0)
         self.batch_size, self.learning_rate, self.seed, self.done = batch_size, learning_rate, seed, 0
         self.correlation: Tensor | None = None
