@@ -5,7 +5,6 @@ import io
 import json
 import os
 import secrets
-import zipfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -41,10 +40,11 @@ class Kept:
     def load(self, record: dict[str, Any]) -> Picture | None:
         """The picture of a scene; None where there is none, or where its file is damaged."""
         try:
-            with np.load(self.file(record)) as found:
-                return Picture(*(found.get(key) for key in Picture._fields))
-        except (OSError, EOFError, ValueError, zipfile.BadZipFile):
+            with open(self.file(record), "rb") as file, np.load(file) as found:
+                picture = Picture(**{"depth": None, "amodal_box": None, **found})
+        except Exception:  # damaged bytes raise whatever zipfile, zlib and the parser of numpy's headers do
             return None
+        return picture if _fits(picture, record) else None
 
     def save(self, record: dict[str, Any], picture: Picture) -> None:
         """Keep the picture of a scene.
@@ -66,3 +66,11 @@ class Kept:
                 f"Expected to write pictures to {self.folder}, which keep= of the Command names, actual "
                 f"{error.strerror}; make room, or take keep= away."
             ) from error
+
+
+def _fits(picture: Picture, record: dict[str, Any]) -> bool:
+    """Whether the arrays have the shapes and types of a picture of this scene."""
+    height, width, most = record["height"], record["width"], max((node["id"] for node in record["nodes"]), default=0)
+    expected = ((height, width, 3), "B"), ((height, width), "h"), ((height, width), "f"), ((most, 4), "f")
+    found = zip(picture, expected, strict=True)
+    return all(part is None or (part.shape, part.dtype.char) == this for part, this in found)

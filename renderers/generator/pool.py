@@ -168,18 +168,21 @@ class Pool:
                 raise Fault("it was ended")
             if number in self._processes:
                 return self._processes[number]
-        process = Process(self.command, self.folder, number)
-        with self._lock:
-            self._processes[number] = process
-            if self.closed:
-                process.kill()
+            process = self._processes[number] = Process(self.command, self.folder, number)
+        try:
+            process.meet()
+        except BaseException:
+            self._end(number)
+            raise
         return process
 
     def _end(self, number: int) -> None:
         with self._lock:
-            process = self._processes.pop(number, None)
+            process = self._processes.get(number)
         if process is not None:
             process.kill()
+            with self._lock:  # only now, as close() kills what is still here
+                self._processes.pop(number, None)
 
 
 def _contents(record: dict[str, Any]) -> str:

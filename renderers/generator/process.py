@@ -23,7 +23,7 @@ _TOLD = 4000  # characters
 
 
 class Process:
-    """A running worker.
+    """A worker that was started; it draws once it has been met.
 
     Args:
         command: what runs.
@@ -35,39 +35,43 @@ class Process:
         memory: megabytes that it had in use, at most.
 
     Raises:
-        GeneratorError: the program cannot be started, or is of another version or protocol.
-        Fault: it ended, or did not call ``serve`` in time.
+        GeneratorError: the program cannot be started.
     """
 
     def __init__(self, command: Command, folder: Path, number: int):
         self.command, self.drawn, self.memory = command, 0, 0.0
         self._log = log_of(folder, number)
-        listening, address = worker.listening(folder, number)
-        token = secrets.token_hex(16)
-        with listening:
-            variables = {worker.SOCKET: address, worker.TOKEN: token, "PROBSCENE_WORKER": str(folder)}
-            self._log.write_bytes(b"")
-            try:
-                with open(self._log, "ab") as log:  # so that it can be cut off while it is written
-                    self._process = subprocess.Popen(
-                        command.argv,
-                        stdin=subprocess.DEVNULL,
-                        stdout=log,
-                        stderr=subprocess.STDOUT,
-                        env={**os.environ, **variables},
-                        start_new_session=True,
-                    )
-            except OSError as error:
-                raise GeneratorError(
-                    f"Expected to start the generator {command.name}, actual {error.strerror} for {command.argv[0]!r}; "
-                    "mend the argv of its Command."
-                ) from error
-            try:
-                self._wire = self._called(listening)
-                self._greeted(token)
-            except BaseException:
-                self.kill()
-                raise
+        self._listening, address = worker.listening(folder, number)
+        self._token = secrets.token_hex(16)
+        variables = {worker.SOCKET: address, worker.TOKEN: self._token, "PROBSCENE_WORKER": str(folder)}
+        self._log.write_bytes(b"")
+        try:
+            with open(self._log, "ab") as log:  # so that it can be cut off while it is written
+                self._process = subprocess.Popen(
+                    command.argv,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env={**os.environ, **variables},
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self._listening.close()
+            raise GeneratorError(
+                f"Expected to start the generator {command.name}, actual {error.strerror} for {command.argv[0]!r}; "
+                "mend the argv of its Command."
+            ) from error
+
+    def meet(self) -> None:
+        """Wait until it calls and says what it is.
+
+        Raises:
+            GeneratorError: the program is of another version or protocol.
+            Fault: it ended, or did not call ``serve`` in time.
+        """
+        with self._listening:
+            self._wire = self._called()
+            self._greeted()
 
     def draw(self, record: dict[str, Any]) -> Picture:
         """Draw a scene.
@@ -116,20 +120,23 @@ class Process:
         if hasattr(self, "_wire"):
             self._wire.close()
 
-    def _called(self, listening: socket.socket) -> socket.socket:
+    def _called(self) -> socket.socket:
         """The connection to the process, once it has called."""
-        listening.settimeout(_LOOK)
+        self._listening.settimeout(_LOOK)
         end = time.monotonic() + self.command.start_timeout
         while True:
             try:
-                return listening.accept()[0]
+                return self._listening.accept()[0]
             except TimeoutError:
                 if self._process.poll() is not None:
                     raise Fault(f"{self._ended()}it had not called serve") from None
                 if time.monotonic() > end:
-                    raise Fault(f"it had not called serve {self.command.start_timeout:g} seconds after") from None
+                    raise Fault(
+                        f"it had not called serve {self.command.start_timeout:g} seconds after it was started; raise "
+                        "start_timeout= of its Command, or run its argv by hand to see what it waits for"
+                    ) from None
 
-    def _greeted(self, token: str) -> None:
+    def _greeted(self) -> None:
         try:
             hello = worker.receive(_Timed(self._wire, self.command.start_timeout), 1 << 16)
         except TimeoutError:
@@ -139,7 +146,7 @@ class Process:
         if hello is None:
             raise Fault(f"{self._ended()}it hung up")
         said = hello[0]
-        if said.get("protocol") != worker.PROTOCOL or said.get("token") != token:
+        if said.get("protocol") != worker.PROTOCOL or said.get("token") != self._token:
             raise GeneratorError(self._stranger(f"protocol {said.get('protocol')!r}"))
         if self.command.version and said.get("version") != self.command.version:
             raise GeneratorError(

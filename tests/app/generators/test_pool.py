@@ -8,14 +8,19 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
 from probscene.renderers.generated import GeneratedRenderer
+from probscene.renderers.generator.kept import Kept
 from probscene.renderers.generator.pool import pool_for
+from probscene.renderers.generator.reply import Picture
 
 SCENES = 24
 
@@ -126,7 +131,7 @@ def test_a_scene_that_always_fails_is_named_with_what_was_raised_and_printed(dra
     ("name", "settings", "said"),
     [
         ("gone", {"attempts": 1}, "status 1; it had not called serve\nThe end of what it printed:\nno licence"),
-        ("silent", {"attempts": 1, "start_timeout": 1.0}, "had not called serve 1 seconds after"),
+        ("silent", {"attempts": 1, "start_timeout": 1.0}, "serve 1 seconds after it was started; raise start_timeout="),
         ("hang", {"attempts": 1, "timeout": 1.0}, "had drawn nothing after 1 seconds"),
         ("garbage", {"attempts": 1}, r"expected image as uint8 \(32, 40, 3\), actual uint8 \(1,\)"),
         ("crash", {"attempts": 1}, "was ended by SIGABRT"),
@@ -172,6 +177,59 @@ os.kill(os.getpid(), 9)
     pytest.fail("the worker still runs")
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+@pytest.mark.parametrize("end", ["start_timeout", "interrupt"])
+def test_programs_that_never_call_end_with_their_parent(end, tmp_path):
+    code = f"""
+import signal
+from probscene.generator import Command
+from probscene.renderers.generator.pool import pool_for
+argv = [{sys.executable!r}, "-c", "import time; time.sleep(1000)", {str(tmp_path)!r}]
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+if {end == "interrupt"}:
+    signal.setitimer(signal.ITIMER_REAL, 1.5)
+scene = {{"height": 4, "width": 4, "seed": 1, "values": {{}}, "nodes": []}}
+pool_for(Command(argv, start_timeout={60 if end == "interrupt" else 1}), 2).draw([scene] * 6)
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    left = processes_with(str(tmp_path))
+    for process in left:
+        os.kill(process, signal.SIGKILL)
+    said = "KeyboardInterrupt" if end == "interrupt" else "had not called serve 1 seconds after"
+    assert said in told.stderr and not left
+
+
+def processes_with(word):
+    found = []
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if word in file.read_bytes().decode(errors="replace").split("\0"):
+                found.append(int(file.parent.name))
+    return found
+
+
+def test_a_program_starts_no_more_once_its_pool_is_closed(command, fault, running):
+    fault("silent")
+    pool, said = pool_for(command(), 2), []
+
+    def draw():
+        try:
+            pool.draw([{"height": 4, "width": 4, "seed": 1, "values": {}, "nodes": []}] * 4)
+        except GeneratorError as error:
+            said.append(str(error))
+
+    drawing = threading.Thread(target=draw)
+    drawing.start()
+    end = time.monotonic() + 10
+    while len(groups := pool.processes()) < 2 and time.monotonic() < end:
+        time.sleep(0.01)
+    pool.close()
+    drawing.join(10)
+    assert said == ["The generator draw_boxes.py was ended while it drew."]
+    assert len(groups) == 2 and not any(running(group) for group in groups)
+    assert set(pool.processes()) <= set(groups)
+
+
 def test_pictures_that_are_kept_are_taken_again(drawn, request_of, command, fault, fresh, tmp_path):
     request, keep = request_of(SCENES), tmp_path / "kept"
     fault("boxes")
@@ -189,6 +247,57 @@ def test_pictures_that_are_kept_are_taken_again(drawn, request_of, command, faul
     fresh()
     fault("boxes")
     assert same(drawn(request, keep=keep), first)
+
+
+def test_a_damaged_picture_is_taken_as_none_or_as_it_was(command, tmp_path):
+    nodes = [{"id": 1, "kind": "mug", "values": {}}, {"id": 2, "kind": "mug", "values": {}}]
+    record = {"height": 16, "width": 20, "seed": 1, "values": {}, "nodes": nodes}
+    draw = np.random.default_rng(0)
+    picture = Picture(
+        draw.integers(0, 255, (16, 20, 3), np.uint8, endpoint=True),
+        draw.integers(0, 2, (16, 20), np.int16, endpoint=True),
+        draw.random((16, 20), np.float32),
+        draw.random((2, 4), np.float32),
+    )
+    kept = Kept(tmp_path, command())
+    kept.save(record, picture)
+    file = kept.file(record)
+    whole = file.read_bytes()
+    assert as_bytes(kept.load(record)) == as_bytes(picture)
+    none = 0
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for at in draw.integers(0, len(whole), draw.integers(1, 40)):
+            damaged[at] = draw.integers(0, 256)
+        file.write_bytes(damaged)
+        found = kept.load(record)
+        none += found is None
+        assert found is None or as_bytes(found) == as_bytes(picture)
+    assert none > 200
+
+
+@pytest.mark.parametrize(
+    ("changed", "taken"),
+    [
+        ({}, True),
+        ({"image": None}, False),
+        ({"image": np.zeros((3, 4, 3), np.uint8)}, False),
+        ({"instance": np.zeros((4, 4), np.float32)}, False),
+        ({"depth": np.zeros((4, 4), np.float32)}, True),
+        ({"depth": np.zeros((4, 4, 1), np.float32)}, False),
+        ({"amodal_box": np.zeros((2, 4), np.float32)}, False),
+    ],
+)
+def test_a_picture_that_is_kept_has_the_shape_of_its_scene(command, tmp_path, changed, taken):
+    record = {"height": 4, "width": 4, "seed": 1, "values": {}, "nodes": [{"id": 1, "kind": "mug", "values": {}}]}
+    kept = Kept(tmp_path, command())
+    picture = Picture(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.int16), None, np.zeros((1, 4), np.float32))
+    kept.save(record, picture._replace(**changed))
+    assert (kept.load(record) is not None) == taken
+
+
+def as_bytes(picture):
+    return [None if part is None else (part.dtype.str, part.shape, part.tobytes()) for part in picture]
 
 
 def test_another_command_has_pictures_of_its_own(drawn, request_of, tmp_path, fault, fresh):
