@@ -105,31 +105,31 @@ def fit(
         try:
             assets_folder = None if assets is None else Path(assets)
             labels = None if labels is None else Path(labels)
-            if resume and (folder / "run.json").exists():
-                begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
-                run, images = session.resume(
-                    folder, show, given, target, chosen, assets_folder, parts, Run, photographs=other, **begun
-                )
-            else:
-                run, images = session.begin(
-                    given,
-                    target,
-                    folder,
-                    chosen,
-                    checked_seed(seed),
-                    skip_bad,
-                    threads,
-                    show,
-                    assets_folder,
-                    parts,
-                    Run,
-                    labels,
-                    other,
-                )
-            if not run.is_finished:
-                with connected(cluster, show.say) as nodes:
+            with connected(cluster, show.say) as nodes:  # first, so that a wrong address leaves no run behind
+                if resume and (folder / "run.json").exists():
+                    begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
+                    run, images = session.resume(
+                        folder, show, given, target, chosen, assets_folder, parts, Run, photographs=other, **begun
+                    )
+                else:
+                    run, images = session.begin(
+                        given,
+                        target,
+                        folder,
+                        chosen,
+                        checked_seed(seed),
+                        skip_bad,
+                        threads,
+                        show,
+                        assets_folder,
+                        parts,
+                        Run,
+                        labels,
+                        other,
+                    )
+                if not run.is_finished:
                     session.carry_out(run, images, show, *_cache(cache), nodes)
-                tell(run, show)
+                    tell(run, show)
         except BaseException:
             if temporary is not None:
                 shutil.rmtree(temporary, ignore_errors=True)

@@ -94,33 +94,35 @@ def fit(
         model = f"{model}:{scenarios}"
     judged = None
     with Display() as show:
-        if resume:
-            given = chosen if preset or objective or guide or features or settings else None
-            begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
-            run, images = session.resume(out, show, model, target, given, assets, parts, photographs=other, **begun)
-        elif model is None or target is None:
-            raise ProbsceneError(
-                "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
-            )
-        else:
-            run, images = session.begin(
-                model,
-                target,
-                out,
-                chosen,
-                seed or 0,
-                bool(skip_bad),
-                threads,
-                show,
-                assets,
-                parts,
-                labels=labels,
-                photographs=other,
-            )
-            ctx.obj.words.append("--resume")
-        if not run.is_finished:
-            with connected(cluster, show.say) as nodes:
+        with connected(cluster, show.say) as nodes:  # first, so that a wrong address leaves no run behind
+            if resume:
+                given = chosen if preset or objective or guide or features or settings else None
+                begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
+                run, images = session.resume(out, show, model, target, given, assets, parts, photographs=other, **begun)
+            elif model is None or target is None:
+                raise ProbsceneError(
+                    "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
+                )
+            else:
+                run, images = session.begin(
+                    model,
+                    target,
+                    out,
+                    chosen,
+                    seed or 0,
+                    bool(skip_bad),
+                    threads,
+                    show,
+                    assets,
+                    parts,
+                    labels=labels,
+                    photographs=other,
+                )
+                ctx.obj.words.append("--resume")
+            is_new = not run.is_finished
+            if is_new:
                 session.carry_out(run, images, show, cache, not no_cache, nodes)
+        if is_new:
             tell(run, show)
             if not no_verdict:
                 judged = judge(run, images or open_target(run, show), show, AFTER_A_FIT)

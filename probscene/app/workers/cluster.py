@@ -6,7 +6,11 @@ frozen costs that time and not the run. Tasks have to give the same wherever and
 """
 
 import os
+import platform
+import re
 import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
@@ -19,6 +23,8 @@ from .crew import Crew, first_line
 
 AUTO = "auto"
 CONNECT = 10.0  # seconds
+ANSWER = 20.0  # seconds
+ASK = "import sys; from ray._raylet import GcsClient; GcsClient(address=sys.argv[1])"
 
 
 class Cluster:
@@ -31,7 +37,7 @@ class Cluster:
 
     Raises:
         ProbsceneError: Ray is not installed.
-        MachineError: there is no such cluster.
+        MachineError: there is no such cluster, or it has other versions of Ray or Python.
     """
 
     def __init__(self, address: str = AUTO, say: Callable[[str], None] = print):
@@ -53,6 +59,13 @@ class Cluster:
             else:
                 ray.init(address=found, **quiet)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+            if str(error).startswith("Version mismatch"):
+                theirs = re.findall(r"(?:Ray|Python): \S+", str(error))[:2]
+                raise MachineError(
+                    f"Expected Ray {ray.__version__} and Python {platform.python_version()} at {address}, as here, "
+                    f"actual {' and '.join(theirs).replace(':', '')}; install the same versions of Ray and Python on "
+                    "both."
+                ) from error
             raise MachineError(
                 f"Expected a Ray cluster at {address}, actual none ({first_line(error)}). Start one with "
                 "ray start --head and name its address, HOST:6379; or let one be started here: --cluster auto."
@@ -88,10 +101,15 @@ def _running() -> str | None:
 
 
 def _knocked(address: str) -> str:
-    """``HOST:PORT`` or ``ray://HOST:PORT``, where something listens; else Ray tries for many minutes, and then ends the
-    process."""
+    """``HOST:PORT`` or ``ray://HOST:PORT``, where something listens that answers; else Ray tries for many minutes, and
+    then ends the process. A child process asks, for Ray cannot be stopped in this one."""
     host, _, port = address.rpartition("//")[2].rpartition(":")
     if not host or not port.isdecimal():
         raise ValueError("no HOST:PORT")
     socket.create_connection((host, int(port)), timeout=CONNECT).close()
+    if not address.startswith("ray://"):  # Ray's client has a time limit of its own
+        try:
+            subprocess.run([sys.executable, "-c", ASK, address], capture_output=True, timeout=ANSWER)
+        except subprocess.TimeoutExpired as error:
+            raise ConnectionError(f"something that is not Ray listens there, no answer in {ANSWER:g} s") from error
     return address

@@ -2,15 +2,18 @@
 
 import errno
 import os
+import socket
 import time
 from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
+from probscene.app.api.fit import fit
 from probscene.app.datasets import generate as datasets
 from probscene.app.datasets.generate import _actor, generate
 from probscene.app.fitting.run import RunFolder
+from probscene.app.workers import cluster as clusters
 from probscene.app.workers import crew as crews
 from probscene.app.workers.cluster import Cluster
 from probscene.errors import MachineError, ModelError, ProbsceneError
@@ -169,6 +172,36 @@ def test_a_cluster_that_is_not_there_is_one_line(call, fitted, tmp_path, address
     result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
     assert result.code == 1 and result.err.count("\n") == 1
     assert f"Expected a Ray cluster at {address}, actual none" in result.err and not (tmp_path / "out").exists()
+
+
+def test_a_fit_without_its_cluster_leaves_no_run(call, discs, target, tmp_path):
+    result = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "out", "--cluster", "127.0.0.1:1")
+    assert result.code == 1 and result.err.count("\n") == 1
+    assert "Expected a Ray cluster at 127.0.0.1:1" in result.err and not (tmp_path / "out").exists()
+    with pytest.raises(MachineError, match="Expected a Ray cluster at 127.0.0.1:1"):
+        fit(discs.file, target.images, out=tmp_path / "out", cluster="127.0.0.1:1", progress=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_not_ray_is_told_in_time(call, fitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(clusters, "ANSWER", 2.0)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        address = f"127.0.0.1:{listening.getsockname()[1]}"
+        result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
+    assert result.code == 1 and result.err.count("\n") == 1
+    assert f"Expected a Ray cluster at {address}, actual none (something that is not Ray listens there" in result.err
+
+
+def test_another_version_of_ray_is_no_missing_cluster(monkeypatch):
+    def mismatched(**_):
+        there = "The cluster was started with:\n    Ray: 2.1.0\n    Python: 3.9.1\n"
+        here = "This process on 10.0.0.2 was started with:\n    Ray: 2.60.0\n    Python: 3.11.9\n"
+        raise RuntimeError(f"Version mismatch: {there}{here}")
+
+    monkeypatch.setattr("ray.init", mismatched)
+    monkeypatch.setattr(clusters, "_knocked", lambda address: address)
+    with pytest.raises(MachineError, match="actual Ray 2.1.0 and Python 3.9.1; install the same versions"):
+        Cluster("10.0.0.1:6379")
 
 
 def test_auto_starts_one_where_what_ray_remembers_is_gone(monkeypatch):
