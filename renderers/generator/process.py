@@ -142,7 +142,7 @@ class Process:
         except TimeoutError:
             raise Fault(f"it had said nothing {self.command.start_timeout:g} seconds after it called") from None
         except (OSError, ValueError) as error:
-            raise GeneratorError(self._stranger(str(error))) from error
+            raise GeneratorError(self._stranger("something else")) from error
         if hello is None:
             raise Fault(f"{self._ended()}it hung up")
         said = hello[0]

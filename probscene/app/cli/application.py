@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from typer.core import TyperGroup
 
-from probscene.errors import ProbsceneError
+from probscene.errors import GeneratorError, ProbsceneError
 from probscene.program_errors import useful_text
 
 
@@ -50,7 +50,8 @@ class Commands(TyperGroup):
 
 
 def explained(error: BaseException, words: list[str]) -> tuple[int, str]:
-    """The exit code and the one line that an error comes to; ``words`` are what was typed after ``probscene``."""
+    """The exit code and the one line that an error comes to, with what a generator printed below it; ``words`` are what
+    was typed after ``probscene``."""
     again = shlex.join(["probscene", *words])
     if isinstance(error, KeyboardInterrupt):
         return 1, f"Interrupted; go on with: {again}"
@@ -58,6 +59,8 @@ def explained(error: BaseException, words: list[str]) -> tuple[int, str]:
         from ..files import machine_error
 
         error = machine_error(error, Path(error.filename or "the output"))
+    if isinstance(error, GeneratorError):
+        return error.exit_code, f"probscene: {error}"
     if isinstance(error, ProbsceneError):
         return error.exit_code, f"probscene: {' '.join(str(error).split())}"
     if isinstance(error, MemoryError):

@@ -119,10 +119,10 @@ def fit(
                     photographs=other,
                 )
                 ctx.obj.words.append("--resume")
-            is_new = not run.is_finished
-            if is_new:
+            unfinished = not run.is_finished
+            if unfinished:
                 session.carry_out(run, images, show, cache, not no_cache, nodes)
-        if is_new:
+        if unfinished:
             tell(run, show)
             if not no_verdict:
                 judged = judge(run, images or open_target(run, show), show, AFTER_A_FIT)

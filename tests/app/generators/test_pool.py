@@ -153,7 +153,7 @@ def test_a_program_that_is_not_there_or_speaks_otherwise(request_of, tmp_path):
         "import os, socket, time\nwire = socket.socket(socket.AF_UNIX)\nwire.connect(os.environ['PROBSCENE_SOCKET'])\n"
         "wire.sendall(b'HTTP/1.1 200 OK\\r\\n\\r\\n')\ntime.sleep(60)\n"
     )
-    with pytest.raises(GeneratorError, match="speak protocol 1"):
+    with pytest.raises(GeneratorError, match="speak protocol 1 of probscene, actual something else; let it import"):
         GeneratedRenderer(Command([sys.executable, str(stranger)]), (32, 40))(request)
 
 

@@ -230,6 +230,15 @@ def test_a_fit_whose_generator_fails_says_so_and_leaves_nothing(copied, tmp_path
     assert not (tmp_path / "run").exists()
 
 
+def test_what_a_program_printed_stands_below_the_message_line_by_line(copied, call, tmp_path):
+    script = copied.with_name("draw_boxes.py")
+    script.write_text("import sys\n\nprint('no licence:', 3, 'seats')\nsys.exit('ask Ann')\n")
+    told = call("preview", copied, "--num", 1, "--out", tmp_path / "prior.png")
+    message, *printed = told.err.strip().splitlines()
+    assert told.code == 2 and message.startswith("probscene: Expected the generator draw_boxes.py to draw the scene")
+    assert printed[0] == "The end of what it printed:" and set(printed[1:]) == {"no licence: 3 seats", "ask Ann"}
+
+
 def test_the_page_on_generators_is_a_model_and_its_program(tmp_path, call):
     page = (HERE.parents[2] / "docs" / "generators.md").read_text(encoding="utf-8")
     model, draw = re.findall(r"^```py\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
