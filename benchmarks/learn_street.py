@@ -1,7 +1,7 @@
 """Whether a fit to real street frames comes closer to them than the prior: numbers of cars, FID and KID, looks.
 
     python benchmarks/learn_street.py FRAMES/ LABELS [--out FOLDER] [--seeds 0] [--min-height 25]
-        [--learn structure,parameters]
+        [--learn structure,parameters] [--all COUNTS.csv]
 
 Fits see the images alone. ``LABELS`` is KITTI's ``label_2``, or a CSV of counts, of the same images. Cars of scenes are
 counted as the labels count them, of 2,000 rendered scenes (``probscene evaluate``). Printed for each seed: total
@@ -10,10 +10,13 @@ prior, the start and what was learnt; FOLDER holds the runs, ``results.json`` an
 parameters are learnt, too, the same distances of learnt structures with the prior's parameters follow as ``structure``,
 and of frames and of images of each source what a photographer would say: how bright they are, their contrast,
 saturation and noise, and the row of the horizon, each the mean with the interval of 95 % of bootstraps over images; and
-KID and FID of 500 images of each source, drawn with one seed.
+KID and FID of 500 images of each source, drawn with one seed. ``--all`` names a CSV with a column ``Car_ge25px``, the
+cars of 25 pixels and more in all of KITTI's label files: how far each source, and the labels of the frames, are from
+these follows as ``all``.
 """
 
 import argparse
+import csv
 import json
 import math
 import time
@@ -68,6 +71,20 @@ def row(found: Evaluation) -> dict:
         for distances in found.images.values():
             out[name] |= {figure.name: round(float(figure.value), 4) for figure in distances[name]}
     return out
+
+
+def from_all(found: Evaluation, counts: Path) -> dict:
+    """How far each source, and the frames' labels, are from the labels of many more frames."""
+    with counts.open(encoding="utf-8") as file:
+        every = histogram(torch.tensor([int(line["Car_ge25px"]) for line in csv.DictReader(file)]))
+    return {
+        name: {
+            "total_variation": round(float(total_variation(each, every)), 3),
+            "wasserstein": round(float(wasserstein(each, every)), 3),
+        }
+        for name, each in cars(found).items()
+        if name in (*FITTED, "truth")
+    }
 
 
 def said(images: Tensor) -> dict[str, list[float]]:
@@ -140,6 +157,7 @@ def main():
     parser.add_argument("--set", action="append", default=[], dest="settings", help="as of probscene fit")
     parser.add_argument("--learn", choices=(STRUCTURE, BOTH), default=STRUCTURE)
     parser.add_argument("--min-height", type=float, default=0.0, help="of KITTI's boxes that are counted, pixels")
+    parser.add_argument("--all", type=Path, help="a CSV of the number of cars in all of KITTI's label files")
     args = parser.parse_args()
     args.images = needed(args.images, "a folder of street frames, and the file or folder of their labels")
     args.labels = needed(args.labels, "the frames' labels, KITTI's label_2 or a CSV of counts, after their folder")
@@ -155,6 +173,8 @@ def main():
         truth = read_labels(args.labels, run.model, target, False, args.min_height)
         found = evaluate(run, target, truth, lambda *_: None, num=2000, features=["efficientnet"])
         rows.append({"seed": seed, "seconds": seconds, **row(found)})
+        if args.all is not None:
+            rows[-1] |= {"all": from_all(found, args.all)}
         if run.parameters:
             rows[-1] |= {"kept": run.parameters["kept"], **looks(run, target, DRAWN)}
         histograms.append(cars(found))
