@@ -136,15 +136,24 @@ class PretrainedCountTraining:
         """Go on from a ``state``."""
         self.done = int(restore_training(self.net, {"adam": self.optimiser}, tensors)["done"])
 
+    @property
+    def _structures(self) -> int:
+        """That are drawn twice, those of renders that are held out among them."""
+        return self.pairs + (len(self.net.held_true) + 1) // 2
+
+    @property
+    def _images(self) -> int:
+        """That are looked at."""
+        return 2 * self._structures + sum(map(len, self.photographs))
+
     def _look(self, each: Report | None) -> tuple[Maps, list[Tensor], Tensor, list[Tensor]]:
         """Of renders: maps, float16, what the places of each of ``KINDS`` should hold ``(N, its scopes, 1 + C, h, w)``
         float16 and the true counts ``(N, S, C)``, of what is trained on and then of what is held out. Of each class the
         sizes of its objects, pixels of what enters."""
         seed_everything(batch_seed(self.seed, 0))
         rng = np.random.default_rng(batch_seed(self.seed, 2))
-        total = self.pairs + (len(self.net.held_true) + 1) // 2
+        total = self._structures
         parts, sizes, done = [], [[] for _ in self.net.classes], 0
-        images = 2 * total + sum(map(len, self.photographs))
         while done < total:
             number = min(DRAWN_AT_ONCE, total - done, self.pairs - done if done < self.pairs else total)
             drawn = self.draw_twice(number)
@@ -156,7 +165,7 @@ class PretrainedCountTraining:
                 of_class.append((drawn.size * self.net.scale()).amax(-1)[shown == c])
             done += number
             if each is not None:
-                each(self, {"images": 2 * done, "of": images})
+                each(self, {"images": 2 * done, "of": self._images})
         last = 2 * self.pairs + len(self.net.held_true)
         *both, true = (torch.cat(column)[:last] for column in zip(*parts, strict=True))
         return both[: -len(KINDS)], both[-len(KINDS) :], true, [torch.cat(of_class) for of_class in sizes]
@@ -171,13 +180,12 @@ class PretrainedCountTraining:
 
     def _look_at_photographs(self, each: Report | None) -> Maps:
         """Maps, float16."""
-        parts, left = [], sum(map(len, self.photographs))
-        images = 2 * (self.pairs + (len(self.net.held_true) + 1) // 2) + left
+        parts, done = [], 2 * self._structures
         for some in self.photographs:
             parts.append([part.half() for part in self.net.look(some)])
-            left -= len(some)
+            done += len(some)
             if each is not None:
-                each(self, {"images": images - left, "of": images})
+                each(self, {"images": done, "of": self._images})
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
     def _believed(self, photographs: Maps) -> list[Tensor]:
