@@ -1,8 +1,8 @@
 """As many processes of one ``Command`` as are asked for, shared by all who draw with it in this process.
 
 A scene goes to whichever worker is free; what it draws does not depend on which. A worker that fails is killed with all
-that it has started, and the scene tried again by a fresh one. At the end of this process all are ended, and a worker
-whose pool is gone ends itself.
+that it has started, and the scene tried again by a fresh one. At the end of this process all are ended, by a guard where
+this was killed.
 """
 
 import os
@@ -17,11 +17,12 @@ from queue import SimpleQueue
 from typing import Any
 
 from probscene import worker
-from probscene.errors import GeneratorError, MachineError
+from probscene.errors import GeneratorError
 from probscene.generator import Command
 
+from .guard import Guard
 from .kept import Kept
-from .process import Process, log_of, tail
+from .process import Process, log_of, no_room, tail
 from .reply import Fault, Picture
 
 _LONGEST = 80  # characters of a folder's path: a socket's may have 107
@@ -70,11 +71,9 @@ class Pool:
                 self.folder.rmdir()
                 self.folder = Path(tempfile.mkdtemp(prefix="probscene-", dir="/tmp"))
             shutil.copyfile(worker.__file__, self.folder / "probscene_worker.py")
+            self._guard = Guard(self.folder)
         except OSError as error:
-            raise MachineError(
-                f"Expected to write temporary files for the generator {command.name}, actual {error.strerror}; make "
-                "room, or set TMPDIR."
-            ) from error
+            raise no_room(command, error) from error
         Finalize(None, self.close, exitpriority=1)  # also at the end of a process that multiprocessing has started
 
     def grow(self, workers: int) -> None:
@@ -116,7 +115,7 @@ class Pool:
                 process.kill()
             for _ in self._threads:
                 self._tasks.put(None)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        self._guard.close()
 
     def _work(self, number: int) -> None:
         """One worker's thread."""
@@ -169,6 +168,7 @@ class Pool:
             if number in self._processes:
                 return self._processes[number]
             process = self._processes[number] = Process(self.command, self.folder, number)
+            self._guard.started(process.pid)
         try:
             process.meet()
         except BaseException:
@@ -183,6 +183,7 @@ class Pool:
             process.kill()
             with self._lock:  # only now, as close() kills what is still here
                 self._processes.pop(number, None)
+                self._guard.ended(process.pid)
 
 
 def _contents(record: dict[str, Any]) -> str:

@@ -6,14 +6,14 @@ import signal
 import socket
 import subprocess
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from probscene import worker
-from probscene.errors import GeneratorError
+from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
 
+from .guard import kill_group
 from .reply import Fault, Picture, read
 
 TAIL, LOG = 12, 1 << 20  # lines of a log that are told; bytes after which it starts again
@@ -36,15 +36,19 @@ class Process:
 
     Raises:
         GeneratorError: the program cannot be started.
+        MachineError: there is no room for temporary files.
     """
 
     def __init__(self, command: Command, folder: Path, number: int):
         self.command, self.drawn, self.memory = command, 0, 0.0
         self._log = log_of(folder, number)
-        self._listening, address = worker.listening(folder, number)
+        try:
+            self._log.write_bytes(b"")
+            self._listening, address = worker.listening(folder, number)
+        except OSError as error:
+            raise no_room(command, error) from error
         self._token = secrets.token_hex(16)
         variables = {worker.SOCKET: address, worker.TOKEN: self._token, "PROBSCENE_WORKER": str(folder)}
-        self._log.write_bytes(b"")
         try:
             with open(self._log, "ab") as log:  # so that it can be cut off while it is written
                 self._process = subprocess.Popen(
@@ -84,11 +88,14 @@ class Process:
             worker.send(wire, record)
             answer = worker.receive(wire, MOST)
         except TimeoutError:
-            raise Fault(f"it had drawn nothing after {self.command.timeout:g} seconds") from None
+            raise Fault(
+                f"it had drawn nothing after {self.command.timeout:g} seconds; raise timeout= of its Command where a "
+                "scene may take longer, or mend the program"
+            ) from None
         except (OSError, ValueError) as error:
-            raise Fault(f"{self._ended()}{type(error).__name__}: {error}") from error
+            raise Fault(f"{self._ended()}{type(error).__name__}: {error}; mend the program") from error
         if answer is None:
-            raise Fault(f"{self._ended()}it hung up")
+            raise Fault(f"{self._ended()}it hung up; mend the program")
         self.drawn += 1
         memory = answer[0].get("memory")
         self.memory = memory if isinstance(memory, float) else 0.0
@@ -111,11 +118,7 @@ class Process:
 
     def kill(self) -> None:
         """End it, and all that it has started in its process group."""
-        if hasattr(os, "killpg") and hasattr(signal, "SIGKILL"):
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-        else:
-            self._process.kill()
+        kill_group(self._process.pid)
         self._process.wait()
         if hasattr(self, "_wire"):
             self._wire.close()
@@ -129,7 +132,7 @@ class Process:
                 return self._listening.accept()[0]
             except TimeoutError:
                 if self._process.poll() is not None:
-                    raise Fault(f"{self._ended()}it had not called serve") from None
+                    raise Fault(f"{self._ended()}it had not called serve; run its argv by hand") from None
                 if time.monotonic() > end:
                     raise Fault(
                         f"it had not called serve {self.command.start_timeout:g} seconds after it was started; raise "
@@ -169,6 +172,14 @@ class Process:
         if status < 0:
             return f"it was ended by {signal.Signals(-status).name}; "
         return f"it ended with status {status}; "
+
+
+def no_room(command: Command, error: OSError) -> MachineError:
+    """What to do where temporary files cannot be written."""
+    return MachineError(
+        f"Expected to write temporary files for the generator {command.name}, actual {error.strerror}; make room, or set "
+        "TMPDIR."
+    )
 
 
 def log_of(folder: Path, number: int) -> Path:

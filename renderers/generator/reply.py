@@ -38,7 +38,7 @@ def read(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
         Fault: it is another one.
     """
     if "error" in reply:
-        raise Fault(f"its render(scene) raised an error:\n{reply['error']}")
+        raise Fault(f"its render(scene) raised an error; mend the program:\n{reply['error']}")
     arrays, at = {}, 0
     try:
         for each in reply["arrays"]:

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 CHILD = """
@@ -26,7 +28,7 @@ keep = checkpoints.Keeper.__call__
 def keeping(self, said):
     line[0] = said
     keep(self, said)
-    if kind == signal.SIGINT:
+    if kind != signal.SIGKILL:
         at_once()
 
 def replacing(source, path):  # the worst moment: the log is ahead, the checkpoint written and not yet in its place
@@ -60,10 +62,11 @@ def test_killed_twice_it_goes_on_to_the_same_guide(call, discs, target, fitted, 
         assert (out / name).read_bytes() == (fitted / name).read_bytes(), name
 
 
-def test_interrupted_it_says_how_to_go_on_and_does(call, discs, target, fitted, tmp_path):
+@pytest.mark.parametrize("kind", ["SIGINT", "SIGTERM"])
+def test_interrupted_it_says_how_to_go_on_and_does(call, discs, target, fitted, tmp_path, kind):
     out = tmp_path / "a run"
     words = ["fit", discs.file, "--target", target.images, "--out", out, *discs.settings]
-    interrupted = child("SIGINT", "structure", 2, words)
+    interrupted = child(kind, "structure", 2, words)
     assert interrupted.returncode == 1 and "Traceback" not in interrupted.stderr
     last = interrupted.stderr.splitlines()[-1]
     assert last == f"Interrupted; go on with: {shlex.join(['probscene', *map(str, words), '--resume'])}"

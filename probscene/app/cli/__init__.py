@@ -5,7 +5,9 @@ Exit codes: 0; 2 where the input is at fault; 1 where the machine is, where the 
 
 import io
 import os
+import signal
 import sys
+from types import FrameType
 
 from ..memory import keep_freed_memory
 from . import fit_commands, model_commands, run_commands, trial_command
@@ -21,9 +23,24 @@ def main() -> None:
     # Torch's threads wait for one another spinning, which on a machine that has other work takes six times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()
+    _end_when_asked()
     try:
         app(prog_name="probscene")
     except KeyboardInterrupt:  # before or after a command's work
         code, text = explained(KeyboardInterrupt(), sys.argv[1:])
         print(text, file=sys.stderr)
         sys.exit(code)
+
+
+def _end_when_asked() -> None:
+    """Take the wish of a scheduler or of ``kill`` as Ctrl-C: what was begun is saved, and what runs is ended."""
+    process = os.getpid()
+
+    def end(number: int, _: FrameType | None) -> None:
+        if os.getpid() != process:  # a fork, which whoever started it ends
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+        signal.signal(number, signal.SIG_IGN)  # it may be sent more than once
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, end)

@@ -20,7 +20,7 @@ def generate(
         list[str] | None,
         typer.Option(
             metavar="FORMAT",
-            help="coco (if not given), yolo, kitti, webdataset, or images for no labels; again for more.",
+            help="coco (if not given), yolo, kitti, webdataset, depth, or images for no labels; again for more.",
         ),
     ] = None,
     seed: Seed = 0,

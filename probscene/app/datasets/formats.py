@@ -4,6 +4,7 @@
     yolo        labels/000000.txt ... and data.yaml
     kitti       Kitti/raw/training/ with image_2, label_2 and instance, and calib of 3D scenes
     webdataset  shard-000000.tar ..., images and labels together
+    depth       depth/000000.png ..., of renders that have it
     images      no labels
 
 All are written from the same renders and share ``images/``: KITTI's image files are hard links to those there, copies
@@ -14,8 +15,14 @@ from collections.abc import Callable, Iterable
 
 from probscene.errors import ProbsceneError
 
-FORMATS = ("coco", "yolo", "kitti", "webdataset", "images")
-_MARKS = {"coco": "annotations.json", "yolo": "data.yaml", "kitti": "Kitti", "webdataset": "shard-000000.tar"}
+FORMATS = ("coco", "yolo", "kitti", "webdataset", "depth", "images")
+_MARKS = {
+    "coco": "annotations.json",
+    "yolo": "data.yaml",
+    "kitti": "Kitti",
+    "webdataset": "shard-000000.tar",
+    "depth": "depth",
+}
 
 
 def chosen(format: str | Iterable[str]) -> tuple[str, ...]:
@@ -47,5 +54,5 @@ def found(exists: Callable[[str], bool]) -> tuple[str, ...]:
 
 def _normal(names: list[str]) -> tuple[str, ...]:
     """``images`` adds something to shards alone: the other formats have that folder anyway."""
-    implied = {"coco", "yolo", "kitti"} & set(names)
+    implied = {"coco", "yolo", "kitti", "depth"} & set(names)
     return tuple(name for name in FORMATS if name in names and not (name == "images" and implied))

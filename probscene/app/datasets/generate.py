@@ -30,7 +30,7 @@ from ..fitting.run import RunFolder
 from ..loading import renderer_for
 from ..workers.cluster import Cluster
 from ..workers.processes import spread
-from . import coco, kitti, shards, yolo
+from . import coco, depth, kitti, shards, yolo
 from .folder import LINES, UNSAID, WHOLE, DatasetFolder, Shard, check_begun
 from .formats import chosen
 from .places import place_at
@@ -86,7 +86,8 @@ def generate(
 
     Raises:
         ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
-            format, more classes or objects than KITTI's masks can number, another text for a shard.
+            format, more classes or objects than KITTI's masks can number, no depth where it is asked for, another text
+            for a shard.
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped. See also
@@ -187,6 +188,9 @@ class Job:
     ) -> Dataset:
         """Do what is missing of a shard by ``work(chunks, done)``; of the whole, then write the labels."""
         folder, made = self.folder, 0
+        if "depth" in self.formats and not folder.finished:  # before anything is written
+            first = draw_chunk(self.model, self.policy, self.origin["seed"], 0)
+            depth.files(self.model, self._renderer(first.drawing[:1]))
         chunks, num = folder.missing(shard), sum(map(folder.size, folder.of(shard)))
         before = num - sum(map(folder.size, chunks))
 
@@ -234,6 +238,9 @@ class Job:
         links, flat = {}, self.folder.flat
         if "yolo" in self.formats:
             files |= {yolo.label_name(i, flat): yolo.label(self.model, of_image[i]).encode() for i in of_image}
+        if "depth" in self.formats:
+            depths = depth.files(self.model, batch)
+            files |= {depth.file_name(i, flat): each for i, each in zip(of_image, depths, strict=True)}
         if "kitti" in self.formats:
             masks = kitti.instances(self.model, batch, first, self.min_visible)
             files |= {kitti.file_name("label_2", i): kitti.label(self.model, of_image[i]).encode() for i in of_image}

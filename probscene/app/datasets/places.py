@@ -22,10 +22,18 @@ PARTS = ".parts"
 
 
 def place_at(out: Path | str) -> "LocalPlace | RemotePlace":
-    """The place of a folder, or of an address with ``://``."""
+    """The place of a folder, or of an address with ``://``.
+
+    Raises:
+        ProbsceneError: an address that names no place.
+    """
     if "://" not in str(out):
         return LocalPlace(Path(out))
     scheme, _, path = str(out).partition("://")
+    if not path.strip("/"):
+        raise ProbsceneError(
+            f"Expected an address with a place, such as {scheme}://bucket/folder, actual {out}; add the place."
+        )
     return LocalPlace(Path(path)) if scheme == "file" else RemotePlace(str(out))
 
 

@@ -34,6 +34,7 @@ from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
 from .coco import check_min_visible, labelled
+from .depth import of as depth_of
 
 Sample = tuple[Tensor, dict[str, Any]]
 _ENDLESS = 1 << 20  # chunks of an epoch that has no end
@@ -47,7 +48,8 @@ class SceneDataset(IterableDataset):
     what is visible; ``area`` ``(n,)`` float32, its pixels; ``iscrowd`` ``(n,)`` int64 zeros; ``amodal_boxes``
     ``(n, 4)`` float32, boxes of the whole silhouettes, which others may cover and the canvas may cut; ``visible``
     ``(n,)`` float32, the visible fraction, see ``RenderBatch``; ``image_id``, an int. An image may have no object:
-    n = 0. What a generator does not tell of whole silhouettes is not in the target.
+    n = 0. Where renders have it, ``depth`` ``(H, W)`` float32 is metres along the camera's z, infinity where there is
+    sky. What a generator does not tell, of depth and of whole silhouettes, is not in the target.
 
     Worker processes start Taichi themselves: give the loader ``multiprocessing_context="spawn"``. Several ranks of a
     distributed training take seeds of their own.
@@ -159,7 +161,7 @@ class SceneDataset(IterableDataset):
 
     def _samples(self, model: SceneModel, batch: RenderBatch, first: int) -> Iterator[Sample]:
         images = as_written(model, batch.image)
-        category = labelled(model, batch, self.min_visible)
+        category, depth = labelled(model, batch, self.min_visible), depth_of(batch)
         for i, image in enumerate(images):
             nodes = category[i].nonzero()[:, 0]
             instance = batch.instance[i]
@@ -174,6 +176,8 @@ class SceneDataset(IterableDataset):
             whole = {"amodal_boxes": batch.amodal_box[i, nodes].float(), "visible": batch.visible[i, nodes]}
             unknown = {"amodal_boxes": "amodal_box"}
             target |= {key: value for key, value in whole.items() if unknown.get(key, key) not in batch.unknown}
+            if depth is not None:
+                target["depth"] = depth[i]
             yield image.expand(3, -1, -1).to(torch.float32, memory_format=torch.contiguous_format).div(255), target
 
     def _open(self) -> tuple[SceneModel, Policy]:

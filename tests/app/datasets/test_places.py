@@ -98,6 +98,12 @@ def test_an_unknown_kind_of_address(call, fitted, tmp_path):
     )
 
 
+@pytest.mark.parametrize("address", ["s3://", "s3:///", "memory://", "file://"])
+def test_an_address_without_a_place_is_an_error(call, fitted, address):
+    result = call("generate", fitted, "--num", 4, "--out", address)
+    assert result.code == 2 and f"Expected an address with a place, such as {address[:4]}" in result.err
+
+
 def test_rights_that_are_lacking(monkeypatch, run):
     place = RemotePlace("memory://nowhere/out")
 

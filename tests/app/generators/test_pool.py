@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -130,9 +131,9 @@ def test_a_scene_that_always_fails_is_named_with_what_was_raised_and_printed(dra
 @pytest.mark.parametrize(
     ("name", "settings", "said"),
     [
-        ("gone", {"attempts": 1}, "status 1; it had not called serve\nThe end of what it printed:\nno licence"),
+        ("gone", {"attempts": 1}, "status 1; it had not called serve; run its argv by hand\nThe end of what it printed:\nno licence"),
         ("silent", {"attempts": 1, "start_timeout": 1.0}, "serve 1 seconds after it was started; raise start_timeout="),
-        ("hang", {"attempts": 1, "timeout": 1.0}, "had drawn nothing after 1 seconds"),
+        ("hang", {"attempts": 1, "timeout": 1.0}, "had drawn nothing after 1 seconds; raise timeout= of its Command where"),
         ("garbage", {"attempts": 1}, r"expected image as uint8 \(32, 40, 3\), actual uint8 \(1,\)"),
         ("crash", {"attempts": 1}, "was ended by SIGABRT"),
         ("", {"version": "2"}, "version '2' of the generator draw_boxes.py, actual ''"),
@@ -157,46 +158,45 @@ def test_a_program_that_is_not_there_or_speaks_otherwise(request_of, tmp_path):
         GeneratedRenderer(Command([sys.executable, str(stranger)]), (32, 40))(request)
 
 
-def test_the_processes_end_with_their_parent(command, running):
-    """Also where it is killed, and has no time to end them."""
-    code = f"""
-import os, sys
-from probscene.generator import Command
-from probscene.renderers.generator.pool import pool_for
-pool = pool_for(Command({command().argv!r}), 1)
-pool.draw([{{"height": 4, "width": 4, "seed": 1, "values": {{}}, "nodes": []}}])
-print(pool.processes()[0], flush=True)
-os.kill(os.getpid(), 9)
-"""
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    worker, end = int(told.stdout), time.monotonic() + 10
-    while time.monotonic() < end:
-        if not running(worker):
-            return
-        time.sleep(0.1)
-    pytest.fail("the worker still runs")
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
-@pytest.mark.parametrize("end", ["start_timeout", "interrupt"])
-def test_programs_that_never_call_end_with_their_parent(end, tmp_path):
+@pytest.mark.parametrize(
+    ("end", "program"),
+    [
+        ("start_timeout", "silent"), ("interrupt", "silent"), ("interrupt", "hang"), ("SIGTERM", "hang"),
+        ("SIGKILL", "serve"), ("SIGKILL", "silent"), ("SIGKILL", "hang"),
+    ],
+)  # fmt: skip
+def test_all_ends_with_the_parent(end, program, command, tmp_path):
+    """Also where it is killed, and has no time to end anything, and whatever the programs are doing."""
+    argv = [*command().argv, str(tmp_path)]
+    ending = {
+        "start_timeout": "time.sleep(0)",
+        "interrupt": "signal.raise_signal(signal.SIGINT)",
+        "SIGTERM": "signal.raise_signal(signal.SIGTERM)",
+        "SIGKILL": "signal.raise_signal(signal.SIGKILL)",
+    }[end]
     code = f"""
-import signal
+import signal, threading, time
 from probscene.generator import Command
 from probscene.renderers.generator.pool import pool_for
-argv = [{sys.executable!r}, "-c", "import time; time.sleep(1000)", {str(tmp_path)!r}]
-signal.signal(signal.SIGALRM, signal.default_int_handler)
-if {end == "interrupt"}:
-    signal.setitimer(signal.ITIMER_REAL, 1.5)
-scene = {{"height": 4, "width": 4, "seed": 1, "values": {{}}, "nodes": []}}
-pool_for(Command(argv, start_timeout={60 if end == "interrupt" else 1}), 2).draw([scene] * 6)
+pool = pool_for(Command({argv!r}, start_timeout={60 if end != "start_timeout" else 0.5}), 2)
+scene = {{"height": 4, "width": 4, "seed": 3, "values": {{"light": 1}}, "nodes": []}}
+print(pool.folder, flush=True)
+drawing = threading.Thread(target=pool.draw, args=([scene] * 2,), daemon=True)
+drawing.start()
+drawing.join(1.5)
+{ending}
 """
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    left = processes_with(str(tmp_path))
+    environment = {**os.environ, "TEST_FAULT": program, "TEST_MARK": str(tmp_path)}
+    told = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    folder, until = told.stdout.strip(), time.monotonic() + 10
+    while (left := processes_with(str(tmp_path)) + processes_with(folder)) and time.monotonic() < until:
+        time.sleep(0.1)
     for process in left:
         os.kill(process, signal.SIGKILL)
-    said = "KeyboardInterrupt" if end == "interrupt" else "had not called serve 1 seconds after"
-    assert said in told.stderr and not left
+    assert folder and not left and not os.path.exists(folder)
 
 
 def processes_with(word):
@@ -307,6 +307,43 @@ def test_another_command_has_pictures_of_its_own(drawn, request_of, tmp_path, fa
     fault("always")
     with pytest.raises(GeneratorError, match="never any mesh"):
         drawn(request, keep=tmp_path, files=(__file__,), attempts=1)
+
+
+def test_where_temporary_files_find_no_room(command):
+    pool = pool_for(command(attempts=1), 0)
+    shutil.rmtree(pool.folder)
+    pool.grow(1)
+    with pytest.raises(MachineError, match="temporary files for the generator draw_boxes.py, actual .*; make room, or"):
+        pool.draw([{"height": 4, "width": 4, "seed": 1, "values": {}, "nodes": []}])
+
+
+def test_a_pool_is_closed_while_a_fork_of_its_process_runs(command, running):
+    pool = pool_for(command(), 1)
+    pool.draw([{"height": 4, "width": 4, "seed": 1, "values": {"light": 1}, "nodes": []}])
+    group, fork = pool.processes()[0], os.fork()
+    if fork == 0:
+        time.sleep(60)
+        os._exit(0)
+    try:
+        pool.close()
+        assert not running(group) and not pool.folder.exists()
+    finally:
+        os.kill(fork, signal.SIGKILL)
+        os.waitpid(fork, 0)
+
+
+def test_a_guard_that_is_ended_changes_nothing(drawn, request_of, command, running, fresh):
+    request = request_of(6)
+    whole = drawn(request)
+    fresh()
+    drawn(request[:1])
+    pool = pool_for(command(), 2)
+    for process in processes_with(str(pool.folder)):
+        os.kill(process, signal.SIGKILL)
+    assert same(drawn(request, restart_after=None), whole)
+    workers = pool.processes()
+    fresh()
+    assert not any(running(group) for group in workers)
 
 
 def test_a_folder_that_cannot_be_written_is_named(drawn, request_of, tmp_path):

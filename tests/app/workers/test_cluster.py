@@ -110,12 +110,15 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
     def disturbed(crew, tasks, done):
         def each(result):
             parts.append(result)
-            if len(parts) == 5:
+            if len(parts) == 4:
                 simulated.kill()
+            if len(parts) == 7:
+                simulated.freeze()
             done(result)
 
         return run(crew, tasks, each)
 
+    monkeypatch.setattr(crews, "LATE", 2.0)
     monkeypatch.setattr(crews.Crew, "run", disturbed)
     result = call(*words, "--out", tmp_path / "out", "--cluster", simulated.address)
     assert result.code == 0, result.err

@@ -1,0 +1,83 @@
+"""A process that outlives a pool whose own was killed, and does what this had no time for: it ends the workers, also
+those that never called, and removes the pool's folder.
+
+It is this file run as a script, in the standard library alone.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+END = "end"
+
+
+class Guard:
+    """Knows which workers run.
+
+    Args:
+        folder: removed when the guard ends.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", __file__, str(folder)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            text=True,
+        )
+
+    def started(self, pid: int) -> None:
+        """A worker, the first of its process group, is to be ended as well."""
+        self._tell(f"+{pid}")
+
+    def ended(self, pid: int) -> None:
+        """A worker need not be ended any more."""
+        self._tell(f"-{pid}")
+
+    def close(self) -> None:
+        """End the workers that run, and remove the folder."""
+        self._tell(END)  # a fork of this process may hold the pipe open
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        self._process.wait()
+        shutil.rmtree(self._folder, ignore_errors=True)  # where the guard was killed
+
+    def _tell(self, line: str) -> None:
+        assert self._process.stdin is not None
+        with suppress(OSError, ValueError):  # it is gone, or closed: the pool ends its workers itself
+            print(line, file=self._process.stdin, flush=True)
+
+
+def kill_group(pid: int) -> None:
+    """End a process and its group."""
+    kill = os.killpg if hasattr(os, "killpg") else os.kill
+    with suppress(OSError):  # it has ended
+        kill(pid, getattr(signal, "SIGKILL", signal.SIGTERM))
+
+
+def watch(folder: str, lines: Iterable[str]) -> None:
+    """Know which workers run until ``END``, or until the process that writes the lines has ended; then end these."""
+    running = set()
+    for line in lines:
+        if line.strip() == END:
+            break
+        (running.add if line[0] == "+" else running.discard)(int(line[1:]))
+    for pid in running:
+        kill_group(pid)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    watch(sys.argv[1], sys.stdin)
