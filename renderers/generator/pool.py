@@ -1,8 +1,8 @@
 """As many processes of one ``Command`` as are asked for, shared by all who draw with it in this process.
 
 A scene goes to whichever worker is free; what it draws does not depend on which. A worker that fails is killed with all
-that it has started, and the scene tried again by a fresh one. At the end of this process all are ended, by a guard where
-this was killed.
+that it has started, and the scene tried again by a fresh one. At the end of this process all are ended, by a guard
+where it was killed.
 """
 
 import os

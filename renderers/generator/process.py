@@ -177,8 +177,8 @@ class Process:
 def no_room(command: Command, error: OSError) -> MachineError:
     """What to do where temporary files cannot be written."""
     return MachineError(
-        f"Expected to write temporary files for the generator {command.name}, actual {error.strerror}; make room, or set "
-        "TMPDIR."
+        f"Expected to write temporary files for the generator {command.name}, actual {error.strerror}; make room, or "
+        "set TMPDIR."
     )
 
 

@@ -263,7 +263,8 @@ def test_other_formats_leave_a_dataset_as_it_is(model, out):
 
 @pytest.mark.parametrize("format", ["voc", ("coco", "voc"), "coco,voc", "", "coco,", ()])
 def test_an_unknown_format_is_one_error_that_names_them(model, tmp_path, format):
-    with pytest.raises(ProbsceneError, match="among coco, yolo, kitti, webdataset, depth, images, actual ('(voc)?'|none)"):
+    names = "coco, yolo, kitti, webdataset, depth, images"
+    with pytest.raises(ProbsceneError, match=f"among {names}, actual ('(voc)?'|none)"):
         generate_scenes(model, model.prior, 1, tmp_path / "out", format=format)
     assert not (tmp_path / "out").exists()
 

@@ -131,9 +131,9 @@ def test_a_scene_that_always_fails_is_named_with_what_was_raised_and_printed(dra
 @pytest.mark.parametrize(
     ("name", "settings", "said"),
     [
-        ("gone", {"attempts": 1}, "status 1; it had not called serve; run its argv by hand\nThe end of what it printed:\nno licence"),
+        ("gone", {"attempts": 1}, "serve; run its argv by hand\nThe end of what it printed:\nno licence"),
         ("silent", {"attempts": 1, "start_timeout": 1.0}, "serve 1 seconds after it was started; raise start_timeout="),
-        ("hang", {"attempts": 1, "timeout": 1.0}, "had drawn nothing after 1 seconds; raise timeout= of its Command where"),
+        ("hang", {"attempts": 1, "timeout": 1.0}, "nothing after 1 seconds; raise timeout= of its Command where"),
         ("garbage", {"attempts": 1}, r"expected image as uint8 \(32, 40, 3\), actual uint8 \(1,\)"),
         ("crash", {"attempts": 1}, "was ended by SIGABRT"),
         ("", {"version": "2"}, "version '2' of the generator draw_boxes.py, actual ''"),
