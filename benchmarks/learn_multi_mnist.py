@@ -4,8 +4,8 @@
 
 The images are drawn here with numpy and OpenCV from the digits of t10k (the original IDX files), which the model does
 not have; the fit sees the folder alone. Printed is the total variation of the number of digits and of their classes
-between 20,000 learnt structures and the distributions that the target was drawn from. Runs of one preset and seed share
-their feature network, which depends on nothing else.
+between 20,000 learnt structures and the distributions that the target was drawn from, and of the labels of 5,000 images
+that ``generate`` writes. Runs of one preset and seed share their feature network, which depends on nothing else.
 """
 
 import argparse
@@ -22,6 +22,7 @@ import torch
 from given import mnist_option, needed_mnist, out_option
 
 from probscene.app.api.fit import fit
+from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
@@ -45,6 +46,7 @@ PRESETS = {
     "oracle": QUICK,
 }
 ORACLE_BATCHES = 100
+GENERATED = 5000  # images
 
 
 def distributions(target: int) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +82,22 @@ def distances(policy, target: int) -> tuple[float, float]:
     """Total variation of number and of classes between 20,000 structures and the truth."""
     seed_everything(99)
     derivation, _ = derive_complete(GRAMMAR, policy, 20_000, MODEL.max_steps)
-    seen = derivation.counts(len(GRAMMAR.kinds))[:, [GRAMMAR.kind(name) for name in CLASSES]].numpy()
+    return from_truth(
+        derivation.counts(len(GRAMMAR.kinds))[:, [GRAMMAR.kind(name) for name in CLASSES]].numpy(), target
+    )
+
+
+def distances_generated(policy, target: int, folder: Path) -> tuple[float, float]:
+    """The same between the labels of images that are generated and the truth."""
+    generate_scenes(MODEL, policy, GENERATED, folder, seed=5)
+    seen = np.zeros((GENERATED, len(CLASSES)), int)
+    for label in json.loads((folder / "annotations.json").read_text())["annotations"]:
+        seen[label["image_id"], label["category_id"] - 1] += 1
+    return from_truth(seen, target)
+
+
+def from_truth(seen: np.ndarray, target: int) -> tuple[float, float]:
+    """Total variation of number and of classes between counts ``(N, 10)`` and the truth."""
     number, share = distributions(target)
     lengths = np.bincount(seen.sum(1), minlength=32) / len(seen)
     number = np.pad(number, (0, len(lengths) - len(number)))
@@ -141,16 +158,23 @@ def main():
             else:
                 guide, took = fit_images(name, target, args.seed, args)
             after = distances(guide, target)
-            rows.append({"preset": name, "target": target, "prior": before, "learnt": after, "seconds": took})
+            made = distances_generated(guide, target, args.out / f"{name}-{target}-generated")
+            rows.append({"preset": name, "target": target, "prior": before, "learnt": after})
+            rows[-1] |= {"generated": made, "seconds": took}
             print(json.dumps(rows[-1]), flush=True)
             write_json(args.out / "results.json", rows)
-    print(f"\n{'preset':12} {'number: prior':>14} {'learnt':>8} {'classes: prior':>15} {'learnt':>8}   each target")
+    head = [
+        f"{'preset':12}",
+        *(f"{what}: {'prior':>8} {'learnt':>8} {'generated':>10}" for what in ("number", "classes")),
+    ]
+    print("\n" + " ".join(head) + "   each target")
     for name in args.presets:
         mine = [row for row in rows if row["preset"] == name]
-        prior, learnt = (np.array([row[key] for row in mine]) for key in ("prior", "learnt"))
-        each = "  ".join(f"{n:.3f}/{c:.3f}" for n, c in learnt)
-        n, c = learnt.mean(0)
-        print(f"{name:12} {prior[:, 0].mean():14.3f} {n:8.3f} {prior[:, 1].mean():15.3f} {c:8.3f}   {each}")
+        prior, learnt, made = (np.array([row[key] for row in mine]) for key in ("prior", "learnt", "generated"))
+        means = zip(prior.mean(0), learnt.mean(0), made.mean(0), strict=True)
+        text = " ".join(f"{p:16.3f} {q:8.3f} {g:10.3f} " for p, q, g in means)
+        each = zip(learnt, made, strict=True)
+        print(f"{name:12} {text}  " + "  ".join(f"{n:.3f}/{c:.3f} {a:.3f}/{b:.3f}" for (n, c), (a, b) in each))
 
 
 if __name__ == "__main__":
