@@ -258,12 +258,30 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
                 for site in "xyzwuv"
             }
 
-    def rows(mean, number):
-        return mean + torch.randn(number, 2), torch.arange(number) // 3
-
     images = {name: torch.zeros(0) for name in ("learnt", "without", "prior", "target")}
     assert judged.passed(Learning(), images, careful=True) == {"y", "z", "w", "u"}
     assert judged.passed(Learning(), images, careful=False) == {"w", "u"}
+
+
+def rows(mean, number):
+    """What is read of a site, three times in each image."""
+    return mean + torch.randn(number, 2), torch.arange(number) // 3
+
+
+def test_of_many_sites_none_is_learnt_by_chance():
+    """Of forty learnt renders are as far away as the prior's; of one they are nearer, which is seen all the same."""
+
+    class Learning:
+        tried = SimpleNamespace(unclear=frozenset())
+
+        def site_rows(self, images):
+            torch.manual_seed(0)
+            means = {"learnt": -0.5, "prior": 0.5, "target": 0.0}
+            nothing = {f"n{i}": {name: rows(means[name], 120) for name in images} for i in range(40)}
+            return nothing | {"x": {name: rows(float(name == "prior"), 120) for name in images}}
+
+    images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
+    assert judged.passed(Learning(), images, careful=True) == {f"n{i}" for i in range(40)}
 
 
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])

@@ -12,7 +12,7 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from probscene.inference.guides.base import Guide
-from probscene.inference.judging.farther import Farther, farther
+from probscene.inference.judging.farther import SURE, Farther, farther
 from probscene.inference.judging.two_sample import Features
 from probscene.inference.parameters.best import HeldOut, useless
 from probscene.inference.parameters.guide import ParameterGuide
@@ -108,22 +108,28 @@ def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool
     """Sites that keep their prior, by what is read in learnt renders, in the prior's and in the target: those of which
     learnt renders are surely farther from the target; where one is careful, those of which they are not surely nearer,
     as there is nothing to be learnt of them, or it was not. What is read of unclear sites is mostly what other sites
-    make of it: they are learnt where renders with the other learnt sites alone, ``"without"``, are surely farther."""
+    make of it: they are learnt where renders with the other learnt sites alone, ``"without"``, are surely farther. All
+    sites together keep to the chance of a mistake that one comparison has: with thirty of them, three would be nearer
+    by chance."""
+    read, unclear = learning.site_rows(images), learning.tried.unclear
+    chance = (1 - SURE) / max(1, len(read))
 
     def passes(of: dict[str, tuple[Tensor, Tensor]], unclear: bool) -> bool:
         if careful or unclear:
-            return not _surely_nearer(of["learnt"], of["without" if unclear else "prior"], of["target"])
-        return _surely_nearer(of["prior"], of["learnt"], of["target"])
+            return not _nearer(chance, of["learnt"], of["without" if unclear else "prior"], of["target"])
+        return _nearer(1 - SURE, of["prior"], of["learnt"], of["target"])
 
-    read, unclear = learning.site_rows(images), learning.tried.unclear
     return frozenset(name for name, of in read.items() if passes(of, name in unclear))
 
 
-def _surely_nearer(*sources: tuple[Tensor, Tensor]) -> bool:
-    """Whether the first rows are surely nearer to the last ones than the second are."""
+def _nearer(chance: float, *sources: tuple[Tensor, Tensor]) -> bool:
+    """Whether the first rows are nearer to the last ones than the second are, but for so small a chance."""
     learnt, prior, target = (rows.double().numpy() for rows, _ in sources)
     of = tuple(image.numpy() for _, image in sources)
-    return min(map(len, of)) > 0 and farther(prior, learnt, target, images=(of[1], of[0], of[2])).sure
+    if not min(map(len, of)):
+        return False
+    apart = farther(prior, learnt, target, images=(of[1], of[0], of[2]))
+    return apart.one > apart.other and apart.share >= 1 - chance
 
 
 def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
