@@ -106,7 +106,7 @@ class Crew:
             if self._longest:
                 for member in self._overdue():
                     again(member)
-            if not self._longest and time.monotonic() - begun > START and not self._prepared():
+            if not self._longest and time.monotonic() - begun > START and not self._there():
                 raise MachineError(
                     f"Expected an actor on the cluster at {self.cluster.address} within {START:g} s, actual none; "
                     "most often other jobs hold its cores. Wait for them, or add nodes."
@@ -222,8 +222,9 @@ class Crew:
                 )
         return found
 
-    def _prepared(self) -> bool:
-        return any(isinstance(member.asked, int) or member.answer is None for member in self._members)
+    def _there(self) -> bool:
+        """Whether an actor has answered; what it prepares may take long where its cores have other work."""
+        return any(member.asked != "versions" or member.answer is None for member in self._members)
 
 
 def first_line(error: Exception, word: str = "") -> str:
