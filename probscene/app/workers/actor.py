@@ -7,6 +7,7 @@ from typing import Any
 
 import probscene
 from probscene.errors import ProbsceneError
+from probscene.renderers.generator.pool import close_pools
 from probscene.threads import use_threads
 
 DECIDING = ("torch", "numpy", "taichi", "pyro-ppl", "opencv-python-headless")
@@ -36,6 +37,10 @@ class Actor:
             self._work = prepare(*arguments)
 
         return _answer(work)
+
+    def close(self) -> None:
+        """End the generators that were started here."""
+        close_pools()
 
     def do(self, task: Any) -> tuple[str, Any]:
         work = self._work

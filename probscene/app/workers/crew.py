@@ -19,6 +19,7 @@ LOOK = 2.0  # seconds from one look at the nodes to the next
 START = 180.0  # seconds in which the first actor has to be there
 ATTEMPTS = 3  # actors that may die with a task before it is an error
 WAIT = 0.5  # seconds
+CLOSE = 5.0  # seconds in which an actor can put its things in order
 SHARED = "Nodes have to see the run's folder, its files and --out by the same paths as this machine."
 
 
@@ -113,7 +114,10 @@ class Crew:
                 )
 
     def close(self) -> None:
-        """End the actors."""
+        """End the actors; those that have nothing to do leave no files."""
+        idle = [member.handle.close.remote() for member in self._members if member.answer is None]
+        if idle:
+            self.ray.wait(idle, num_returns=len(idle), timeout=CLOSE)
         for member in self._members:
             self.ray.kill(member.handle, no_restart=True)
         self._members.clear()

@@ -3,9 +3,11 @@
 import errno
 import os
 import socket
+import sys
 import time
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -18,6 +20,8 @@ from probscene.app.workers import cluster as clusters
 from probscene.app.workers import crew as crews
 from probscene.app.workers.cluster import Cluster
 from probscene.errors import MachineError, ModelError, ProbsceneError
+from probscene.generator import Command
+from probscene.renderers.generator.pool import pool_for
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
@@ -52,6 +56,13 @@ def slow():
     """The work of a crew whose preparation takes its time."""
     time.sleep(4)
     return doubling()
+
+
+def drawing(argv):
+    """Work that starts a generator; it gives the folder of its pool."""
+    pool = pool_for(Command(argv), 1)
+    pool.draw([{"height": 4, "width": 4, "seed": 1, "values": {"light": 1}, "nodes": []}])
+    return lambda task: str(pool.folder)
 
 
 def contents(folder):
@@ -144,6 +155,15 @@ def test_an_actor_that_prepares_itself_for_long_is_waited_for(nodes, monkeypatch
             crew.run([1], lambda result: None)
     crew.run([1, 2], found.append)
     assert sorted(found) == [(1, 2), (2, 4)]
+
+
+def test_generators_that_nodes_have_started_leave_no_files(nodes):
+    argv = [sys.executable, str(Path(__file__).parents[1] / "generators" / "draw_boxes.py")]
+    crew, folders = nodes.crew(drawing, (argv,)), []
+    crew.run(range(3), folders.append)
+    assert len(folders) == 3 and any(map(os.path.exists, folders))
+    crew.close()
+    assert not any(map(os.path.exists, folders))
 
 
 def test_what_a_task_raises_is_told_with_its_node(nodes):
