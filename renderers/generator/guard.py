@@ -62,9 +62,11 @@ class Guard:
 
 def kill_group(pid: int) -> None:
     """End a process and its group."""
-    kill = os.killpg if hasattr(os, "killpg") else os.kill
     with suppress(OSError):  # it has ended
-        kill(pid, getattr(signal, "SIGKILL", signal.SIGTERM))
+        if hasattr(os, "killpg") and hasattr(signal, "SIGKILL"):
+            os.killpg(pid, signal.SIGKILL)
+        else:
+            os.kill(pid, signal.SIGTERM)
 
 
 def watch(folder: str, lines: Iterable[str]) -> None:
