@@ -62,6 +62,16 @@ def learn_generator(result: dict) -> Rows:
     return rows
 
 
+def learn_labelled(result: dict) -> Rows:
+    """A row for each source and class, total variation and Wasserstein-1; a column for each seed, and their mean."""
+    seeds, rows = result["rows"], [["", *(f"seed {row['seed']}" for row in result["rows"]), "mean"]]
+    for name, sources in seeds[0]["distances"].items():
+        for source in sources:
+            each = [row["distances"][name][source] for row in seeds]
+            rows.append([f"{name}, {source}", *(f"{tv:.2f}, {w1:.2f}" for tv, w1 in (*each, np.mean(each, 0)))])
+    return rows
+
+
 def _of_site(site: dict | None) -> str:
     if site is None:
         return ""
@@ -88,6 +98,7 @@ def _figure(figure: dict) -> str:
 TABLES: dict[str, Callable[[dict], Rows]] = {
     "ablate": ablate,
     "learn_generator": learn_generator,
+    "learn_labelled": learn_labelled,
     "learn_looks": learn_looks,
 }
 

@@ -8,6 +8,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+LONG = ("test_cluster.py", "test_docs.py", "test_pretrained_fit.py", "test_parameters.py")  # minutes each
+
 torch.set_num_threads(1)
 settings.register_profile(
     "probscene",
@@ -17,6 +19,11 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],  # both judge the machine's load, too
 )
 settings.load_profile("probscene")
+
+
+def pytest_collection_modifyitems(items):
+    """Long files first, so that no worker is left with one while the other has nothing to do."""
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
 
 
 @pytest.fixture(autouse=True)

@@ -12,9 +12,11 @@ SIMULATED = Path(__file__).parents[3] / "benchmarks" / "simulated_cluster.py"
 @pytest.fixture(scope="module")
 def _simulated():
     pytest.importorskip("ray")
-    simulated = import_file(SIMULATED).Simulated()
-    yield simulated
-    simulated.shutdown()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")  # 15 otherwise: other tests on the same cores would go before
+        simulated = import_file(SIMULATED).Simulated()
+        yield simulated
+        simulated.shutdown()
 
 
 @pytest.fixture
