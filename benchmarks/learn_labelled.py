@@ -5,8 +5,8 @@
 
 Each seed draws ``--number`` of the images at random, fits with their counts, and is judged by the labels of all others.
 With ``--among`` the labelled images are drawn from those whose name matches, such as those of one place; the fit then
-has these few and all that do not match, by which it is judged. With ``--number 0`` no image has a label. LABELS is a CSV
-of counts, COCO's JSON, or KITTI's ``label_2``, of all images. Structure alone is learnt.
+has these few and all that do not match, by which it is judged. With ``--number 0`` no image has a label. LABELS is a
+CSV of counts, COCO's JSON, or KITTI's ``label_2``, of all images. Structure alone is learnt.
 
 Printed for each class are total variation and Wasserstein-1 from the labels, of the prior, the start, what was learnt,
 the histogram of the labelled few alone, and the floor: as many labels drawn anew, the mean of 200 times. FOLDER holds
