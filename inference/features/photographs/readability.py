@@ -5,7 +5,8 @@ believed where heads that agree on renders agreed on the photographs too, before
 counts right on renders that nothing was trained on, and where those rules read about as much as each other. With labels
 the rule is that with the least error on them, a little held by its error on renders, as ten labels alone would choose
 among many rules by luck; where they bear out what is read without them, nothing changes. Where the other labels'
-histogram predicts a label better than any rule does, that histogram is what is learnt.
+histogram predicts a label better than any rule does, that histogram is what is learnt; as well where the rule reads
+another number in the images without labels, as in those of another place, where it may not hold.
 
 Axis letters: L photographs, V renders, K labelled images, S scopes, R rules, C classes.
 """
@@ -165,7 +166,8 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     if free.readable and without <= MUCH * min(error, histogram) + LITTLE and abs(off.mean()) <= surely + LITTLE:
         because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image; {figures})"
         return free._replace(by="labels", error=without, because=because)
-    if error <= MUCH * histogram + LITTLE:
+    unlike = _unlike(seen[:, scope, rule], read.photographs[:, scope, rule, c].double().numpy())
+    if error <= MUCH * histogram + LITTLE and unlike is None:
         found = read.photographs[:, scope, rule, c]
         because = (
             f"readable by {len(y)} labels, {float(found.mean()):.1f} an image by {RULES[rule]}, of objects from "
@@ -187,10 +189,25 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
         )
         return free._replace(error=error, because=because)
     steps = _steps(read.photographs[:, scope, 0, c].double().numpy(), y)
-    because = f"the histogram of {len(y)} labels is learnt, {mean:.1f} an image: no rule reads them better ({figures})"
+    why = f"no rule reads them better ({figures})"
+    if unlike is not None:
+        here, there = unlike
+        why = f"the best rule reads {here:.1f} in these images and {there:.1f} in the others; label some of those"
+    because = f"the histogram of {len(y)} labels is learnt, {mean:.1f} an image: {why}"
     return free._replace(
         readable=True, by="histogram", rules=(0,), scope=scope, mean=mean, error=error, steps=steps, because=because
     )
+
+
+def _unlike(labelled: Array, photographs: Array) -> tuple[float, float] | None:
+    """The mean of what is read in the labelled photographs and in the others, where these differ beyond chance."""
+    number = len(photographs) - len(labelled)
+    if not number:
+        return None
+    mean = (photographs.sum() - labelled.sum()) / number
+    square = ((photographs**2).sum() - (labelled**2).sum()) / number
+    error = math.sqrt(labelled.var(ddof=1) / len(labelled) + max(0.0, square - mean**2) / number)
+    return (labelled.mean(), mean) if abs(labelled.mean() - mean) > BIASED * error else None
 
 
 def _choose(seen: Array, labels: Array, drawn: Array) -> tuple[int, int]:

@@ -186,6 +186,17 @@ def test_the_labels_histogram_is_learnt_where_nothing_reads_them():
     assert counts.mean().item() == pytest.approx(labels.mean().item(), abs=0.35)
 
 
+def test_labels_of_another_place_choose_no_rule():
+    """In the images without labels three more are read by every rule, and rules differ: what the labels say of a rule
+    does not hold there. Of images drawn from all it does."""
+    elsewhere = np.where(np.arange(len(COUNTS)) < 12, COUNTS, COUNTS + 3)
+    labels = torch.from_numpy(COUNTS[:12])
+    found = with_labels(made(COUNTS[:12], 4 * elsewhere, ramp=1.0), 0, labels)
+    assert found.by == "histogram" and found.mean == pytest.approx(labels.mean().item())
+    assert found.because.endswith("the best rule reads 2.1 in these images and 4.9 in the others; label some of those")
+    assert with_labels(made(COUNTS[:12], 4 * COUNTS, ramp=1.0), 0, labels).by == "labels"
+
+
 def test_labels_that_do_not_go_with_what_is_seen_are_not_used():
     """Half of the objects, and not those of the fuller images: not all are labelled."""
     labels = torch.from_numpy(np.random.default_rng(3).permutation(COUNTS[:12]) / 2).round()
