@@ -64,11 +64,13 @@ def learn_generator(result: dict) -> Rows:
 
 def learn_labelled(result: dict) -> Rows:
     """A row for each source and class, total variation and Wasserstein-1; a column for each seed, and their mean."""
-    seeds, rows = result["rows"], [["", *(f"seed {row['seed']}" for row in result["rows"]), "mean"]]
-    for name, sources in seeds[0]["distances"].items():
-        for source in sources:
+    seeds, sources = result["rows"], ("prior", "start", "learnt", "labels alone", "floor")
+    rows: Rows = [["total variation, Wasserstein-1", *(f"seed {row['seed']}" for row in seeds), "mean"]]
+    for name, distances in seeds[0]["distances"].items():
+        for source in (source for source in sources if source in distances):
             each = [row["distances"][name][source] for row in seeds]
-            rows.append([f"{name}, {source}", *(f"{tv:.2f}, {w1:.2f}" for tv, w1 in (*each, np.mean(each, 0)))])
+            said = {"labels alone": "the labelled few alone", "floor": "as many labels drawn anew"}.get(source, source)
+            rows.append([f"{name}, {said}", *(f"{tv:.2f}, {w1:.2f}" for tv, w1 in (*each, np.mean(each, 0)))])
     return rows
 
 
