@@ -6,8 +6,9 @@ Structures of Aerial 2D, with true counts of roads and of cars by road instead o
 distribution is learnt, and not how images are read. The search draws step size, steps a batch, baseline and number of
 batches, the same for all fits, with each one's default among them. All are tried on one target with half the batches,
 the better third on another with all of them; both have other distributions than the paper's target, on which the
-winner and the default settings are then fitted. Printed are the total variation of 20,000 structures from the target's
-distributions, and log q of 5,000 others, nats. The row ``best-pcfg`` has the rule frequencies of the target's own
+winner and the default settings are then fitted. Settings whose fit fails, as by scenes that no longer end, are out.
+Printed are the total variation of 20,000 structures from the target's distributions, and log q of 5,000 others, nats.
+The row ``best-pcfg`` has the rule frequencies of the target's own
 structures, which no context-free grammar beats in likelihood, and ``best-pcfg, bounded`` the weights of maximum
 likelihood where lists end at the longest that the model declares, as they do in all fits. FOLDER holds
 ``results.json``, every fit; an interrupted search goes on.
@@ -15,6 +16,7 @@ likelihood where lists end at the longest that the model declares, as they do in
 
 import argparse
 import json
+import math
 import time
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -32,6 +34,7 @@ from probscene.app.fitting.presets import DEFAULT
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
+from probscene.errors import ProbsceneError
 from probscene.inference.guides.base import Guide
 from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.pcfg import PCFG
@@ -164,7 +167,11 @@ class Search:
 
         def score(settings: Settings, target: int, share: float) -> float:
             short = replace(settings, batches=max(1, round(share * settings.batches)))
-            row = self.row(fit, short, target, 0)
+            try:
+                row = self.row(fit, short, target, 0)
+            except ProbsceneError as error:
+                print(f"{fit}: {short} fails: {error}", flush=True)
+                return math.inf
             return sum(row[column] for column in SCORE)
 
         every = drawn(fit, draws)
