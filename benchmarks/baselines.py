@@ -8,10 +8,9 @@ batches, the same for all fits, with each one's default among them. All are trie
 the better third on another with all of them; both have other distributions than the paper's target, on which the
 winner and the default settings are then fitted. Settings whose fit fails, as by scenes that no longer end, are out.
 Printed are the total variation of 20,000 structures from the target's distributions, and log q of 5,000 others, nats.
-The row ``best-pcfg`` has the rule frequencies of the target's own
-structures, which no context-free grammar beats in likelihood, and ``best-pcfg, bounded`` the weights of maximum
-likelihood where lists end at the longest that the model declares, as they do in all fits. FOLDER holds
-``results.json``, every fit; an interrupted search goes on.
+The row ``best-pcfg`` has the rule frequencies of the target's own structures, which no context-free grammar beats in
+likelihood, and ``best-pcfg, bounded`` the weights of maximum likelihood where lists end at the longest that the model
+declares, as they do in all fits. FOLDER holds ``results.json``, every fit; an interrupted search goes on.
 """
 
 import argparse
