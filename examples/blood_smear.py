@@ -3,8 +3,8 @@
     python examples/blood_smear.py PHOTOGRAPHS --out beside.png     # photographs above, scenes of the prior below
     probscene fit examples/blood_smear.py --target PHOTOGRAPHS --out runs/blood
 
-PHOTOGRAPHS is a folder of images of 640 x 480 pixels in which a red cell is about 100 across. Colours were taken from
-looking at them and sizes from boxes; how many cells the prior has is a guess. ``docs/blood.md`` goes on from here.
+PHOTOGRAPHS is a folder of images of 640 x 480 pixels in which a red cell is about 100 across. Colours and sizes were
+taken from looking at them; how many cells the prior has is a guess. ``docs/blood.md`` goes on from here.
 """
 
 import argparse
@@ -32,7 +32,7 @@ PRIOR = ps.StructurePrior(
     GRAMMAR, Reds=ps.counts(*[1] * 41), Whites=ps.counts(1, 1, 1, 1), Platelets=ps.counts(*[1] * 9)
 )
 HEIGHT, WIDTH = 240, 320  # pixels: half of the photographs
-RED, WHITE, PLATELET = 27.5, 49.0, 10.5  # typical radii, pixels of the canvas
+RED, WHITE, PLATELET = 27.5, 49.0, 6.0  # typical radii, pixels of the canvas
 FOCUS = (0.6, 1.2, 2.2)  # pixels of blur that every sprite is drawn with
 DIRT, CROWD = 16, 6  # specks at most; steps in which cells push one another apart
 CLASSES = ("rbc", "wbc", "platelet")
@@ -92,11 +92,11 @@ def white(rng: np.random.Generator, form: str) -> list[np.ndarray]:
 
 
 def platelet(rng: np.random.Generator) -> list[np.ndarray]:
-    """A small violet body of radius 10.5, grainy and ragged."""
-    inside = outline(rng, 36, PLATELET, 0.2)
-    core = np.clip(outline(rng, 36, 6.5, 0.25) / 4 + 0.5, 0, 1)[..., None]
-    colour = (170, 166, 220) - core * (38, 50, 4) + 10 * grain(rng, 36, 1.5)
-    return sprites(colour, np.clip(inside / 3 + 0.5, 0, 1) * rng.uniform(0.7, 0.95))
+    """A small violet body of radius 6, grainy and ragged, some as pale as the slide."""
+    inside = outline(rng, 28, PLATELET, 0.2)
+    core = np.clip(outline(rng, 28, 4, 0.25) / 3 + 0.5, 0, 1)[..., None]
+    stain = (182, 164, 222) - core * (38, 50, 4) + 10 * grain(rng, 28, 1)
+    return sprites(stain + rng.uniform(0, 0.5) * (224 - stain), 0.9 * np.clip(inside / 2 + 0.5, 0, 1))
 
 
 def field(rng: np.random.Generator) -> np.ndarray:
@@ -122,7 +122,7 @@ LOOKS = zip(*(red(RNG, pallor) for pallor in np.linspace(0, 1, 12)), strict=True
 REDS, SHADES = (Atlas(tuple(chain(*looks))) for looks in LOOKS)
 FORMS = ("neutrophil", "neutrophil", "eosinophil", "lymphocyte", "lymphocyte", "monocyte")
 WHITES = Atlas(tuple(chain(*(white(RNG, form) for form in FORMS * 4))))
-PLATELETS = Atlas(tuple(chain(*(platelet(RNG) for _ in range(8)))))
+PLATELETS = Atlas(tuple(chain(*(platelet(RNG) for _ in range(12)))))
 SPECKS = Atlas(tuple(chain(*(speck(RNG) for _ in range(6)))))
 FIELDS = Atlas(tuple(field(RNG) for _ in range(8)))
 

@@ -86,7 +86,7 @@ def test_cells_are_drawn_where_they_can_be_seen(scenes):
         x, y = layer.x[layer.present], layer.y[layer.present]
         assert (-25 < x).all() and (x < width + 25).all() and (-25 < y).all() and (y < height + 25).all()
     assert (batch.pixels[cells] > 0).float().mean() > 0.98
-    for name, size in zip(CLASSES, (52, 98, 20), strict=True):  # pixels, half of the photographs'
+    for name, size in zip(CLASSES, (52, 98, 11.5), strict=True):  # pixels, half of the photographs'
         box = batch.amodal_box[batch.kind == MODEL.grammar.kind(name)]
         assert (box[:, 2:] - box[:, :2]).prod(1).sqrt().median() == pytest.approx(size, rel=0.15), name
 

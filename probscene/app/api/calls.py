@@ -59,6 +59,7 @@ def generate(
     shard: str | None = None,
     cluster: str | None = None,
     flat: bool = False,
+    box_margin: int = 0,
 ) -> Dataset:
     """Write a labelled dataset; the same call goes on after an interruption.
 
@@ -74,7 +75,7 @@ def generate(
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
         shard: ``"I/N"``, I from 0: one of N calls that make the dataset together, see ``generate_run``.
         cluster: the address of a Ray cluster whose nodes make a run's images, see ``Cluster``.
-        flat: see ``generate_run``.
+        flat, box_margin: see ``generate_run``.
 
     Raises:
         ProbsceneError: see ``generate_run``.
@@ -87,10 +88,11 @@ def generate(
             if workers != 1 or cluster is not None:
                 raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
             policy = policy or source.prior
-            return generate_scenes(source, policy, num, out, seed, format, said, min_visible, shard, flat)
+            return generate_scenes(source, policy, num, out, seed, format, said, min_visible, shard, flat, box_margin)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
         with connected(cluster, show.say) as nodes:
-            return generate_run(run, num, out, seed, workers, format, said, min_visible, shard, nodes, flat)
+            more = min_visible, shard, nodes, flat, box_margin
+            return generate_run(run, num, out, seed, workers, format, said, *more)
 
 
 def evaluate(
@@ -206,6 +208,7 @@ def trial(
     sources: Sequence[str] = ("prior", "start", "learnt"),
     generated: int = 600,
     min_visible: float = 0.2,
+    box_margin: int = 0,
     classes: Iterable[str] | None = None,
     detector: str = "efficientnet",
     budget: trying.Budget | None = None,
@@ -229,7 +232,8 @@ def trial(
         real: other labelled photographs to train on.
         numbers: of them, with a set each, None for all; 10, 20, 50 and all where not given.
         run: a run or its folder, of which ``sources`` are generated, ``generated`` images each, without labels for
-            objects of which less than ``min_visible`` is visible.
+            objects of which less than ``min_visible`` is visible, and with boxes that are ``box_margin`` pixels wider
+            on each side.
         classes: those that it is about; else all, which are then the same in all sets.
         detector: ``"efficientnet"``, or ``"maskrcnn=FILE"`` with torchvision's weights.
         budget: how each is trained.
@@ -247,7 +251,7 @@ def trial(
     made = None
     if run is not None:
         opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
-        made = trying.Generated(opened, tuple(sources), generated, min_visible)
+        made = trying.Generated(opened, tuple(sources), generated, min_visible, box_margin)
     with display(progress) as show:
         return trying.trial(
             Path(test),
@@ -267,6 +271,7 @@ def trial(
             baselines=baselines,
             resamples=resamples,
             workers=workers,
+            say=show.say,
         )
 
 

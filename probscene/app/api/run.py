@@ -77,9 +77,12 @@ class Run(RunFolder):
         progress: bool = True,
         min_visible: float = 0.0,
         shard: str | None = None,
+        box_margin: int = 0,
     ) -> Dataset:
         """Write a labelled dataset of the learnt structures, see ``generate``."""
-        return calls.generate(self, num, out, format, seed, workers, progress, min_visible=min_visible, shard=shard)
+        return calls.generate(
+            self, num, out, format, seed, workers, progress, None, min_visible, shard, box_margin=box_margin
+        )
 
     def evaluate(
         self, target: Target | None = None, labels: Path | str | Labels | None = None, **options: Any

@@ -26,6 +26,9 @@ Visible = Annotated[
         help="Count objects of rendered scenes of which at least this is visible, 0 to 1; many.",
     ),
 ]
+BoxMargin = Annotated[
+    int, typer.Option(min=0, metavar="PIXELS", help="By which labelled boxes are wider on each side.")
+]
 PresetName = StrEnum("PresetName", ["quick", "default", "street", "paper", "paper-aerial", "paper-driving"])
 ClusterAddress = Annotated[
     str | None,

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from .application import app
-from .options import ClusterAddress, MinHeight, RunPath, Seed, SomeLabels, Visible
+from .options import BoxMargin, ClusterAddress, MinHeight, RunPath, Seed, SomeLabels, Visible
 
 
 @app.command()
@@ -34,6 +34,7 @@ def generate(
     ] = None,
     cluster: ClusterAddress = None,
     flat: Annotated[bool, typer.Option("--flat", help="One folder also for more than 10,000 images.")] = False,
+    box_margin: BoxMargin = 0,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
     from ..datasets.generate import generate
@@ -44,7 +45,8 @@ def generate(
     with Display() as show, connected(cluster, show.say) as nodes:
         said = show.stage("generating")
         opened = RunFolder.at(run)
-        dataset = generate(opened, num, out, seed, workers, format or "coco", said, min_visible, shard, nodes, flat)
+        more = min_visible, shard, nodes, flat, box_margin
+        dataset = generate(opened, num, out, seed, workers, format or "coco", said, *more)
     print(f"{dataset.num} images in {dataset.path}, {dataset.made} of them made now")
     if not dataset.finished:
         print("When all shards are done, the same command without --shard writes the files of labels.")

@@ -8,7 +8,7 @@ import typer
 from probscene.errors import ProbsceneError
 
 from .application import app
-from .options import Seed
+from .options import BoxMargin, Seed
 
 
 @app.command()
@@ -42,6 +42,7 @@ def trial(
     min_visible: Annotated[
         float, typer.Option(metavar="FRACTION", help="No label there for objects of which less is visible.")
     ] = 0.2,
+    box_margin: BoxMargin = 0,
     classes: Annotated[
         str | None, typer.Option(metavar="NAME,...", help="What it is about; all classes if not given.")
     ] = None,
@@ -92,6 +93,7 @@ def trial(
         sources=_words(sources),
         generated=generate,
         min_visible=min_visible,
+        box_margin=box_margin,
         classes=None if classes is None else _words(classes),
         detector=detector,
         budget=Budget(presentations, batch, rate, last, chain),

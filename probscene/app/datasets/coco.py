@@ -39,6 +39,26 @@ def check_min_visible(min_visible: float) -> None:
         raise ProbsceneError(f"Expected min_visible from 0 to 1, actual {min_visible}.")
 
 
+def check_box_margin(box_margin: int) -> None:
+    """See that a margin of boxes is one.
+
+    Raises:
+        ProbsceneError: it is not a whole number of pixels, 0 or more.
+    """
+    if not (box_margin >= 0 and box_margin % 1 == 0):
+        raise ProbsceneError(f"Expected box_margin as a whole number of pixels, 0 or more, actual {box_margin}.")
+
+
+def with_margin(batch: RenderBatch, box_margin: int) -> RenderBatch:
+    """The batch with boxes of what is visible that are ``box_margin`` pixels wider on each side, as far as the image
+    goes: people box objects more loosely than a mask does. Whole silhouettes' boxes stay.
+    """
+    height, width = batch.image.shape[2:]
+    wider = batch.box + torch.tensor([-1, -1, 1, 1]) * box_margin
+    wider = torch.minimum(wider.clamp(min=0), torch.tensor([width, height, width, height]))
+    return batch._replace(box=torch.where(batch.pixels[..., None] > 0, wider, batch.box))
+
+
 def labelled(model: SceneModel, batch: RenderBatch, min_visible: float = 0.0) -> Tensor:
     """The category ids ``(N, M)`` int64 of the nodes that are labelled in every format: those of a class that have a
     visible pixel, and of which at least the fraction ``min_visible`` is visible; 0 at the others.

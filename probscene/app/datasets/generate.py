@@ -68,6 +68,7 @@ def generate(
     shard: str | None = None,
     cluster: Cluster | None = None,
     flat: bool = False,
+    box_margin: int = 0,
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
 
@@ -83,11 +84,13 @@ def generate(
         cluster: of which all nodes make images, in place of ``workers``. They have to see the folders of the run and of
             the dataset by the same paths.
         flat: all images in one folder; of more than 10,000, a thousand share one otherwise. KITTI's folders are flat.
+        box_margin: pixels by which boxes of what is visible are wider than it on each side, within the image; masks and
+            boxes of whole silhouettes stay.
 
     Raises:
-        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
-            format, more classes or objects than KITTI's masks can number, no depth where it is asked for, another text
-            for a shard.
+        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, a margin that is
+            no whole number or of KITTI's boxes in 3D, an unknown format, more classes or objects than KITTI's masks can
+            number, no depth where it is asked for, another text for a shard.
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped. See also
@@ -98,7 +101,7 @@ def generate(
     if cluster is not None and workers > 1:
         raise ProbsceneError(f"Expected workers or a cluster, actual {workers} workers and a cluster; leave one out.")
     part = WHOLE if shard is None else Shard.of(shard)
-    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), min_visible, flat)
+    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), min_visible, flat, box_margin)
     if workers == 1 and cluster is None:
         return job.run(job.each, progress, part)
     if run.objects:
@@ -106,7 +109,7 @@ def generate(
             f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual "
             f"{workers if cluster is None else 'a cluster'}; fit a model and parts in files for more."
         )
-    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, min_visible, flat)
+    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, min_visible, flat, box_margin)
     if cluster is None:
         return job.run(partial(spread, _worker, task, workers), progress, part)
     crew = cluster.crew(_actor, task)
@@ -127,12 +130,13 @@ def generate_scenes(
     min_visible: float = 0.0,
     shard: str | None = None,
     flat: bool = False,
+    box_margin: int = 0,
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
 
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
-    job = Job(model, policy, num, out, seed, format, min_visible=min_visible, flat=flat)
+    job = Job(model, policy, num, out, seed, format, min_visible=min_visible, flat=flat, box_margin=box_margin)
     return job.run(job.each, progress, WHOLE if shard is None else Shard.of(shard))
 
 
@@ -149,11 +153,11 @@ class Job:
 
     Args:
         guide: SHA-256 of the policy's checkpoint, where it is a learnt one.
-        min_visible, flat: see ``generate``.
+        min_visible, flat, box_margin: see ``generate``.
 
     Raises:
-        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, an unknown
-            format, more classes than KITTI's masks can number.
+        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, a margin that is
+            no whole number or of KITTI's boxes in 3D, an unknown format, more classes than KITTI's masks can number.
     """
 
     def __init__(
@@ -167,19 +171,23 @@ class Job:
         guide: str | None = None,
         min_visible: float = 0.0,
         flat: bool = False,
+        box_margin: int = 0,
     ):
         if num < 1:
             raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
         if seed < 0:
             raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
         coco.check_min_visible(min_visible)
-        self.formats = chosen(format)
+        coco.check_box_margin(box_margin)
+        self.formats, self.box_margin = chosen(format), int(box_margin)
         if "kitti" in self.formats:
             kitti.check(model)
         self.model, self.policy, self.min_visible = model, policy, float(min_visible)
         self.origin = {"seed": seed, "model": model.name, "guide": guide, "version": probscene.__version__}
         if self.min_visible != UNSAID["min_visible"]:
             self.origin["min_visible"] = self.min_visible
+        if self.box_margin != UNSAID["box_margin"]:
+            self.origin["box_margin"] = self.box_margin
         self.folder = DatasetFolder(out, self.origin, num, self.formats, flat)
         self._renderer = renderer_for(model, threads=1)
 
@@ -188,9 +196,12 @@ class Job:
     ) -> Dataset:
         """Do what is missing of a shard by ``work(chunks, done)``; of the whole, then write the labels."""
         folder, made = self.folder, 0
-        if "depth" in self.formats and not folder.finished:  # before anything is written
-            first = draw_chunk(self.model, self.policy, self.origin["seed"], 0)
-            depth.files(self.model, self._renderer(first.drawing[:1]))
+        if {"depth", "kitti"} & {*self.formats} and not folder.finished:  # before anything is written
+            first = self._renderer(draw_chunk(self.model, self.policy, self.origin["seed"], 0).drawing[:1])
+            if "depth" in self.formats:
+                depth.files(self.model, first)
+            if "kitti" in self.formats:
+                kitti.check_box_margin(self.model, first, self.box_margin)
         chunks, num = folder.missing(shard), sum(map(folder.size, folder.of(shard)))
         before = num - sum(map(folder.size, chunks))
 
@@ -219,7 +230,7 @@ class Job:
         """
         first, size = chunk * CHUNK, self.folder.size(chunk)
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
-        batch = self._renderer(scenes.drawing[:size])
+        batch = coco.with_margin(self._renderer(scenes.drawing[:size]), self.box_margin)
         found = [] if self.formats == ("images",) else coco.annotations(self.model, batch, first, self.min_visible)
         lines = provenance(self.model, scenes, first, self.origin, self.folder.flat)
         record = {"annotations": found, "provenance": lines[:size]}
@@ -280,11 +291,19 @@ class Job:
 
 
 def _worker(
-    run: Path, num: int, out: str, seed: int, format: tuple[str, ...], min_visible: float, flat: bool
+    run: Path,
+    num: int,
+    out: str,
+    seed: int,
+    format: tuple[str, ...],
+    min_visible: float,
+    flat: bool,
+    box_margin: int,
 ) -> Callable[[int], int]:
     """What a worker process does with a chunk's number."""
     opened = RunFolder.at(run)
-    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), min_visible, flat).make
+    settings = opened.guide_hash(), min_visible, flat, box_margin
+    return Job(opened.model, opened.guide, num, out, seed, format, *settings).make
 
 
 def _actor(run: Path, num: int, out: str, *settings: Any) -> Callable[[int], int]:

@@ -67,6 +67,19 @@ def check(model: SceneModel) -> None:
         )
 
 
+def check_box_margin(model: SceneModel, batch: RenderBatch, box_margin: int) -> None:
+    """See that boxes have no margin where KITTI's are of whole silhouettes.
+
+    Raises:
+        ProbsceneError: a margin in 3D.
+    """
+    if box_margin and batch.space is not None:
+        raise ProbsceneError(
+            f"Expected no box_margin in KITTI's labels of the 3D model {model.name!r}, whose boxes there are of whole "
+            f"silhouettes, actual {box_margin}; leave it out, or choose other formats."
+        )
+
+
 def label(model: SceneModel, annotations: list[dict[str, Any]]) -> str:
     """The lines of one image's COCO annotations, in their order."""
     return "".join(

@@ -33,7 +33,7 @@ from probscene.policy import Policy
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
-from .coco import check_min_visible, labelled
+from .coco import check_box_margin, check_min_visible, labelled, with_margin
 from .depth import of as depth_of
 
 Sample = tuple[Tensor, dict[str, Any]]
@@ -60,6 +60,7 @@ class SceneDataset(IterableDataset):
         num: images of an epoch; None for no end.
         seed: of everything random.
         min_visible: objects of which a smaller fraction is visible are left out of the target.
+        box_margin: pixels by which ``boxes`` are wider on each side, see ``generate``.
         batch_size: the loader's, where the order must not depend on the number of workers.
         policy: other structures, over the grammar of ``source``.
 
@@ -80,6 +81,7 @@ class SceneDataset(IterableDataset):
         min_visible: float = 0.0,
         batch_size: int | None = None,
         policy: Policy | None = None,
+        box_margin: int = 0,
     ):
         for name, number in (("images", num), ("images of a batch", batch_size)):
             if number is not None and number < 1:
@@ -87,7 +89,9 @@ class SceneDataset(IterableDataset):
         if seed < 0:
             raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
         check_min_visible(min_visible)
-        self.num, self.seed, self.min_visible, self.batch_size = num, seed, min_visible, batch_size
+        check_box_margin(box_margin)
+        self.num, self.seed, self.batch_size = num, seed, batch_size
+        self.min_visible, self.box_margin = min_visible, box_margin
         self._source = source if isinstance(source, SceneModel) else _resolved(source)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that persist see it change
         self._given, self._opened = policy, None
@@ -136,7 +140,7 @@ class SceneDataset(IterableDataset):
                 last = min(first + stop - at, CHUNK)
                 if scenes is None or drawn != chunk:
                     drawn, scenes = chunk, draw_chunk(model, policy, self.seed, start + chunk)
-                batch = render(scenes.drawing[first:last])
+                batch = with_margin(render(scenes.drawing[first:last]), self.box_margin)
                 yield from self._samples(model, batch, (start + chunk) * CHUNK + first)
                 at += last - first
 

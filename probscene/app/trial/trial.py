@@ -10,7 +10,7 @@ on labelled real images; see ``trial``.
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from .jobs import Job
 from .pictures import draw
 from .plan import REAL, Plan, Row, baselines_of, check, list_of, only, plan, split
 from .results import Results, score
-from .sets import LabelledSet, digest_of, read_set
+from .sets import LabelledSet, digest_of, looser, read_set
 from .tables import text
 
 FORMAT = 1
@@ -58,12 +58,14 @@ AS_USUAL = Budget()
 
 
 class Generated(NamedTuple):
-    """What is generated of a run: its sources, how many images of each, the least visible fraction of a label."""
+    """What is generated of a run: its sources, how many images of each, the least visible fraction of a label, and the
+    margin of boxes."""
 
     run: RunFolder
     sources: tuple[str, ...] = ("prior", "start", "learnt")
     number: int = 600
     min_visible: float = 0.2
+    box_margin: int = 0
 
 
 def trial(
@@ -85,6 +87,7 @@ def trial(
     baselines: Iterable[str] = (),
     resamples: int = 1000,
     workers: int = 1,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Results:
     """Train, test, compare; the same call goes on after an interruption. Nothing is trained before all is checked.
 
@@ -101,6 +104,7 @@ def trial(
         baselines: rows that the others are compared with; the first where there is none.
         resamples: of the bootstrap.
         workers: processes; the results do not depend on their number.
+        say: hears a note on the sets, before anything is trained.
 
     Raises:
         ProbsceneError: a setting that makes no sense.
@@ -144,6 +148,9 @@ def trial(
         for key, path in _generate(generated, out / "sets", seed, workers, show).items():
             loaded[key] = _read(path, names, show)
         check(planned, loaded, tested, set())
+        note = None if photographs is None else looser(photographs, loaded[known[-1]])
+        if note is not None:
+            say(note)
     rows = {
         row.name: tuple(tuple((loaded[p.source], p) for p in stage) for stage in row.stages) for row in planned.rows
     }
@@ -224,7 +231,8 @@ def _check_classes(generated: Generated, classes: tuple[str, ...], same: bool) -
 
 def _generate(generated: Generated, into: Path, seed: int, workers: int, show: Progress) -> dict[str, Path]:
     """Write what is generated of a run, as far as it is not there; by source its folder."""
-    run, number, least = generated.run, positive(generated.number, "images to generate"), generated.min_visible
+    run, number = generated.run, positive(generated.number, "images to generate")
+    least, margin = generated.min_visible, generated.box_margin
     policies = {"prior": run.model.prior, "start": run.model.pretraining_policy}
     folders = {}
     for source in _sources(generated):
@@ -234,9 +242,11 @@ def _generate(generated: Generated, into: Path, seed: int, workers: int, show: P
             show("generating", done, total)
 
         if source == "learnt":
-            generate(run, number, into / source, seed, 1 if run.objects else workers, "coco", said, least)
+            w = 1 if run.objects else workers
+            generate(run, number, into / source, seed, w, "coco", said, least, box_margin=margin)
         else:
-            generate_scenes(run.model, policies[source], number, into / source, seed, "coco", said, least)
+            policy = policies[source]
+            generate_scenes(run.model, policy, number, into / source, seed, "coco", said, least, box_margin=margin)
     return folders
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from probscene.app.trial.plan import Part, chosen, only, plan, split
-from probscene.app.trial.sets import BEYOND, EASY, HARD, MODERATE, read_set
+from probscene.app.trial.sets import BEYOND, EASY, HARD, MODERATE, looser, read_set
 from probscene.errors import DataError, ProbsceneError
 
 from .conftest import SIDE, change, draw_set
@@ -175,3 +175,21 @@ def test_what_a_plan_understands(drawn):
 def test_what_a_plan_refuses(sets, said):
     with pytest.raises(ProbsceneError, match=re.escape(said)):
         plan(sets, ("learnt", "real") if sets else (), ())
+
+
+@pytest.mark.parametrize(("wider", "margin"), [(0, None), (1, None), (4, 4)])
+def test_labels_that_are_looser_than_masks_are_said_with_their_margin(tmp_path, wider, margin):
+    def loosen(record):
+        for one in record["annotations"]:
+            x, y, w, h = one["bbox"]
+            one["bbox"] = [x - wider, y - wider, w + 2 * wider, h + 2 * wider]
+
+    made = read_set(draw_set(tmp_path / "made", 30, 5))
+    photographs = draw_set(tmp_path / "photographs", 30, 6, side=4 * SIDE)  # objects of the same size in pixels
+    change(photographs, loosen)
+    assert looser(read_set(photographs), made) is None  # as large a share of the image would be four times as wide
+    same = change(draw_set(tmp_path / "same", 30, 6), loosen)
+    said = looser(read_set(same), made)
+    assert (said is None) == (margin is None)
+    if said is not None:
+        assert f"--box-margin {margin}" in said and re.search(r"disc 2\d for 1\d, square 2\d for 1\d", said)
