@@ -2,7 +2,8 @@
 
 Without labels all rules that count renders about as well as the best one are taken, and their median is read. It is
 believed where heads that agree on renders agreed on the photographs too, before they learnt from one another, where it
-counts right on renders that nothing was trained on, and where those rules read about as much as each other. With labels
+counts right on renders that nothing was trained on, where those rules read about as much as each other, and where most
+objects are large: what heads take for a small object, dirt or a speck, all of them take for one. With labels
 the rule is that with the least error on them, a little held by its error on renders, as ten labels alone would choose
 among many rules by luck; where they bear out what is read without them, nothing changes. Where the other labels'
 histogram predicts a label better than any rule does, that histogram is what is learnt; as well where the rule reads
@@ -130,10 +131,12 @@ def without_labels(read: Read, c: int) -> Reading:
     apart = float(read.apart[s, rules, c].mean())
     spread = float((means.max() - means.min()) / (means.mean() + BASE))
     skill = _correlation(read.renders[:, s, rules, c].quantile(0.5, 1), true)
-    good = apart <= AGREE and spread <= CLOSE and skill >= SKILL
+    good = s == LARGE and apart <= AGREE and spread <= CLOSE and skill >= SKILL
     because = f"{'readable' if good else 'not readable'}, {mean:.1f} an image by {_by(tuple(rules.tolist()))}"
     if s == LARGE and true.sum() < read.true[:, SMALL, c].sum():
         because += f", of objects from {SCOPES[s].pixels:g} pixels"
+    if s == SMALL:
+        because += f", most objects under {SCOPES[LARGE].pixels:g} pixels"
     because += f" (heads differ by {apart:.0%}, rules by {spread:.0%}, r = {skill:.2f} on renders)"
     if not good:
         because += "; label ten images"
@@ -155,8 +158,10 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
         return free._replace(because=f"{free.because}; {why}")
     seen = read.labelled[..., c].double().numpy()  # (K, S, R)
     drawn = _errors(read.renders[..., c].double().numpy(), read.true[..., None, c].double().numpy())
-    scope, rule = _choose(seen, y, drawn)
-    left_out = np.array([seen[(i, *_choose(np.delete(seen, i, 0), np.delete(y, i), drawn))] for i in range(len(y))])
+    first = free.scope  # where most objects are small, the few large ones that go with the labels are not the labelled
+    scope, rule = _choose(seen, y, drawn, first)
+    others = ((np.delete(seen, i, 0), np.delete(y, i), drawn, first) for i in range(len(y)))
+    left_out = np.array([seen[(i, *_choose(*some))] for i, some in enumerate(others)])
     error, histogram = float(np.abs(left_out - y).mean()), _histogram_error(y)
     of_free = read.labelled[:, free.scope, :, c][:, list(free.rules)].quantile(0.5, 1)
     with_free, seen_mean, mean = _correlation(of_free, labels), float(of_free.mean()), float(y.mean())
@@ -210,12 +215,12 @@ def _unlike(labelled: Array, photographs: Array) -> tuple[float, float] | None:
     return (labelled.mean(), mean) if abs(labelled.mean() - mean) > BIASED * error else None
 
 
-def _choose(seen: Array, labels: Array, drawn: Array) -> tuple[int, int]:
-    """The scope and the rule with the least error on labelled images ``(K, S, R)`` and on renders ``(S, R)``; of scopes
-    that do about as well the first, which asks least of where objects stand."""
-    cost = _errors(seen, labels[:, None, None]) + RENDERS / len(labels) * drawn
+def _choose(seen: Array, labels: Array, drawn: Array, first: int) -> tuple[int, int]:
+    """The scope, from the ``first`` on, and the rule with the least error on labelled images ``(K, S, R)`` and on
+    renders ``(S, R)``; of scopes that do about as well the earliest, which asks least of where objects stand."""
+    cost = (_errors(seen, labels[:, None, None]) + RENDERS / len(labels) * drawn)[first:]
     scope = int(np.argmax(cost.min(1) <= MUCH * cost.min() + LITTLE))
-    return scope, int(np.argmin(cost[scope]))
+    return first + scope, int(np.argmin(cost[scope]))
 
 
 def _errors(read: Array, true: Array) -> Array:

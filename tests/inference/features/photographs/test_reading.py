@@ -144,6 +144,20 @@ def test_heads_that_differ_or_rules_that_differ_are_not(spoilt):
     assert not found.readable and found.because.startswith("not readable, ") and "label ten images" in found.because
 
 
+def test_small_objects_are_not_believed_without_labels():
+    read = made(COUNTS[:10], COUNTS)
+    true, renders = read.true.clone(), read.renders.clone()
+    true[:, LARGE] = true[:, LARGE].clamp(max=1)
+    renders[:, LARGE] = renders[:, LARGE].clamp(max=1)
+    read = read._replace(true=true, renders=renders)
+    assert scopes_without_labels(read.true).tolist() == [SMALL]
+    free = without_labels(read, 0)
+    assert free.disagreement < 0.1 and free.skill > 0.9 and not free.readable
+    assert "most objects under 16 pixels" in free.because and "label ten images" in free.because
+    found = with_labels(read, 0, torch.from_numpy(COUNTS[:10]))
+    assert found.readable and found.scope >= SMALL  # the large ones are read as well, and are not what was labelled
+
+
 def test_rules_that_count_renders_badly_are_left_out():
     """Of rules that read from once to seven times as much, one counts the renders right: the others do not matter."""
     read = made(COUNTS, COUNTS, ramp=0.5)
