@@ -74,7 +74,7 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--min-height", type=float, default=0.0, help="of boxes that are counted, pixels")
     args = parser.parse_args()
-    needed(args.images, "a model, a folder of images, and their labels")
+    needed(args.labels, "a model, a folder of images, and their labels")
     keep_freed_memory()
     model = load_model(args.model)
     folder = ImageFolder(args.images, model.canvas, model.channels)
