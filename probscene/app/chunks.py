@@ -5,6 +5,7 @@ that of the workers changes an image. Axis letters: N scenes, H W.
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import cv2
 import numpy as np
 import torch
 from pyro.util import get_rng_state, set_rng_state
@@ -49,3 +50,11 @@ def as_written(model: SceneModel, image: Tensor) -> Tensor:
     ``convert("RGB")``, COCO loaders) give its three equal channels.
     """
     return grey(image) if model.channels == 1 else image
+
+
+def png(image: Tensor) -> bytes:
+    """The bytes of a file for ``image (C, H, W)`` uint8, grey or RGB."""
+    pixels = image.permute(1, 2, 0).numpy()
+    if pixels.shape[2] == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".png", pixels)[1].tobytes()

@@ -16,16 +16,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
-from torch import Tensor
-
 import probscene
 from probscene.batch import RenderBatch
 from probscene.errors import ProbsceneError
 from probscene.model import SceneModel
 from probscene.policy import Policy
 
-from ..chunks import CHUNK, as_written, draw_chunk
+from ..chunks import CHUNK, as_written, draw_chunk, png
 from ..fitting.run import RunFolder
 from ..loading import renderer_for
 from ..workers.cluster import Cluster
@@ -140,14 +137,6 @@ def generate_scenes(
     return job.run(job.each, progress, WHOLE if shard is None else Shard.of(shard))
 
 
-def png(image: Tensor) -> bytes:
-    """The bytes of a file for ``image (C, H, W)`` uint8, grey or RGB."""
-    pixels = image.permute(1, 2, 0).numpy()
-    if pixels.shape[2] == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".png", pixels)[1].tobytes()
-
-
 class Job:
     """A dataset to be written.
 
@@ -156,8 +145,7 @@ class Job:
         min_visible, flat, box_margin: see ``generate``.
 
     Raises:
-        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, a margin that is
-            no whole number or of KITTI's boxes in 3D, an unknown format, more classes than KITTI's masks can number.
+        ProbsceneError: see ``generate``.
     """
 
     def __init__(
@@ -284,26 +272,16 @@ class Job:
             for record in self.folder.records(chunks):
                 found = list(shards.labels(self.model, record))
                 images = self.folder.place.read_all([self.folder.image(i) for i, _ in found])
-                for (i, label), png in zip(found, images, strict=True):
-                    yield i, {"png": png, "json": label}
+                for (i, label), image in zip(found, images, strict=True):
+                    yield i, {"png": image, "json": label}
 
         shards.write(path, samples())
 
 
-def _worker(
-    run: Path,
-    num: int,
-    out: str,
-    seed: int,
-    format: tuple[str, ...],
-    min_visible: float,
-    flat: bool,
-    box_margin: int,
-) -> Callable[[int], int]:
+def _worker(run: Path, num: int, out: str, seed: int, format: tuple[str, ...], *settings: Any) -> Callable[[int], int]:
     """What a worker process does with a chunk's number."""
     opened = RunFolder.at(run)
-    settings = opened.guide_hash(), min_visible, flat, box_margin
-    return Job(opened.model, opened.guide, num, out, seed, format, *settings).make
+    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), *settings).make
 
 
 def _actor(run: Path, num: int, out: str, *settings: Any) -> Callable[[int], int]:

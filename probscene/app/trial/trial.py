@@ -26,9 +26,9 @@ from ..progress import Progress, silent
 from .detector import RECIPES, checked, fingerprint
 from .jobs import Job
 from .pictures import draw
-from .plan import REAL, Plan, Row, baselines_of, check, list_of, only, plan, split
+from .plan import REAL, Plan, Row, baselines_of, check, list_of, looser, only, plan, split
 from .results import Results, score
-from .sets import LabelledSet, digest_of, looser, read_set
+from .sets import LabelledSet, digest_of, read_set
 from .tables import text
 
 FORMAT = 1
@@ -58,8 +58,7 @@ AS_USUAL = Budget()
 
 
 class Generated(NamedTuple):
-    """What is generated of a run: its sources, how many images of each, the least visible fraction of a label, and the
-    margin of boxes."""
+    """What is generated of a run: its sources, images of each, the least visible fraction of labels, boxes' margin."""
 
     run: RunFolder
     sources: tuple[str, ...] = ("prior", "start", "learnt")

@@ -15,7 +15,8 @@ from PIL import Image
 from pycocotools.coco import COCO
 
 import probscene
-from probscene.app.datasets.generate import generate, generate_scenes, png
+from probscene.app.chunks import png
+from probscene.app.datasets.generate import generate, generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from probscene.app.trial.plan import Part, chosen, only, plan, split
-from probscene.app.trial.sets import BEYOND, EASY, HARD, MODERATE, looser, read_set
+from probscene.app.trial.plan import Part, chosen, looser, only, plan, split
+from probscene.app.trial.sets import BEYOND, EASY, HARD, MODERATE, read_set
 from probscene.errors import DataError, ProbsceneError
 
 from .conftest import SIDE, change, draw_set
