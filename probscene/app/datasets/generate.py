@@ -184,12 +184,13 @@ class Job:
     ) -> Dataset:
         """Do what is missing of a shard by ``work(chunks, done)``; of the whole, then write the labels."""
         folder, made = self.folder, 0
-        if {"depth", "kitti"} & {*self.formats} and not folder.finished:  # before anything is written
+        boxes = "kitti" in self.formats and self.box_margin > 0
+        if ("depth" in self.formats or boxes) and not folder.finished:  # before anything is written
             first = self._renderer(draw_chunk(self.model, self.policy, self.origin["seed"], 0).drawing[:1])
+            if boxes:
+                kitti.check_box_margin(self.model, first, self.box_margin)
             if "depth" in self.formats:
                 depth.files(self.model, first)
-            if "kitti" in self.formats:
-                kitti.check_box_margin(self.model, first, self.box_margin)
         chunks, num = folder.missing(shard), sum(map(folder.size, folder.of(shard)))
         before = num - sum(map(folder.size, chunks))
 
