@@ -53,6 +53,8 @@ def with_margin(batch: RenderBatch, box_margin: int) -> RenderBatch:
     """The batch with boxes of what is visible that are ``box_margin`` pixels wider on each side, as far as the image
     goes: people box objects more loosely than a mask does. Whole silhouettes' boxes stay.
     """
+    if not box_margin:
+        return batch
     height, width = batch.image.shape[2:]
     wider = batch.box + torch.tensor([-1, -1, 1, 1]) * box_margin
     wider = torch.minimum(wider.clamp(min=0), torch.tensor([width, height, width, height]))
