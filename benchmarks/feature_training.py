@@ -15,7 +15,7 @@ import time
 
 import torch
 
-from probscene.app.fitting.observer import Observer, feature_net
+from probscene.app.fitting.observer import Observer
 from probscene.app.fitting.presets import QUICK
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
@@ -27,7 +27,7 @@ from probscene.sampling import seed_everything
 def train(model, view, steps, theirs):
     """CPU milliseconds of a training, and of its Muon alone, a step; and the last loss."""
     seed_everything(0)
-    net = feature_net(QUICK, model)
+    net = QUICK.make_features().build(model)
     net.fit_to(view.object_size())
     training = CountTraining(net, view.draw, CountSchedule(steps=steps))
     muon = training.optimisers["muon"]
@@ -45,7 +45,7 @@ def train(model, view, steps, theirs):
 
     muon.step = timed
     start = time.process_time()
-    training.run(lambda _, loss: losses.append(loss))
+    training.run(lambda _, figures: losses.append(figures["loss"]))
     return 1e3 * (time.process_time() - start) / steps, 1e3 * alone / steps, losses[-1]
 
 

@@ -27,14 +27,15 @@ Rows = list[list[str]]
 
 
 def ablate(result: dict) -> Rows:
-    """A row for each variant."""
-    rows: Rows = [["", "settings", "total variation", "log q", "cannot derive"]]
+    """A row for each variant; log q as what is missing to the floor of the same seed, for each seed has its target."""
+    rows: Rows = [["", "settings", "total variation", "log q below the floor's", "cannot derive"]]
+    floors = {row["seed"]: row["log_q"] for row in result["rows"] if row["variant"] == "floor"}
     for variant in dict.fromkeys(row["variant"] for row in result["rows"]):
         each = [row for row in result["rows"] if row["variant"] == variant]
         settings, impossible = each[0]["settings"], spread([row["impossible"] for row in each], 2)
-        log_q = spread([row["log_q"] for row in each], 2)
+        below = spread([floors[row["seed"]] - row["log_q"] for row in each], 2)
         rows.append([variant, f"`{settings}`" if settings else "", spread([row["total_variation"] for row in each], 3)])
-        rows[-1] += [log_q, impossible if any(row["impossible"] for row in each) else "none"]
+        rows[-1] += [below, impossible if any(row["impossible"] for row in each) else "none"]
     return rows
 
 

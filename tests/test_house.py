@@ -1,6 +1,7 @@
 """The house rules: who imports whom, what is installed, what no file may name."""
 
 import ast
+import importlib
 import json
 import re
 import shutil
@@ -105,6 +106,15 @@ def test_imports_inside_a_folder_are_relative_and_all_others_are_not():
             elif isinstance(node, ast.Import | ast.ImportFrom):
                 first = {alias.name for alias in node.names} if isinstance(node, ast.Import) else {node.module}
                 assert not {name.split(".")[0] for name in first} & {"models", "renderers", "inference"}, module
+
+
+def test_benchmarks_import_what_there_is():
+    modules = library()
+    for path in (ROOT / "benchmarks").glob("*.py"):
+        for name in imported(path):
+            package, _, member = name.rpartition(".")
+            if package in modules and name not in modules:
+                assert hasattr(importlib.import_module(package), member), f"{path.name} imports {name}"
 
 
 @pytest.mark.parametrize("folder", ["probscene/app", "models", "renderers", "inference"])
