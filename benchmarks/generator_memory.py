@@ -17,7 +17,7 @@ from pathlib import Path
 
 import psutil
 import torch
-from given import command, out_option
+from given import command, needed, out_option
 
 from probscene.app.files import write_json
 from probscene.app.loading import load_model
@@ -35,6 +35,8 @@ def main():
     parser.add_argument("--memory", type=float, default=500.0)
     args = parser.parse_args()
     model = load_model(str(MODEL))
+    python = Path(model.generator.argv[0])
+    needed(python if python.exists() else None, "Blender's environment by make blender")
     seed_everything(0)
     scenes, first, rows = sample(model, model.prior, args.scenes).drawing, None, []
     leaking = replace(
@@ -60,7 +62,7 @@ def main():
                     except psutil.Error:
                         continue
 
-        watching, begun = threading.Thread(target=look), time.monotonic()
+        watching, begun = threading.Thread(target=look, daemon=True), time.monotonic()
         watching.start()
         batch = GeneratedRenderer(way, model.canvas)(scenes)
         seconds = time.monotonic() - begun
