@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from probscene.app.loading import load_model
 from probscene.renderers.generated import GeneratedRenderer
@@ -79,3 +80,9 @@ def processes_of(group):
         if int(its_group) == group and state != "Z":
             found.append(int(folder.name))
     return found
+
+
+@pytest.fixture
+def same():
+    """Whether two batches hold the same bytes."""
+    return lambda one, other: all(torch.equal(a, b) for a, b in zip(one[:7], other[:7], strict=True))

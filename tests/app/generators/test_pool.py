@@ -12,22 +12,15 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
 from probscene.renderers.generated import GeneratedRenderer
-from probscene.renderers.generator.kept import Kept
 from probscene.renderers.generator.pool import pool_for
-from probscene.renderers.generator.reply import Picture
 
 SCENES = 24
-
-
-def same(one, other):
-    return all(torch.equal(a, b) for a, b in zip(one[:7], other[:7], strict=True))
 
 
 @pytest.mark.parametrize(
@@ -37,7 +30,9 @@ def same(one, other):
         ("leak", {"memory": 60.0}), ("", {"restart_after": 5}), ("", {"workers": 1}), ("", {"workers": 5}),
     ],
 )  # fmt: skip
-def test_the_bytes_are_those_of_an_undisturbed_run(drawn, request_of, fault, fresh, running, command, name, settings):
+def test_the_bytes_are_those_of_an_undisturbed_run(
+    drawn, request_of, fault, fresh, running, command, same, name, settings
+):
     request = request_of(SCENES)
     assert (request.seed % 3 == 0).sum() > 3  # those are disturbed
     undisturbed = drawn(request)
@@ -86,7 +81,7 @@ def test_what_a_killed_worker_has_started_is_killed_with_it(drawn, request_of, f
     assert groups - left and not any(running(group) for group in groups - left)
 
 
-def test_a_worker_that_is_killed_from_outside_is_replaced(drawn, request_of, command, fresh):
+def test_a_worker_that_is_killed_from_outside_is_replaced(drawn, request_of, command, fresh, same):
     request = request_of(SCENES)
     whole = drawn(request)
     for group in pool_for(command(), 2).processes():
@@ -101,7 +96,7 @@ def test_workers_are_shared_and_as_many_as_are_asked_for(drawn, request_of, comm
     assert 1 <= len(first) <= 2 and pool_for(command(), 1).processes() == first
 
 
-def test_without_unix_sockets_the_bytes_are_the_same(drawn, request_of, fresh, monkeypatch):
+def test_without_unix_sockets_the_bytes_are_the_same(drawn, request_of, fresh, monkeypatch, same):
     request = request_of(SCENES)
     whole = drawn(request)
     fresh()
@@ -110,7 +105,7 @@ def test_without_unix_sockets_the_bytes_are_the_same(drawn, request_of, fresh, m
     assert same(drawn(request, restart_after=7), whole)
 
 
-def test_several_threads_draw_at_once(drawn, request_of):
+def test_several_threads_draw_at_once(drawn, request_of, same):
     requests = [request_of(8, seed=s) for s in range(4)]
     expected, found = [drawn(request) for request in requests], {}
     threads = [threading.Thread(target=lambda i=i: found.update({i: drawn(requests[i])})) for i in range(4)]
@@ -230,83 +225,14 @@ def test_a_program_starts_no_more_once_its_pool_is_closed(command, fault, runnin
     assert set(pool.processes()) <= set(groups)
 
 
-def test_pictures_that_are_kept_are_taken_again(drawn, request_of, command, fault, fresh, tmp_path):
-    request, keep = request_of(SCENES), tmp_path / "kept"
-    fault("boxes")
-    first = drawn(request, keep=keep)
-    files = sorted(keep.rglob("*"))
-    assert len([file for file in files if file.suffix == ".npz"]) == SCENES
-    fresh()
-    fault("always")
-    again = drawn(request, keep=keep)
-    assert same(again, first) and again.unknown == first.unknown == ("visible",)
-    assert not pool_for(command(keep=keep), 1).processes() and sorted(keep.rglob("*")) == files
-    next(file for file in files if file.suffix == ".npz").write_bytes(b"damaged")
-    with pytest.raises(GeneratorError, match="never any mesh"):
-        drawn(request, keep=keep, attempts=1)
-    fresh()
-    fault("boxes")
-    assert same(drawn(request, keep=keep), first)
 
 
-def test_a_damaged_picture_is_taken_as_none_or_as_it_was(command, tmp_path):
-    nodes = [{"id": 1, "kind": "mug", "values": {}}, {"id": 2, "kind": "mug", "values": {}}]
-    record = {"height": 16, "width": 20, "seed": 1, "values": {}, "nodes": nodes}
-    draw = np.random.default_rng(0)
-    picture = Picture(
-        draw.integers(0, 255, (16, 20, 3), np.uint8, endpoint=True),
-        draw.integers(0, 2, (16, 20), np.int16, endpoint=True),
-        draw.random((16, 20), np.float32),
-        draw.random((2, 4), np.float32),
-    )
-    kept = Kept(tmp_path, command())
-    kept.save(record, picture)
-    file = kept.file(record)
-    whole = file.read_bytes()
-    assert as_bytes(kept.load(record)) == as_bytes(picture)
-    none = 0
-    for _ in range(300):
-        damaged = bytearray(whole)
-        for at in draw.integers(0, len(whole), draw.integers(1, 40)):
-            damaged[at] = draw.integers(0, 256)
-        file.write_bytes(damaged)
-        found = kept.load(record)
-        none += found is None
-        assert found is None or as_bytes(found) == as_bytes(picture)
-    assert none > 200
 
 
-@pytest.mark.parametrize(
-    ("changed", "taken"),
-    [
-        ({}, True),
-        ({"image": None}, False),
-        ({"image": np.zeros((3, 4, 3), np.uint8)}, False),
-        ({"instance": np.zeros((4, 4), np.float32)}, False),
-        ({"depth": np.zeros((4, 4), np.float32)}, True),
-        ({"depth": np.zeros((4, 4, 1), np.float32)}, False),
-        ({"amodal_box": np.zeros((2, 4), np.float32)}, False),
-    ],
-)
-def test_a_picture_that_is_kept_has_the_shape_of_its_scene(command, tmp_path, changed, taken):
-    record = {"height": 4, "width": 4, "seed": 1, "values": {}, "nodes": [{"id": 1, "kind": "mug", "values": {}}]}
-    kept = Kept(tmp_path, command())
-    picture = Picture(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.int16), None, np.zeros((1, 4), np.float32))
-    kept.save(record, picture._replace(**changed))
-    assert (kept.load(record) is not None) == taken
 
 
-def as_bytes(picture):
-    return [None if part is None else (part.dtype.str, part.shape, part.tobytes()) for part in picture]
 
 
-def test_another_command_has_pictures_of_its_own(drawn, request_of, tmp_path, fault, fresh):
-    request = request_of(2)
-    drawn(request, keep=tmp_path)
-    fresh()
-    fault("always")
-    with pytest.raises(GeneratorError, match="never any mesh"):
-        drawn(request, keep=tmp_path, files=(__file__,), attempts=1)
 
 
 def test_where_temporary_files_find_no_room(command):
@@ -332,7 +258,7 @@ def test_a_pool_is_closed_while_a_fork_of_its_process_runs(command, running):
         os.waitpid(fork, 0)
 
 
-def test_a_guard_that_is_ended_changes_nothing(drawn, request_of, command, running, fresh):
+def test_a_guard_that_is_ended_changes_nothing(drawn, request_of, command, running, fresh, same):
     request = request_of(6)
     whole = drawn(request)
     fresh()
@@ -346,10 +272,6 @@ def test_a_guard_that_is_ended_changes_nothing(drawn, request_of, command, runni
     assert not any(running(group) for group in workers)
 
 
-def test_a_folder_that_cannot_be_written_is_named(drawn, request_of, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(MachineError, match="file.*, which keep= of the Command names, actual Not a directory"):
-        drawn(request_of(1), keep=tmp_path / "file")
 
 
 def pool_of_a_child(argv, out):
