@@ -1,6 +1,6 @@
 """The baselines at their best: each guide and objective gets the same search over its settings, beside the default.
 
-    python benchmarks/baselines.py [--fits lstm pcfg grammar-vae mmd witness js] [--draws 12] [--seeds 0 1 2]
+    python benchmarks/baselines.py [--fits lstm pcfg grammar-vae mmd witness js] [--draws 9] [--seeds 0]
 
 Structures of Aerial 2D, with true counts of roads and of cars by road instead of images: what is compared is how a
 distribution is learnt, and not how images are read. The search draws step size, steps a batch, baseline and number of
@@ -182,7 +182,7 @@ def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     out_option(parser, __file__)
     parser.add_argument("--fits", nargs="+", default=["lstm", "pcfg"], choices=["lstm", *GUIDES, *OBJECTIVES])
-    parser.add_argument("--draws", type=int, default=12, help="settings that are tried")
+    parser.add_argument("--draws", type=int, default=9, help="settings that are tried")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     args = parser.parse_args()
     torch.set_num_threads(1)

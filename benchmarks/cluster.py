@@ -1,8 +1,8 @@
 """What a Ray cluster costs, and what a node costs that dies or freezes.
 
-    python benchmarks/cluster.py [--out FOLDER] [--images 20000] [--repeats 3] [--disturbed 6000]
+    python benchmarks/cluster.py [--out FOLDER] [--images 20000] [--repeats 1] [--disturbed 6000]
 
-First one process, two workers and ``--cluster auto`` make the same Multi-MNIST images, in turn and several times:
+First one process, two workers and ``--cluster auto`` make the same Multi-MNIST images, in turn, once or several times:
 seconds, and seconds of CPU of all processes, those of Ray among them; and what workers and a cluster cost with a chunk
 for each. ``more`` is by how much the CPU of a cluster exceeds that of two workers, each without its start, each time.
 Then three simulated nodes of one core each make fewer images, undisturbed, and with a node killed after a quarter and
@@ -76,7 +76,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     out_option(parser, __file__)
     parser.add_argument("--images", type=int, default=20_000)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--disturbed", type=int, default=6_000)
     args = parser.parse_args()
     out, found = args.out, {"command": command(__file__)}

@@ -1,6 +1,6 @@
 """Whether a fit learns structure through a generator, Panda3D or Blender, by images alone.
 
-    python benchmarks/learn_generator.py [--out FOLDER] [--example panda3d] [--seeds 0 1 2] [--images 2000]
+    python benchmarks/learn_generator.py [--out FOLDER] [--example panda3d] [--seeds 0] [--images 2000]
         [--preset quick] [--features count=efficientnet] [--set key=value]
 
 Each seed has a target of its own, drawn to a folder by ``generate``, in processes of its own: pallets with hidden
@@ -63,7 +63,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     out_option(parser, __file__)
     parser.add_argument("--example", choices=MODELS, default="panda3d")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--features", help="as of probscene fit")

@@ -1,6 +1,6 @@
-"""Whether data sets of hundreds of thousands of images can be made and read: time, memory, and every label.
+"""Whether data sets of many images can be made and read: time, memory, and every label.
 
-    python benchmarks/many_images.py [--out FOLDER] [--images 300000] [--workers 2] [--formats webdataset coco]
+    python benchmarks/many_images.py [--out FOLDER] [--images 30000] [--workers 2] [--formats webdataset coco]
 
 A Multi-MNIST run, whose fit is as short as can be, generates the images in each format, by the command line. It is
 interrupted once, at a third, and given again. Printed are hours in all; megabytes of all its processes together
@@ -83,7 +83,7 @@ def read_coco(out: Path) -> tuple[int, int]:
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     out_option(parser, __file__)
-    parser.add_argument("--images", type=int, default=300_000)
+    parser.add_argument("--images", type=int, default=30_000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--formats", nargs="+", choices=("webdataset", "coco"), default=["webdataset", "coco"])
     args = parser.parse_args()

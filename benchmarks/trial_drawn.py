@@ -1,6 +1,6 @@
 """What learning is worth to a detector, on targets that the models draw themselves.
 
-    python benchmarks/trial_drawn.py [--out FOLDER] [--models multi_mnist] [--presentations 1200] [--seeds 5]
+    python benchmarks/trial_drawn.py [--out FOLDER] [--models multi_mnist] [--presentations 1200] [--seeds 2]
 
 For each model a target of another structure and layout (``SceneModel.target``) is drawn, a fit sees its images alone,
 and ``probscene trial`` compares what is generated of the prior, of the start and of what was learnt, tested on 500 of
@@ -32,7 +32,7 @@ def main():
     parser.add_argument("--images", type=int, default=2000, help="of the target, for the fit")
     parser.add_argument("--generate", type=int, default=600)
     parser.add_argument("--presentations", type=int, default=1200)
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0, help="of the target and of all else")
     parser.add_argument("--workers", type=int, default=1)
     args = parser.parse_args()
