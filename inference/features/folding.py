@@ -1,12 +1,13 @@
 """A frozen EfficientNet-Lite in fewer passes over memory: the same function, but for rounding.
 
 Batch normalisation goes into the convolution before it, a convolution pads by itself where the library gives it a
-module for that, and what is clipped is written over.
+module for that, one of single pixels is a product of matrices, and what is clipped is written over.
 """
 
 import torch
+import torch.nn.functional as F
 from efficientnet_lite_pytorch import EfficientNet
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 PAIRS = (("_conv_stem", "_bn0"), ("_conv_head", "_bn1"))
@@ -22,8 +23,27 @@ def fold(net: EfficientNet) -> None:
         for convolution, norm in pairs:
             if hasattr(part, convolution):  # the first block does not expand
                 _pad_alone(getattr(part, convolution))
-                setattr(part, convolution, fuse_conv_bn_eval(getattr(part, convolution), getattr(part, norm)))
+                fused = fuse_conv_bn_eval(getattr(part, convolution), getattr(part, norm))
+                setattr(part, convolution, Pointwise(fused) if fused.kernel_size == (1, 1) else fused)
                 setattr(part, norm, nn.Identity())
+
+
+class Pointwise(nn.Module):
+    """A 1 x 1 convolution of images that lie in memory with their channels last. torch takes each image apart for it
+    where one thread is given few of them.
+
+    Args:
+        convolution: the same function.
+    """
+
+    def __init__(self, convolution: nn.Conv2d):
+        super().__init__()
+        self.weight, self.bias = nn.Parameter(convolution.weight.flatten(1)), convolution.bias
+        self.out_channels = convolution.out_channels
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(N, out_channels, H, W)``."""
+        return F.linear(x.permute(0, 2, 3, 1), self.weight, self.bias).permute(0, 3, 1, 2)
 
 
 def _pad_alone(convolution: nn.Conv2d) -> None:

@@ -56,9 +56,10 @@ def _own_cache(tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def _few_images_are_looked_at():
-    """By a verdict on layout and looks."""
+    """By a verdict."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("probscene.app.judging.looked.IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.judge.AFTER_A_FIT", 60)
         yield
 
 

@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..base import Examples
-from ..pretrained import AT_ONCE, EfficientNetLite
+from ..pretrained import AT_ONCE, LAST, EfficientNetLite
 from ..projection import bandwidth
 from .head import KINDS, Head, Maps
 from .readability import rules_for_renders, scopes_without_labels
@@ -194,9 +194,8 @@ class PretrainedCountNet(nn.Module):
 
     def normal(self, maps: Maps) -> Maps:
         """Maps in their channels' scales, float32."""
-        return [
-            (some.float() - getattr(self, f"mean_{i}")) / getattr(self, f"scale_{i}") for i, some in enumerate(maps)
-        ]
+        wide = [some.float().contiguous(memory_format=LAST) for some in maps]
+        return [(some - getattr(self, f"mean_{i}")) / getattr(self, f"scale_{i}") for i, some in enumerate(wide)]
 
     def forward(self, maps: Maps) -> list[Tensor]:
         """For each of ``KINDS``, logits of the places by each head, ``(HEADS, N, its scopes, 1 + C, h, w)``, of maps as
