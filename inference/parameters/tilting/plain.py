@@ -9,6 +9,7 @@ from torch import Tensor
 
 ROWS = 8  # parts of an image from top to bottom
 FINE = 10.0  # noise and edges are so many times smaller than light
+AT_ONCE = 8  # images, so that they stay in the processor's cache from one number to the next
 
 
 def plain(images: Tensor) -> Tensor:
@@ -18,6 +19,10 @@ def plain(images: Tensor) -> Tensor:
     References:
         [1] Immerkær, *Fast noise variance estimation*, Computer Vision and Image Understanding 1996.
     """
+    return torch.cat([_plain(some) for some in images.split(AT_ONCE)])
+
+
+def _plain(images: Tensor) -> Tensor:
     x = images.expand(-1, 3, -1, -1) / 255
     grey, most = x.mean(1, keepdim=True), x.amax(1)
     kernel = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
