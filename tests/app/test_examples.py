@@ -53,7 +53,8 @@ def test_other_presets_and_objectives_run(words, call, photos, tmp_path):
         "learn=structure",
     )
     few = [word for setting in few for word in ("--set", setting)]
-    done = call("fit", TABLETOP, "--target", photos, "--out", tmp_path / "run", "--threads", 1, "--no-verdict", *words, *few)
+    out = ["--target", photos, "--out", tmp_path / "run", "--threads", 1, "--no-verdict"]
+    done = call("fit", TABLETOP, *out, *words, *few)
     assert done.code == 0, done.err
     run = RunFolder.at(tmp_path / "run")
     guide = "lstm" if "--guide" not in words else words[words.index("--guide") + 1]

@@ -44,7 +44,36 @@ class Assembly(NamedTuple):
         each = [[] for _ in range(number)]
         for k, image in enumerate(found.image.tolist()):
             each[image].append(k)
-        return [self._scene(found, some) for some in each]
+        label, above, stage, axis = (part.tolist() for part in (found.label, self.above, self.stage, self.axis))
+
+        def parent(k: int, objects: list[int]) -> int:
+            """The object nearest to where object ``k`` says that its parent is; -1 for none."""
+            some = [j for j in objects if above[label[k]][label[j]] and j != k]
+            if not some:
+                return -1
+            away = (found.centre[some] - found.parent[k]).norm(dim=-1)
+            return some[int(away.argmin())]
+
+        def scene(objects: list[int]) -> list[tuple[int, int]]:
+            drawn = dict(zip(objects, torch.rand(len(objects)).tolist(), strict=True))
+            below: dict[int, list[int]] = {}
+            for k in objects:
+                below.setdefault(parent(k, objects), []).append(k)
+            order: list[tuple[int, int]] = []
+
+            def key(k: int) -> tuple[int, float]:
+                way = axis[label[k]]
+                return stage[label[k]], drawn[k] if way == SHUFFLED else float(found.centre[k, way])
+
+            def add(parent: int, place: int) -> None:
+                for k in sorted(below.get(parent, []), key=key):
+                    order.append((k, place))
+                    add(k, len(order) - 1)
+
+            add(-1, -1)
+            return order
+
+        return [scene(some) for some in each]
 
     def values(self, found: Found, number: int, mean: Tensor, sd: Tensor) -> tuple[Tensor, ...]:
         """Kind and parent ``(L, M)`` of the scene graphs, and the mean and standard deviation of their sites
@@ -59,35 +88,6 @@ class Assembly(NamedTuple):
         index = object_of.clamp(min=0)
         kind = torch.where(there, self.kinds[found.label[index]], -1) if len(found.label) else object_of
         return kind, parent, *(_spread_out(part, index, there) for part in (mean, sd))
-
-    def _scene(self, found: Found, objects: list[int]) -> list[tuple[int, int]]:
-        label, anywhere = found.label.tolist(), torch.rand(len(objects)).tolist()
-        drawn = dict(zip(objects, anywhere, strict=True))
-        below: dict[int, list[int]] = {}
-        for k in objects:
-            below.setdefault(self._parent(found, k, objects), []).append(k)
-        order: list[tuple[int, int]] = []
-
-        def key(k: int) -> tuple[int, float]:
-            axis = int(self.axis[label[k]])
-            return int(self.stage[label[k]]), drawn[k] if axis == SHUFFLED else float(found.centre[k, axis])
-
-        def add(parent: int, place: int) -> None:
-            for k in sorted(below.get(parent, []), key=key):
-                order.append((k, place))
-                add(k, len(order) - 1)
-
-        add(-1, -1)
-        return order
-
-    def _parent(self, found: Found, k: int, objects: list[int]) -> int:
-        """The object nearest to where object ``k`` says that its parent is; -1 for none."""
-        allowed = self.above[found.label[k]]
-        some = [j for j in objects if allowed[found.label[j]] and j != k]
-        if not some:
-            return -1
-        away = (found.centre[some] - found.parent[k]).norm(dim=-1)
-        return some[int(away.argmin())]
 
 
 def assembly(

@@ -19,6 +19,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.judging.farther import Farther
+from probscene.inference.parameters import learning
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.reading import reader, skill
 from probscene.model import SceneModel, scene_model
@@ -36,6 +37,8 @@ def anything_is_read(patch):
     patch.setattr(reader, "LEAST_MASS", (1e-3,))
     patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
     patch.setattr(judged, "passed", lambda *_: frozenset())
+    for renders in ("TRIED", "ASSEMBLED", "MISSED"):
+        patch.setattr(learning, renders, 40)
 
 
 @pytest.fixture(scope="module")

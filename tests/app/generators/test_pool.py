@@ -225,16 +225,6 @@ def test_a_program_starts_no_more_once_its_pool_is_closed(command, fault, runnin
     assert set(pool.processes()) <= set(groups)
 
 
-
-
-
-
-
-
-
-
-
-
 def test_where_temporary_files_find_no_room(command):
     pool = pool_for(command(attempts=1), 0)
     shutil.rmtree(pool.folder)
@@ -270,8 +260,6 @@ def test_a_guard_that_is_ended_changes_nothing(drawn, request_of, command, runni
     workers = pool.processes()
     fresh()
     assert not any(running(group) for group in workers)
-
-
 
 
 def pool_of_a_child(argv, out):

@@ -107,7 +107,7 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     monkeypatch.setattr(reader, "LEAST_MASS", (10.0,))  # no object is found
     counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
-    schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=0, energy_steps=0, reader_images=2)
+    schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=2, rounds=0, energy_steps=0, reader_images=2)
     empty = torch.zeros(30, 3, 64, 64, dtype=torch.uint8)
     learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: empty, schedule)
     learning.run()
@@ -124,6 +124,8 @@ def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
     monkeypatch.setattr(missing, "FEWEST", 1)
     monkeypatch.setattr(missing, "TOLD", 0.0)
+    for renders in ("TRIED", "ASSEMBLED", "MISSED"):
+        monkeypatch.setattr(f"probscene.inference.parameters.learning.{renders}", 60)
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     few = {"scene_renders": 4, "round_scene_renders": 4, "energy_steps": 0}
     schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=1, round_reader_steps=1, round_steps=30, **few)

@@ -272,6 +272,7 @@ def test_heads_teach_themselves_what_they_half_see(learnt, dots, draw_twice):
     drawn = draw_twice(30)
     pale = (drawn.image.float() * 0.15).byte()
     taught = training(dots, draw_twice, 80, 15, 64, 8, photographs=pale)
+    taught.restore(learnt[0].state())
     taught.run()
     assert taught.total == 16 and taught.done == 16
     true = taught.net.true_counts(drawn)[:, LARGE].mean(0)
