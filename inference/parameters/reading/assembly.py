@@ -46,7 +46,7 @@ class Assembly(NamedTuple):
             each[image].append(k)
         label, above, stage, axis = (part.tolist() for part in (found.label, self.above, self.stage, self.axis))
 
-        def parent(k: int, objects: list[int]) -> int:
+        def parent_of(k: int, objects: list[int]) -> int:
             """The object nearest to where object ``k`` says that its parent is; -1 for none."""
             some = [j for j in objects if above[label[k]][label[j]] and j != k]
             if not some:
@@ -58,7 +58,7 @@ class Assembly(NamedTuple):
             drawn = dict(zip(objects, torch.rand(len(objects)).tolist(), strict=True))
             below: dict[int, list[int]] = {}
             for k in objects:
-                below.setdefault(parent(k, objects), []).append(k)
+                below.setdefault(parent_of(k, objects), []).append(k)
             order: list[tuple[int, int]] = []
 
             def key(k: int) -> tuple[int, float]:
