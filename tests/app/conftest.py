@@ -14,7 +14,6 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import counts_of_dataset
 from probscene.app.labelling.counts import write_counts
 from probscene.app.loading import load_model
-from probscene.inference.features.pretrained import EfficientNetLite
 
 DISCS = Path(__file__).with_name("discs.py")
 SHORT = {
@@ -56,11 +55,9 @@ def _own_cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _few_small_images_are_looked_at():
-    """By a verdict, and by the pretrained network, which has its own tests."""
+def _few_images_are_looked_at():
+    """By a verdict."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
-        patch.setattr("probscene.inference.features.photographs.heads.SIZES", (96, 342))
         patch.setattr("probscene.app.judging.looked.IMAGES", 60)
         patch.setattr("probscene.app.evaluation.judge.AFTER_A_FIT", 60)
         yield
