@@ -1,20 +1,24 @@
 """What each part of the method is worth: a fit with one thing changed at a time, on targets with hidden structures.
 
-    python benchmarks/ablate.py [--model multi_mnist] [--preset quick] [--seeds 0] [--only NAME ...] [--out FOLDER]
+    python benchmarks/ablate.py [--model multi_mnist] [--preset quick] [--seeds 0] [--only NAME ...] [--workers N]
 
 Each seed's target is drawn by the model itself with another distribution of structures (``SceneModel.target``), and
 fits see its images alone. Figures are of 20,000 learnt structures against 20,000 of the target's: the total variation
 of the number of objects of each class, averaged over classes, and log q of 5,000 held-out structures, nats a scene,
 with the share of them that the guide cannot derive. Beside the fits are the prior, the start and the floor: as many
-structures of the target as it has images. FOLDER holds the runs, ``results.json``, ``results.csv`` and a figure,
-``ablation.png``. An interrupted run goes on.
+structures of the target as it has images. Fits are of one thread each, as many at a time as there are cores.
+The folder of ``--out`` holds the runs, ``results.json``, ``results.csv`` and a figure, ``ablation.png``. An interrupted
+run goes on.
 """
 
 import argparse
 import csv
 import json
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +43,7 @@ from probscene.inference.judging.metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
+from probscene.threads import cores, use_threads
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -112,34 +117,49 @@ def figures(model: SceneModel, policy: Policy, truth: np.ndarray, held_out: Deri
     }
 
 
-def of_seed(args, seed: int) -> list[dict]:
-    """The rows of a seed, one for each variant."""
-    model = load_model(args.model)
-    target = model.target(seed)
-    images = args.out / f"target-{seed}"
-    generate_scenes(target, target.prior, args.images, images, seed=1000 + seed, format="images")
+def targets_own(args, seed: int) -> tuple[SceneModel, np.ndarray, Derivation]:
+    """The target of a seed, how many objects of each class are in its structures, and structures that no fit sees."""
+    target = load_model(args.model).target(seed)
     truth = counted(target, target.prior)
     seed_everything(98)
-    held_out, _ = derive_complete(target.grammar, target.prior, HELD_OUT, target.max_steps)
+    return target, truth, derive_complete(target.grammar, target.prior, HELD_OUT, target.max_steps)[0]
+
+
+def of_variant(args, seed: int, name: str) -> dict:
+    """The row of a variant, which is fitted in a process of its own."""
+    keep_freed_memory()
+    use_threads(1)
+    start, variant = time.monotonic(), VARIANTS[name]
+    other = changed(load_model(args.model), args.model, variant)
+    base = replace(preset(args.preset), learn=STRUCTURE, prior_if_worse=False)
+    images, path = args.out / f"target-{seed}" / "images", args.out / f"{name.replace(' ', '-')}-{seed}"
+    chosen = override(base, list(variant.settings))
+    run = fit(other, images, chosen, seed, out=path, resume=True, cache=args.out / "cache")
+    took, (_, truth, held_out) = round(time.monotonic() - start, 1), targets_own(args, seed)
+    found = figures(run.model, run.guide, truth, held_out)
+    return {"variant": name, "settings": " ".join(variant.settings), "seed": seed, **found, "seconds": took}
+
+
+def of_seed(args, seed: int) -> list[dict]:
+    """The rows of a seed, one for each variant."""
+    target, truth, held_out = targets_own(args, seed)
+    images = args.out / f"target-{seed}"
+    generate_scenes(target, target.prior, args.images, images, seed=1000 + seed, format="images")
     sample = counted(target, target.prior, args.images + len(truth))[len(truth) :]
-    floor = [total_variation(histogram(sample[:, i]), histogram(truth[:, i])) for i in range(len(model.classes))]
-    own = figures(model, target.prior, truth, held_out) | {"total_variation": round(float(np.mean(floor)), 4)}
+    floor = [total_variation(histogram(sample[:, i]), histogram(truth[:, i])) for i in range(len(target.classes))]
+    own = figures(target, target.prior, truth, held_out) | {"total_variation": round(float(np.mean(floor)), 4)}
     rows = [{"variant": FLOOR, "settings": "", "seed": seed, **own, "seconds": 0.0}]
+    model = load_model(args.model)
     for name, policy in before(model).items():
         rows.append(
             {"variant": name, "settings": "", "seed": seed, **figures(model, policy, truth, held_out), "seconds": 0.0}
         )
-    base = replace(preset(args.preset), learn=STRUCTURE, prior_if_worse=False)
-    for name, variant in variants(model, args.only).items():
-        start, path = time.monotonic(), args.out / f"{name.replace(' ', '-')}-{seed}"
-        chosen = override(base, list(variant.settings))
-        other = changed(model, args.model, variant)
-        run = fit(other, images / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
-        found = figures(run.model, run.guide, truth, held_out)
-        settings = " ".join(variant.settings)
-        took = round(time.monotonic() - start, 1)
-        rows.append({"variant": name, "settings": settings, "seed": seed, **found, "seconds": took})
-        print(json.dumps(rows[-1]), flush=True)
+    with ProcessPoolExecutor(args.workers, get_context("spawn")) as pool:
+        _, *others = variants(model, args.only)
+        first = pool.submit(of_variant, args, seed, AS_IT_IS).result()  # alone: its network is most others', too
+        for row in (first, *pool.map(partial(of_variant, args, seed), others)):
+            print(json.dumps(row), flush=True)
+            rows.append(row)
     return rows
 
 
@@ -170,6 +190,7 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=5000)
     parser.add_argument("--only", nargs="*", default=[], choices=VARIANTS, help="of the variants")
+    parser.add_argument("--workers", type=int, default=cores(), help="fits at a time (%(default)s)")
     args = parser.parse_args()
     args.out /= args.model
     keep_freed_memory()
