@@ -175,6 +175,41 @@ def test_the_gradient_of_all_terms_is_exact_where_derivations_may_not_end(dots, 
     assert float(runs.mean(0).norm() / exact.norm()) == pytest.approx(1, abs=0.05)
 
 
+def test_the_gradient_of_a_shared_mmd_is_exact_where_derivations_may_not_end(dots, monkeypatch):
+    """Every pair of scenes is a batch, in proportion to its probability: with one reward for both, an estimate of
+    random batches would take tens of thousands."""
+    pyro.set_rng_seed(7)
+    guide = LSTMGuide(dots.grammar, 6, hidden=8)
+    derivations = enumerate_derivations(dots.grammar, 6)
+    features = derivations.counts(len(dots.grammar.kinds)).float()
+    real = features[torch.randint(len(features), (50,))]
+    log_q = guide.log_prob(derivations)
+    ends = log_q.exp().sum()
+    q, failing = log_q.exp() / ends, 1 - ends
+    kernel = torch.exp(-0.5 * (features.unsqueeze(1) - features).square().sum(-1))
+    across = torch.exp(-0.5 * (features.unsqueeze(1) - real).square().sum(-1)).mean(1)
+    penalties = 0.7 * failing**2 + 0.5 * 0.2 * (failing / ends) ** 2
+    exact = gradients((q @ kernel @ q - 2 * q @ across) / 2 + penalties, guide)
+
+    loss = ScoreFunction(
+        lambda scenes: scenes.derivation.counts(len(dots.grammar.kinds)).float(), MMD(1.0), "moving_average",
+        decay=1e-6, reject_weight=0.7, incompletion_weight=0.2,
+    )  # fmt: skip
+    failed = (failing / ends).detach().expand(2)
+    q, pairs = q.detach(), torch.cartesian_prod(*2 * [torch.arange(len(features))])
+    mean = float(q @ kernel @ q - 2 * q @ across) + float(
+        torch.exp(-0.5 * (real.unsqueeze(1) - real).square().sum(-1)).fill_diagonal_(0).sum() / (50 * 49)
+    )
+    found, drawn = torch.zeros_like(exact), "probscene.inference.objective.derive_complete"
+    for pair in pairs:
+        monkeypatch.setattr(drawn, lambda *_, pair=pair: (derivations[pair], failed))
+        loss.averages, loss.batch = {0: mean}, None
+        found += q[pair].prod() * gradients(loss(dots, guide, 2, real=real), guide)
+    assert 0.2 < float(ends.detach()) < 0.9 and len(features) > 4
+    assert float(torch.nn.functional.cosine_similarity(found, exact, 0)) >= 0.999
+    assert float(found.norm() / exact.norm()) == pytest.approx(1, abs=0.01)
+
+
 OBJECTIVES = {
     "kde": KDELogRatio(1.0, None),
     "kde and marginals": KDELogRatio(1.0, 0.3),
