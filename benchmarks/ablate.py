@@ -134,7 +134,7 @@ def of_variant(args, seed: int, name: str) -> dict:
     base = replace(preset(args.preset), learn=STRUCTURE, prior_if_worse=False)
     images, path = args.out / f"target-{seed}" / "images", args.out / f"{name.replace(' ', '-')}-{seed}"
     chosen = override(base, list(variant.settings))
-    run = fit(other, images, chosen, seed, out=path, resume=True, cache=args.out / "cache")
+    run = fit(other, images, chosen, seed, threads=1, out=path, resume=True, cache=args.out / "cache")
     took, (_, truth, held_out) = round(time.monotonic() - start, 1), targets_own(args, seed)
     found = figures(run.model, run.guide, truth, held_out)
     return {"variant": name, "settings": " ".join(variant.settings), "seed": seed, **found, "seconds": took}

@@ -14,6 +14,12 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+def default_threads() -> int:
+    """As many as ``OMP_NUM_THREADS`` says, which torch goes by as well, and schedulers set; else one for each core."""
+    first = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()  # the others are of nested loops
+    return int(first) if first.isdecimal() and int(first) else cores()
+
+
 @contextmanager
 def threads(number: int) -> Iterator[None]:
     """So many of torch's threads inside; as many as before afterwards.

@@ -10,6 +10,7 @@ import pytest
 
 import probscene
 from probscene.cache import cache_folder
+from probscene.threads import cores, default_threads
 
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = [
@@ -135,6 +136,14 @@ def test_text_is_read_and_written_the_same_everywhere(file):
 def test_only_one_module_sets_how_many_threads_torch_has():
     setters = [file for file in LIBRARY if "set_num_threads" in file.read_text(encoding="utf-8")]
     assert setters == [ROOT / "probscene" / "threads.py"]
+
+
+@pytest.mark.parametrize("said", ["3", " 3 ", "3,1", "", "0", "many", None])
+def test_threads_are_as_many_as_the_environment_says_or_as_cores(monkeypatch, said):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if said is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", said)
+    assert default_threads() == (3 if "3" in (said or "") else cores())
 
 
 @pytest.mark.parametrize(

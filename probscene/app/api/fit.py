@@ -75,7 +75,7 @@ def fit(
             images look as wholes, for photographs; or ``"meta-sim"``, a baseline; what suits the features where None.
         settings: other values of the preset's fields, ``{"batches": 20, "count.steps": 300}``.
         skip_bad: leave out files that do not decode.
-        threads: of torch; all cores where None. Another number rounds differently.
+        threads: of torch; as ``OMP_NUM_THREADS`` says, else all cores, where None. Another number rounds differently.
         assets: a folder that the model is drawn with.
         cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
             folder.

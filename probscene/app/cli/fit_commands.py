@@ -51,7 +51,7 @@ def fit(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same result; 0 if not given.")] = None,
     skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = None,
-    threads: Annotated[int | None, typer.Option(help="All cores if not given.")] = None,
+    threads: Annotated[int | None, typer.Option(help="As OMP_NUM_THREADS says if not given, else all cores.")] = None,
     scenarios: Annotated[
         str | None,
         typer.Option(metavar="NAME,...", help="Of a model that has several; a guide learns each. All if not given."),

@@ -17,7 +17,7 @@ from probscene.inference.features.base import Features
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
-from probscene.threads import cores
+from probscene.threads import default_threads
 
 from ..checking.generator_check import cost
 from ..checking.model_check import QUICK, check_model
@@ -73,8 +73,7 @@ def begin(
     """A new run; nothing is written before the model, the target and every image in it are found to be good.
 
     Args:
-        threads: of torch; all that this process may use where None. Another number rounds differently, so it is
-            recorded.
+        threads: of torch; see ``default_threads`` where None. Another number rounds differently, so it is recorded.
         assets: a folder that the model is drawn with.
         parts: what the user brought as objects.
         make: the class of the run.
@@ -101,7 +100,7 @@ def begin(
         "target": _lasting_target(target),
         "skip_bad": skip_bad,
         "seed": seed,
-        "threads": threads or cores(),
+        "threads": threads or default_threads(),
         "preset": dataclasses.asdict(preset),
         "guide": preset.guide_settings(),
     }
