@@ -100,13 +100,13 @@ def apart(generated: Features, real: Features, judged: int = JUDGED, splits: int
     n = min(judged, len(generated), len(real) // 2)
     real, generated = _some(real, 8 * n, rng), _some(generated, 8 * n, rng)
     within, across, theirs = cdist(real, real), cdist(real, generated), cdist(generated, generated)
-    found, floor = np.empty(splits), np.empty(splits)
+    a, b, g = (np.zeros((splits, number)) for number in (len(real), len(real), len(generated)))
     for s in range(splits):
         order = rng.permutation(len(real))
-        a, b, g = order[:n], order[n : 2 * n], rng.permutation(len(generated))[:n]
-        aa = _mean(within, a, a)
-        floor[s] = _root(2 * _mean(within, a, b) - aa - _mean(within, b, b))
-        found[s] = _root(2 * _mean(across, a, g) - aa - _mean(theirs, g, g))
+        a[s, order[:n]], b[s, order[n : 2 * n]], g[s, rng.permutation(len(generated))[:n]] = 1 / n, 1 / n, 1 / n
+    aa = _means(within, a, a)
+    floor = _roots(2 * _means(within, a, b) - aa - _means(within, b, b))
+    found = _roots(2 * _means(across, a, g) - aa - _means(theirs, g, g))
     return _beside(found, floor, n)
 
 
@@ -173,12 +173,13 @@ def _some(rows: Features, most: int, rng: np.random.Generator) -> Features:
     return rows if len(rows) <= most else rows[rng.permutation(len(rows))[:most]]
 
 
-def _mean(distances: NDArray[np.floating], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> float:
-    return float(distances[np.ix_(rows, columns)].mean())
+def _means(distances: Features, rows: Features, columns: Features) -> Features:
+    """Mean distances ``(S,)`` by weights of the rows ``(S, N)`` and of the columns ``(S, L)``."""
+    return ((rows @ distances) * columns).sum(1)
 
 
-def _root(value: float) -> float:
-    return float(np.sqrt(max(0.0, value)))
+def _roots(values: Features) -> Features:
+    return np.sqrt(values.clip(min=0))
 
 
 def _beside(found: Features, floor: Features, judged: int) -> Apart:

@@ -44,7 +44,7 @@ def close_to(rng, shares, far):
     return shares + (other - shares) * min(1, far / (np.abs(other - shares).sum() / 2))
 
 
-def aerial(case, rng, N=900, L=800):
+def aerial(case, rng, N=500, L=450):
     prior, real = roads(rng, N, (1, 1, 1, 1), cars=some_cars), roads(rng, L)
     if case == "good":
         return roads(rng, N), real, prior
@@ -64,7 +64,7 @@ def aerial(case, rng, N=900, L=800):
     return roads(rng, N, PAPER, 4.5, 4.5), real, prior  # what no context-free grammar can do better
 
 
-def numbers(case, rng, N=900, L=800):
+def numbers(case, rng, N=500, L=450):
     lengths, classes = rng.dirichlet(np.ones(11)), rng.dirichlet(np.ones(10))
     uniform, longest = np.full(11, 1 / 11), np.eye(11)
     prior, real = digits(rng, N, uniform, TEN), digits(rng, L, lengths, classes)
