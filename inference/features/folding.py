@@ -1,7 +1,8 @@
 """A frozen EfficientNet-Lite in fewer passes over memory: the same function, but for rounding.
 
 Batch normalisation goes into the convolution before it, a convolution pads by itself where the library gives it a
-module for that, one of single pixels is a product of matrices, and what is clipped is written over.
+module for that, which copies the maps, one of single pixels is a product of matrices, and what is clipped is written
+over.
 """
 
 import torch
@@ -47,6 +48,10 @@ class Pointwise(nn.Module):
 
 
 def _pad_alone(convolution: nn.Conv2d) -> None:
-    sides: list[int] = list(getattr(convolution.static_padding, "padding", ()))
-    if len(set(sides)) == 1:  # those that halve pad one side only, which a convolution cannot
-        convolution.padding, convolution.static_padding = (sides[0], sides[0]), nn.Identity()
+    left, right, *others = getattr(convolution.static_padding, "padding", (0, 0, 0, 0))
+    if others != [left, right] or right - left not in (0, 1):
+        return
+    if left < right:  # those that halve: after a row and a column of zeros in the kernel both sides are alike
+        convolution.weight = nn.Parameter(F.pad(convolution.weight, (1, 0, 1, 0)))
+        convolution.kernel_size = (convolution.weight.shape[2], convolution.weight.shape[3])
+    convolution.padding, convolution.static_padding = (right, right), nn.Identity()
