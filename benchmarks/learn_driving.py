@@ -5,7 +5,7 @@
 Each seed's target is drawn by the driving models themselves with another, random distribution of structures
 (``SceneModel.target``); fits see its images. Printed for each seed is the total variation of the number of cars in a
 scene, 20,000 structures of the prior, the start and the learnt guide against 20,000 of the target's, and how long the
-fit took.
+fit took. The floor is as many structures of the target as it has images.
 """
 
 import argparse
@@ -31,6 +31,8 @@ from probscene.inference.judging.metrics import histogram, total_variation, wass
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
+
+FLOOR = "floor"
 
 
 def counted(model: SceneModel, policy: Policy, num: int = 20_000) -> np.ndarray:
@@ -62,8 +64,10 @@ def main():
         run = fit(args.model, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
         truth = counted(model, target.prior)
         row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
-        for name, policy in {**before(run.model), LEARNT: run.guide}.items():
-            found = counted(model, policy)
+        policies = {**before(run.model), LEARNT: run.guide}
+        counts = {name: counted(model, policy) for name, policy in policies.items()}
+        counts[FLOOR] = counted(model, target.prior, len(truth) + args.images)[len(truth) :]
+        for name, found in counts.items():
             each = {
                 c: round(total_variation(histogram(found[:, i]), histogram(truth[:, i])), 4)
                 for i, c in enumerate(model.classes)
@@ -73,7 +77,7 @@ def main():
         rows.append(row)
         print(json.dumps(row), flush=True)
         write_json(args.out / "results.json", rows)
-    for name in (name for name in FITTED if name in rows[0]):
+    for name in (name for name in (*FITTED, FLOOR) if name in rows[0]):
         cars = [row[name]["total_variation"]["car"] for row in rows]
         print(f"{name:8} cars, total variation: mean {np.mean(cars):.3f}, {min(cars):.3f} to {max(cars):.3f}")
 
