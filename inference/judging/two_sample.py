@@ -173,7 +173,7 @@ def _some(rows: Features, most: int, rng: np.random.Generator) -> Features:
     return rows if len(rows) <= most else rows[rng.permutation(len(rows))[:most]]
 
 
-def _means(distances: Features, rows: Features, columns: Features) -> Features:
+def _means(distances: NDArray[np.floating], rows: Features, columns: Features) -> Features:
     """Mean distances ``(S,)`` by weights of the rows ``(S, N)`` and of the columns ``(S, L)``."""
     return ((rows @ distances) * columns).sum(1)
 
