@@ -28,6 +28,15 @@ def small():
         features = derivations.counts(len(grammar.kinds)).float()
 
         @staticmethod
+        def observe(scenes):
+            return scenes.derivation.counts(len(Small.grammar.kinds)).float()
+
+        @staticmethod
+        def cost(generated, real):
+            """It depends on the scene alone, so that the expected gradient is a finite sum."""
+            return (generated * torch.linspace(-1, 1.5, len(Small.grammar.kinds)) ** 3).sum(1) + 2.0
+
+        @staticmethod
         def program(num_scenes, structure=None):
             with pyro.plate("scenes", num_scenes, dim=-2):
                 policy = structure or StructurePrior(Small.grammar)

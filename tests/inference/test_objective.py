@@ -1,4 +1,4 @@
-"""The score-function gradient against the exact one, on a grammar that can be enumerated."""
+"""The objective: what a batch, its baseline and its costs are, and that a guide learns by it."""
 
 from dataclasses import replace
 
@@ -9,75 +9,19 @@ from pyro.infer import SVI
 from pyro.optim import Adam
 
 from probscene.app.fitting.presets import QUICK
-from probscene.enumeration import enumerate_derivations
 from probscene.errors import ModelError, ProbsceneError
-from probscene.inference.divergence import MMD, JensenShannon, KDELogRatio
+from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import FAR, ScoreFunction
 from probscene.structure import StructurePrior, counts
 
 
-def structure_features(small):
-    return lambda scenes: scenes.derivation.counts(len(small.grammar.kinds)).float()
-
-
-class FixedCost:
-    """A cost that depends on the scene alone, so that the expected gradient is a finite sum."""
-
-    def __init__(self, small):
-        self.weights = torch.linspace(-1, 1.5, len(small.grammar.kinds)) ** 3
-
-    def __call__(self, generated, real):
-        return (generated * self.weights).sum(1) + 2.0
-
-
-def gradients(loss, guide):
-    for p in guide.parameters():
-        p.grad = None
-    loss.backward()
-    return torch.cat([torch.zeros(p.numel()) if p.grad is None else p.grad.flatten() for p in guide.parameters()])
-
-
-def assert_estimates(draw, exact):
-    """The mean of eight estimates is the exact gradient, but for their error."""
-    runs = torch.stack([draw() for _ in range(8)])
-    mean, error = runs.mean(0), runs.std(0) / 8**0.5
-    away = exact.abs() > 1e-3
-    assert ((mean - exact).abs()[away] < 6 * error[away] + 1e-4).all()
-    assert torch.nn.functional.cosine_similarity(mean, exact, 0) > 0.98
-
-
-@pytest.mark.parametrize("latents", [1, 3])
-@pytest.mark.parametrize("baseline", ["leave_one_out", "moving_average", "none"])
-def test_gradient_is_the_exact_one(small, baseline, latents):
-    pyro.set_rng_seed(1)
-    guide = LSTMGuide(small.grammar, 4, hidden=8, num_latents=latents)
-    cost = FixedCost(small)
-    log_q = guide.log_prob(small.derivations)
-    exact = gradients((log_q.exp() * cost(small.features, None)).sum(), guide)
-    loss = ScoreFunction(structure_features(small), cost, baseline=baseline)
-    assert_estimates(lambda: gradients(loss(small.program, guide, 4000, real=None), guide), exact)
-
-
-def test_kde_gradient_tends_to_the_enumerated_one(small):
-    pyro.set_rng_seed(2)
-    guide = LSTMGuide(small.grammar, 4, hidden=8)
-    log_q = guide.log_prob(small.derivations)
-    kernel = torch.exp(-0.5 * (small.features.unsqueeze(1) - small.features).square().sum(-1))
-    cost = ((kernel @ log_q.exp()) / (kernel @ small.target)).log().detach()
-    exact = gradients((log_q.exp() * cost).sum(), guide)
-    real = small.features[torch.multinomial(small.target, 4000, replacement=True)]
-    loss = ScoreFunction(structure_features(small), KDELogRatio(1.0, None))
-    runs = torch.stack([gradients(loss(small.program, guide, 2000, real=real), guide) for _ in range(6)])
-    assert torch.nn.functional.cosine_similarity(runs.mean(0), exact, 0) > 0.97
-
-
 def test_svi_learns_the_target_distribution(small):
     pyro.set_rng_seed(0)
     guide = LSTMGuide(small.grammar, 4, hidden=16)
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
-    loss = ScoreFunction(structure_features(small), KDELogRatio(0.2, None), updates=2)
+    loss = ScoreFunction(small.observe, KDELogRatio(0.2, None), updates=2)
 
     def distance():
         return 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item()
@@ -116,7 +60,7 @@ def test_each_objective_learns_from_samples(small, objective):
     torch.manual_seed(0)
     guide = LSTMGuide(small.grammar, 4, hidden=16)
     preset = replace(QUICK, variance=0.2, marginal_variance=None).with_objective(objective)
-    loss = ScoreFunction(structure_features(small), preset.divergence(), preset.baseline, updates=preset.updates)
+    loss = ScoreFunction(small.observe, preset.divergence(), preset.baseline, updates=preset.updates)
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
     Trainer(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=preset.learning_rate).run()
     with torch.no_grad():
@@ -126,8 +70,7 @@ def test_each_objective_learns_from_samples(small, objective):
 def test_value_is_the_mean_cost_and_batches_are_reused(small):
     guide = LSTMGuide(small.grammar, 4, hidden=8)
     seen = []
-    features = structure_features(small)
-    loss = ScoreFunction(lambda scenes: seen.append(1) or features(scenes), FixedCost(small), updates=3)
+    loss = ScoreFunction(lambda scenes: seen.append(1) or small.observe(scenes), small.cost, updates=3)
     values = [loss(small.program, guide, 50, real=None).item() for _ in range(6)]
     assert len(seen) == 2
     assert values[0] == values[1] == values[2] == pytest.approx(values[0])
@@ -137,7 +80,7 @@ def test_value_is_the_mean_cost_and_batches_are_reused(small):
 def test_moving_average_is_the_papers(small):
     """b <- 0.05 new + 0.95 b, from the first batch's mean."""
     guide = LSTMGuide(small.grammar, 4, hidden=8)
-    loss = ScoreFunction(structure_features(small), FixedCost(small), baseline="moving_average")
+    loss = ScoreFunction(small.observe, small.cost, baseline="moving_average")
     expected = None
     for _ in range(4):
         loss(small.program, guide, 20, real=None)
@@ -145,160 +88,6 @@ def test_moving_average_is_the_papers(small):
         expected = new if expected is None else 0.05 * new + 0.95 * expected
         assert loss.averages == {0: pytest.approx(expected)}
         assert torch.allclose(loss.batch.advantage, loss.batch.cost - expected)
-
-
-@pytest.mark.parametrize("threshold", [0.0, 1.0, 2.5])
-@pytest.mark.parametrize("costs", ["none", "fixed"])
-def test_the_gradient_of_all_terms_is_exact_where_derivations_may_not_end(dots, costs, threshold):
-    """Of the cost of scenes that ended, the probability of more failed attempts than the threshold, and half their
-    squared number; two thirds of the derivations end."""
-    pyro.set_rng_seed(6)
-    guide = LSTMGuide(dots.grammar, 6, hidden=8)
-    kinds = (
-        torch.linspace(-1, 1.5, len(dots.grammar.kinds)) if costs == "fixed" else torch.zeros(len(dots.grammar.kinds))
-    )
-    derivations = enumerate_derivations(dots.grammar, 6)
-    log_q = guide.log_prob(derivations)
-    ends = log_q.exp().sum()
-    assert 0.3 < float(ends.detach()) < 0.8
-    failing = 1 - ends
-    of_scene = (derivations.counts(len(dots.grammar.kinds)) * kinds).sum(1)
-    expected = (log_q.exp() * of_scene).sum() / ends
-    penalty = failing ** (int(threshold) + 1)
-    exact = gradients(expected + 0.7 * penalty + 0.5 * 0.2 * (failing / ends) ** 2, guide)
-    loss = ScoreFunction(
-        lambda scenes: scenes.derivation.counts(len(dots.grammar.kinds)).float(), lambda g, r: (g * kinds).sum(1),
-        reject_weight=0.7, reject_threshold=threshold, incompletion_weight=0.2,
-    )  # fmt: skip
-    runs = torch.stack([gradients(loss(dots, guide, 20_000, real=None), guide) for _ in range(6)])
-    assert float(torch.nn.functional.cosine_similarity(runs.mean(0), exact, 0)) >= 0.999
-    assert float(runs.mean(0).norm() / exact.norm()) == pytest.approx(1, abs=0.05)
-
-
-def test_the_gradient_of_a_shared_mmd_is_exact_where_derivations_may_not_end(dots, monkeypatch):
-    """Every pair of scenes is a batch, in proportion to its probability: with one reward for both, an estimate of
-    random batches would take tens of thousands."""
-    pyro.set_rng_seed(7)
-    guide = LSTMGuide(dots.grammar, 6, hidden=8)
-    derivations = enumerate_derivations(dots.grammar, 6)
-    features = derivations.counts(len(dots.grammar.kinds)).float()
-    real = features[torch.randint(len(features), (50,))]
-    log_q = guide.log_prob(derivations)
-    ends = log_q.exp().sum()
-    q, failing = log_q.exp() / ends, 1 - ends
-    kernel = torch.exp(-0.5 * (features.unsqueeze(1) - features).square().sum(-1))
-    across = torch.exp(-0.5 * (features.unsqueeze(1) - real).square().sum(-1)).mean(1)
-    penalties = 0.7 * failing**2 + 0.5 * 0.2 * (failing / ends) ** 2
-    exact = gradients((q @ kernel @ q - 2 * q @ across) / 2 + penalties, guide)
-
-    loss = ScoreFunction(
-        lambda scenes: scenes.derivation.counts(len(dots.grammar.kinds)).float(), MMD(1.0), "moving_average",
-        decay=1e-6, reject_weight=0.7, incompletion_weight=0.2,
-    )  # fmt: skip
-    failed = (failing / ends).detach().expand(2)
-    q, pairs = q.detach(), torch.cartesian_prod(*2 * [torch.arange(len(features))])
-    mean = float(q @ kernel @ q - 2 * q @ across) + float(
-        torch.exp(-0.5 * (real.unsqueeze(1) - real).square().sum(-1)).fill_diagonal_(0).sum() / (50 * 49)
-    )
-    found, drawn = torch.zeros_like(exact), "probscene.inference.objective.derive_complete"
-    for pair in pairs:
-        monkeypatch.setattr(drawn, lambda *_, pair=pair: (derivations[pair], failed))
-        loss.averages, loss.batch = {0: mean}, None
-        found += q[pair].prod() * gradients(loss(dots, guide, 2, real=real), guide)
-    assert 0.2 < float(ends.detach()) < 0.9 and len(features) > 4
-    assert float(torch.nn.functional.cosine_similarity(found, exact, 0)) >= 0.999
-    assert float(found.norm() / exact.norm()) == pytest.approx(1, abs=0.01)
-
-
-OBJECTIVES = {
-    "kde": KDELogRatio(1.0, None),
-    "kde and marginals": KDELogRatio(1.0, 0.3),
-    "js": JensenShannon(1.0, 0.3),
-    "witness": MMD(1.0, shared=False),
-}
-
-
-@pytest.mark.parametrize("objective", OBJECTIVES.values(), ids=OBJECTIVES)
-def test_the_gradient_of_each_objective_is_exact_where_derivations_may_not_end(dots, objective):
-    """With the penalties, and densities that are sums over all derivations, of which a fifth do not end."""
-    pyro.set_rng_seed(6)
-    guide = LSTMGuide(dots.grammar, 6, hidden=8)
-    derivations = enumerate_derivations(dots.grammar, 6)
-    features = derivations.counts(len(dots.grammar.kinds)).float()
-    target = torch.distributions.Dirichlet(torch.ones(len(features))).sample()
-    log_q = guide.log_prob(derivations)
-    ends = log_q.exp().sum()
-    failing, of_ended = 1 - ends, (log_q.exp() / ends).detach()
-
-    def densities(x, variance):
-        kernel = torch.exp(-0.5 / variance * (x.unsqueeze(1) - x).square().sum(-1))
-        return kernel @ of_ended, kernel @ target
-
-    def ratio(x, variance):
-        own, real = densities(x, variance)
-        return objective.of_ratio((own / real).log())
-
-    if isinstance(objective, MMD):
-        own, real = densities(features, objective.variance)
-        cost = 2 * (own - real)
-    else:
-        marginal = objective.marginal_variance
-        cost = ratio(features, objective.variance)
-        cost = cost + (0 if marginal is None else sum(ratio(x, marginal) for x in features.T.unsqueeze(-1)))
-    expected = (log_q.exp() * cost).sum() / ends
-    exact = gradients(expected + 0.7 * failing**2 + 0.5 * 0.2 * (failing / ends) ** 2, guide)
-    loss = ScoreFunction(
-        lambda scenes: scenes.derivation.counts(len(dots.grammar.kinds)).float(), objective,
-        reject_weight=0.7, reject_threshold=1.0, incompletion_weight=0.2,
-    )  # fmt: skip
-
-    def estimate():
-        real = features[torch.multinomial(target, 4000, replacement=True)]
-        return gradients(loss(dots, guide, 4000, real=real), guide)
-
-    mean = torch.stack([estimate() for _ in range(6)]).mean(0)
-    assert float(torch.nn.functional.cosine_similarity(mean, exact, 0)) >= 0.999
-    assert float(mean.norm() / exact.norm()) == pytest.approx(1, abs=0.05)
-
-
-def test_what_failed_attempts_cost_is_not_scaled(dots):
-    """The paper scales the log ratio, and gives the penalty a weight of its own."""
-    grads = []
-    for scale in (1.0, 1e-2):
-        pyro.set_rng_seed(7)
-        guide = LSTMGuide(dots.grammar, 6, hidden=8)
-        loss = ScoreFunction(
-            lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)), scale=scale
-        )
-        grads.append(gradients(loss(dots, guide, 500, real=None), guide))
-    assert grads[0].any() and torch.equal(*grads)
-
-
-def test_leaked_probability_is_drawn_back(dots):
-    """The gradient of half the squared number of failed attempts, exactly: of a truncated grammar's complete part."""
-    pyro.set_rng_seed(3)
-    guide = LSTMGuide(dots.grammar, 6, hidden=8)
-    complete = guide.log_prob(enumerate_derivations(dots.grammar, 6)).exp().sum()
-    failures = (1 - complete) / complete
-    assert failures > 0.05
-    exact = gradients(0.5 * 3.0 * failures**2, guide)
-    loss = ScoreFunction(
-        lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
-        reject_weight=0.0, incompletion_weight=3.0,
-    )  # fmt: skip
-    assert_estimates(lambda: gradients(loss(dots, guide, 4000, real=None), guide), exact)
-
-
-def test_an_anchor_draws_toward_its_policy(small):
-    """The gradient of the weighted KL from the anchor, exactly."""
-    pyro.set_rng_seed(4)
-    guide, prior = LSTMGuide(small.grammar, 4, hidden=8), StructurePrior(small.grammar)
-    log_q = guide.log_prob(small.derivations)
-    exact = gradients(0.5 * (log_q.exp() * (log_q - prior.log_prob(small.derivations))).sum(), guide)
-    loss = ScoreFunction(
-        structure_features(small), lambda g, r: torch.zeros(len(g)), prior=prior, prior_kl_weight=0.5
-    )  # fmt: skip
-    assert_estimates(lambda: gradients(loss(small.program, guide, 4000, real=None), guide), exact)
 
 
 def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
@@ -315,7 +104,7 @@ def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
 def test_evaluating_the_loss_changes_nothing(small):
     """Neither the batch, nor how many updates it has left, nor a moving average."""
     guide = LSTMGuide(small.grammar, 4, hidden=8)
-    loss = ScoreFunction(structure_features(small), FixedCost(small), baseline="moving_average", updates=3)
+    loss = ScoreFunction(small.observe, small.cost, baseline="moving_average", updates=3)
     svi = SVI(small.program, guide, Adam({"lr": 1e-3}), loss=loss)
     first = svi.evaluate_loss(40, real=None)
     assert loss.batch is None and loss.averages == {} and first == pytest.approx(2.0, abs=1.5)
@@ -331,7 +120,7 @@ def test_evaluating_the_loss_changes_nothing(small):
 
 def test_other_arguments_start_another_batch(small):
     guide = LSTMGuide(small.grammar, 4, hidden=8)
-    loss = ScoreFunction(structure_features(small), FixedCost(small), updates=5)
+    loss = ScoreFunction(small.observe, small.cost, updates=5)
     real = small.features, small.features + 1
     drawn = []
     for num, given in ((30, real[0]), (30, real[0].clone()), (20, real[0]), (20, real[1]), (20, real[1])):
@@ -343,7 +132,7 @@ def test_other_arguments_start_another_batch(small):
 
 
 def test_a_guide_that_is_none_is_told_what_is_missing(small):
-    loss = ScoreFunction(structure_features(small), FixedCost(small))
+    loss = ScoreFunction(small.observe, small.cost)
     with pytest.raises(ModelError, match="log_prob and max_steps, actual StructurePrior without max_steps"):
         loss(small.program, StructurePrior(small.grammar), 20, real=None)
     with pytest.raises(ModelError, match="actual function without grammar, log_prob, max_steps"):
@@ -353,4 +142,4 @@ def test_a_guide_that_is_none_is_told_what_is_missing(small):
 def test_bad_arguments_are_named(small):
     for arguments in ({"baseline": "median"}, {"updates": 0}, {"decay": 0.0}, {"clip": -1.0}, {"reject_threshold": -1}):
         with pytest.raises(ProbsceneError, match="Expected"):
-            ScoreFunction(structure_features(small), FixedCost(small), **arguments)
+            ScoreFunction(small.observe, small.cost, **arguments)
