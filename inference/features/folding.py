@@ -1,8 +1,7 @@
 """A frozen EfficientNet-Lite in fewer passes over memory: the same function, but for rounding.
 
-Batch normalisation goes into the convolution before it, a convolution pads by itself where the library gives it a
-module for that, which copies the maps, one of single pixels is a product of matrices, and what is clipped is written
-over.
+Batch normalisation goes into the convolution before it, a convolution pads by itself and not by a module, which would
+copy the maps, one of single pixels is a product of matrices, and what is clipped is written over.
 """
 
 import torch
