@@ -1,14 +1,14 @@
 """What each part of the method is worth: a fit with one thing changed at a time, on targets with hidden structures.
 
     python benchmarks/ablate.py [--model multi_mnist] [--preset quick] [--seeds 0] [--only NAME ...] [--workers N]
+                                [--images 5000] [--out FOLDER]
 
 Each seed's target is drawn by the model itself with another distribution of structures (``SceneModel.target``), and
 fits see its images alone. Figures are of 20,000 learnt structures against 20,000 of the target's: the total variation
 of the number of objects of each class, averaged over classes, and log q of 5,000 held-out structures, nats a scene,
 with the share of them that the guide cannot derive. Beside the fits are the prior, the start and the floor: as many
 structures of the target as it has images. Fits are of one thread each, as many at a time as there are cores.
-The folder of ``--out`` holds the runs, ``results.json``, ``results.csv`` and a figure, ``ablation.png``. An interrupted
-run goes on.
+FOLDER holds the runs, ``results.json``, ``results.csv`` and a figure, ``ablation.png``. An interrupted run goes on.
 """
 
 import argparse
@@ -26,7 +26,7 @@ import matplotlib
 import numpy as np
 import torch
 from given import command, out_option
-from learn_driving import counted
+from learn_driving import FLOOR, counted, sampled_anew
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
@@ -48,7 +48,7 @@ from probscene.threads import cores, use_threads
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-AS_IT_IS, FLOOR = "as it is", "floor"
+AS_IT_IS = "as it is"
 HELD_OUT = 5000
 COLUMNS = ("variant", "settings", "seed", "total_variation", "log_q", "impossible", "seconds")
 
@@ -117,16 +117,8 @@ def figures(model: SceneModel, policy: Policy, truth: np.ndarray, held_out: Deri
     }
 
 
-def targets_own(args, seed: int) -> tuple[SceneModel, np.ndarray, Derivation]:
-    """The target of a seed, how many objects of each class are in its structures, and structures that no fit sees."""
-    target = load_model(args.model).target(seed)
-    truth = counted(target, target.prior)
-    seed_everything(98)
-    return target, truth, derive_complete(target.grammar, target.prior, HELD_OUT, target.max_steps)[0]
-
-
-def of_variant(args, seed: int, name: str) -> dict:
-    """The row of a variant, which is fitted in a process of its own."""
+def of_variant(args, seed: int, truth: np.ndarray, held_out: Derivation, name: str) -> dict:
+    """The row of a variant, which is fitted in a process of its own; the others are as of ``figures``."""
     keep_freed_memory()
     use_threads(1)
     start, variant = time.monotonic(), VARIANTS[name]
@@ -135,29 +127,31 @@ def of_variant(args, seed: int, name: str) -> dict:
     images, path = args.out / f"target-{seed}" / "images", args.out / f"{name.replace(' ', '-')}-{seed}"
     chosen = override(base, list(variant.settings))
     run = fit(other, images, chosen, seed, threads=1, out=path, resume=True, cache=args.out / "cache")
-    took, (_, truth, held_out) = round(time.monotonic() - start, 1), targets_own(args, seed)
-    found = figures(run.model, run.guide, truth, held_out)
+    took, found = round(time.monotonic() - start, 1), figures(run.model, run.guide, truth, held_out)
     return {"variant": name, "settings": " ".join(variant.settings), "seed": seed, **found, "seconds": took}
 
 
 def of_seed(args, seed: int) -> list[dict]:
     """The rows of a seed, one for each variant."""
-    target, truth, held_out = targets_own(args, seed)
-    images = args.out / f"target-{seed}"
+    model = load_model(args.model)
+    target, images = model.target(seed), args.out / f"target-{seed}"
     generate_scenes(target, target.prior, args.images, images, seed=1000 + seed, format="images")
-    sample = counted(target, target.prior, args.images + len(truth))[len(truth) :]
+    truth = counted(target, target.prior)
+    seed_everything(98)
+    held_out, _ = derive_complete(target.grammar, target.prior, HELD_OUT, target.max_steps)
+    sample = sampled_anew(target, args.images)
     floor = [total_variation(histogram(sample[:, i]), histogram(truth[:, i])) for i in range(len(target.classes))]
     own = figures(target, target.prior, truth, held_out) | {"total_variation": round(float(np.mean(floor)), 4)}
     rows = [{"variant": FLOOR, "settings": "", "seed": seed, **own, "seconds": 0.0}]
-    model = load_model(args.model)
     for name, policy in before(model).items():
         rows.append(
             {"variant": name, "settings": "", "seed": seed, **figures(model, policy, truth, held_out), "seconds": 0.0}
         )
     with ProcessPoolExecutor(args.workers, get_context("spawn")) as pool:
         _, *others = variants(model, args.only)
-        first = pool.submit(of_variant, args, seed, AS_IT_IS).result()  # alone: its network is most others', too
-        for row in (first, *pool.map(partial(of_variant, args, seed), others)):
+        fitted = partial(of_variant, args, seed, truth, held_out)
+        first = pool.submit(fitted, AS_IT_IS).result()  # alone: its network is most others', too
+        for row in (first, *pool.map(fitted, others)):
             print(json.dumps(row), flush=True)
             rows.append(row)
     return rows

@@ -33,13 +33,19 @@ from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
 FLOOR = "floor"
+TRUTH = 20_000  # structures
 
 
-def counted(model: SceneModel, policy: Policy, num: int = 20_000) -> np.ndarray:
+def counted(model: SceneModel, policy: Policy, num: int = TRUTH) -> np.ndarray:
     """``(num, classes)``, objects of each class in derivations of a policy."""
     seed_everything(99)
     derivation, _ = derive_complete(model.grammar, policy, num, model.max_steps)
     return derivation.counts(len(model.grammar.kinds))[:, [model.grammar.kind(name) for name in model.classes]].numpy()
+
+
+def sampled_anew(model: SceneModel, num: int) -> np.ndarray:
+    """``(num, classes)``, of structures of a target that ``counted`` has not drawn: the floor."""
+    return counted(model, model.prior, TRUTH + num)[TRUTH:]
 
 
 def main():
@@ -66,7 +72,7 @@ def main():
         row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
         policies = {**before(run.model), LEARNT: run.guide}
         counts = {name: counted(model, policy) for name, policy in policies.items()}
-        counts[FLOOR] = counted(model, target.prior, len(truth) + args.images)[len(truth) :]
+        counts[FLOOR] = sampled_anew(target, args.images)
         for name, found in counts.items():
             each = {
                 c: round(total_variation(histogram(found[:, i]), histogram(truth[:, i])), 4)
