@@ -24,18 +24,22 @@ def photographed(images: Tensor, rng: np.random.Generator) -> Tensor:
 
 def _one(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """``(C, H, W)`` of ``(H, W, C)``."""
+
+    def normal(spread: float, *shape: int) -> np.ndarray:
+        return np.asarray(rng.normal(0, spread, shape), np.float32)  # doubles would make all pixels doubles
+
     x = image.astype(np.float32) / 255
     if x.shape[2] == 3:
-        x = x * np.exp(rng.normal(0, CHANNEL, 3)).astype(np.float32)
+        x = x * np.exp(normal(CHANNEL, 3))
         grey = x.mean(2, keepdims=True)
-        x = grey + (x - grey) * np.exp(rng.normal(0, SATURATION))
-    x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, GAMMA))
+        x = grey + (x - grey) * np.exp(normal(SATURATION))
+    x = np.clip(x, 0, 1) ** np.exp(normal(GAMMA))
     mean = x.mean()
-    x = mean + (x - mean) * np.exp(rng.normal(0, CONTRAST)) + rng.normal(0, EXPOSURE)
+    x = mean + (x - mean) * np.exp(normal(CONTRAST)) + normal(EXPOSURE)
     blur = rng.uniform(0, BLUR)
     if blur > 0.3:
         x = cv2.GaussianBlur(x, (0, 0), blur).reshape(x.shape)
-    x = x + rng.normal(0, rng.uniform(0, NOISE), x.shape)
+    x = x + normal(rng.uniform(0, NOISE), *x.shape)
     x = np.rint(np.clip(x, 0, 1) * 255).astype(np.uint8)
     _, coded = cv2.imencode(".jpg", x, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(*QUALITY))])
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)).reshape(x.shape).transpose(2, 0, 1)
