@@ -6,10 +6,12 @@ from the target's images r. With own renders x', that distance changes with the 
 
     w(x) = E |x - r| - E |x - x'|
 
-so that exp(-eta w) q is a step of mirror descent on it, a natural gradient step of length eta [2]. The guide is fitted
-to it by maximum likelihood, on scenes drawn in proportion to exp(-eta w), as in the cross-entropy method [3]; eta is
-as large as leaves a given effective share of them. Distances to the target that no parameter changes, as photographs
-are not renders, are the same for all scenes and weigh nothing.
+so that exp(-eta w) q is a step of mirror descent on it, a natural gradient step of length eta [2]. Most of w is chance:
+where objects stand, and noise. So the step is along v, what a linear regression on numbers of the chosen sites says of
+w. The guide is fitted to it by maximum likelihood, on scenes drawn in proportion to exp(-eta v), as in the
+cross-entropy method [3]; eta is as large as leaves a given effective share of them, but smaller where v could be chance
+as well [6]. Distances to the target that no parameter changes, as photographs are not renders, are the same for all
+scenes and weigh nothing.
 
 Several sorts of features each have a w, in units of the gradient's norm; along their sum none of the distances grows,
 as in multiple-gradient descent [4].
@@ -24,6 +26,7 @@ References:
     [3] Rubinstein, *The cross-entropy method for combinatorial and continuous optimization*, 1999.
     [4] Désidéri, *Multiple-gradient descent algorithm for multiobjective optimization*, 2012.
     [5] Benjamini and Hochberg, *Controlling the false discovery rate*, 1995.
+    [6] Ezekiel, *Methods of correlation analysis*, 1930: the adjusted coefficient of determination.
 """
 
 from collections.abc import Callable
@@ -152,8 +155,9 @@ class TiltingLearning:
         self.chosen |= torch.from_numpy(false_discovery_control(p) < CHANCE)
         self._pass()
         if self.chosen.any():
-            seed = batch_seed(self.seed, 2, self.done)
-            _Weighted(guide.net, values, tilted(w, self.schedule.kept), self.chosen, self.schedule, seed).run()
+            v, sure = explained(values.scene[:, self.chosen], w)
+            weight = tilted(v, 1 - sure * (1 - self.schedule.kept))
+            _Weighted(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
         return sum(apart for _, apart in each)
 
     def _pass(self) -> None:
@@ -207,11 +211,19 @@ def beside_structure(kind: Tensor, w: Features) -> Features:
 
 
 def unit(u: Tensor, w: Features) -> float:
-    """The standard deviation of what a linear regression on numbers of all sites' u ``(N, G)`` explains of w: the norm
-    of the gradient that a guide can follow. A tenth of w's own, if that is more."""
-    x = np.concatenate([numbers(one) for one in u.unbind(1)], 1)
-    said = x @ np.linalg.lstsq(x, w - w.mean(), rcond=None)[0]
-    return max(float(said.std()), SMALL * float(w.std()), LEAST)
+    """The standard deviation of what is explained of w by all sites' u ``(N, G)``: the norm of the gradient that a
+    guide can follow. A tenth of w's own, if that is more."""
+    return max(float(explained(u, w)[0].std()), SMALL * float(w.std()), LEAST)
+
+
+def explained(u: Tensor, w: Features) -> tuple[Features, float]:
+    """What a linear regression on numbers of sites' u ``(N, G)`` says of w, less its mean, ``(N,)``; and the share of
+    its variance that is more than chance would give, 0 to 1."""
+    x, y = np.concatenate([numbers(one) for one in u.unbind(1)], 1), w - w.mean()
+    slope, _, rank, _ = np.linalg.lstsq(x, y, rcond=None)
+    v = x @ slope
+    found, left, freedom = np.square(v).sum(), np.square(y - v).sum(), len(y) - 1 - int(rank)
+    return v, max(0.0, 1 - float(rank * left / freedom / found)) if found and freedom > 0 else 0.0
 
 
 def numbers(u: Tensor) -> Features:
@@ -231,6 +243,8 @@ def tilted(w: Features, kept: float) -> Features:
     def more(eta: float) -> float:
         return 1 / np.square(weight(eta)).sum() / len(w) - kept
 
+    if kept >= 1:
+        return weight(0.0)
     return weight(root_scalar(more, bracket=(0.0, STRONGEST)).root if more(STRONGEST) < 0 else STRONGEST)
 
 
@@ -241,6 +255,6 @@ def dependence(u: Tensor, w: Features) -> Tensor:
     for one in u.unbind(1):
         left, singular, _ = np.linalg.svd(numbers(one), full_matrices=False)
         left = left[:, singular > LEAST * len(y) ** 0.5]
-        explained, whole = np.square(left.T @ y).sum(), np.square(y).sum()
-        rows.append((len(y) * float(explained / whole) if whole else 0.0, float(left.shape[1])))
+        found, whole = np.square(left.T @ y).sum(), np.square(y).sum()
+        rows.append((len(y) * float(found / whole) if whole else 0.0, float(left.shape[1])))
     return torch.tensor(rows).reshape(-1, 2)

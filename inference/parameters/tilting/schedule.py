@@ -17,9 +17,9 @@ class TiltingSchedule:
         images: of the target, at most.
     """
 
-    rounds: int = 20
+    rounds: int = 10
     first: int = 2000
-    scenes: int = 500
+    scenes: int = 400
     kept: float = 0.4
     steps: int = 60
     rate: float = 5e-3

@@ -17,6 +17,8 @@ from probscene.inference.parameters.tilting.learning import (
     TiltingLearning,
     beside_structure,
     dependence,
+    explained,
+    numbers,
     tilted,
     witness,
 )
@@ -39,6 +41,39 @@ def test_as_many_scenes_are_effective_as_are_kept(seed, number, kept):
 
 def test_scenes_that_are_all_as_near_weigh_the_same():
     assert tilted(np.full(20, 3.0), 0.4) == pytest.approx(np.full(20, 0.05))
+
+
+@given(seeds, st.integers(1, 60), st.floats(0.9999999, 1))
+def test_where_all_are_kept_all_weigh_the_same(seed, number, kept):
+    w = np.random.default_rng(seed).normal(size=number)
+    assert tilted(w, kept) == pytest.approx(np.full(number, 1 / number), rel=0.02)
+
+
+@given(seeds, st.integers(20, 400), st.integers(1, 4), st.floats(0, 2))
+def test_what_is_explained_of_w_is_its_regression(seed, number, sites, strength):
+    """By the normal equations; the share beyond chance by the adjusted coefficient of determination."""
+    rng = np.random.default_rng(seed)
+    u = torch.from_numpy(rng.uniform(size=(number, sites)))
+    w = strength * np.sin(6 * u[:, 0].numpy()) + rng.normal(size=number)
+    x, y = np.concatenate([numbers(one) for one in u.unbind(1)], 1), w - w.mean()
+    v, sure = explained(u, w)
+    assert v == pytest.approx(x @ np.linalg.solve(x.T @ x, x.T @ y), abs=1e-6)
+    determined, freedom = 1 - np.square(y - v).sum() / np.square(y).sum(), number - 4 * sites - 1
+    adjusted = 1 - (1 - determined) * (number - 1) / freedom
+    assert sure == pytest.approx(max(0, adjusted / determined), abs=1e-6)
+
+
+@pytest.mark.parametrize(("number", "w"), [(50, lambda u: 0 * u + 3), (5, lambda u: u), (1, lambda u: u)])
+def test_nothing_is_explained_surely_of_one_value_or_of_few_scenes(number, w):
+    u = torch.from_numpy(np.random.default_rng(0).uniform(size=(number, 2)))
+    assert explained(u, w(u[:, 0].numpy()))[1] == 0
+
+
+def test_noise_is_mostly_known_for_what_it_is():
+    rng, found = np.random.default_rng(0), []
+    for _ in range(300):
+        found.append(explained(torch.from_numpy(rng.uniform(size=(500, 9))), rng.normal(size=500))[1])
+    assert np.mean(found) < 0.2 and np.mean(np.array(found) == 0) > 0.4
 
 
 @given(seeds, st.floats(0, 20), st.floats(30, 200), st.floats(0, 25))
