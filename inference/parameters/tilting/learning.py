@@ -149,13 +149,14 @@ class TiltingLearning:
         features, values = self._drawn(guide, self.schedule.scenes if self.done else self.schedule.first)
         each = [witness(own, real) for own, real in zip(features, self.real, strict=True)]
         freed = [beside_structure(values.kind, w) for w, _ in each]
-        w = np.stack([w / unit(values.scene, w) for w in freed]).sum(0)
+        w = together(values.scene, freed)
         self.dependence += dependence(values.scene, w).where(~self.chosen.unsqueeze(1), 0.0)
         p = chi2.sf(self.dependence[:, 0].numpy(), self.dependence[:, 1].numpy().clip(min=1))
         self.chosen |= torch.from_numpy(false_discovery_control(p) < CHANCE)
         self._pass()
         if self.chosen.any():
-            v, sure = explained(values.scene[:, self.chosen], w)
+            of = values.scene[:, self.chosen]
+            v, sure = explained(of, together(of, freed))
             weight = tilted(v, 1 - sure * (1 - self.schedule.kept))
             _Weighted(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
         return sum(apart for _, apart in each)
@@ -210,20 +211,25 @@ def beside_structure(kind: Tensor, w: Features) -> Features:
     return w - x @ np.linalg.lstsq(x, w, rcond=None)[0]
 
 
+def together(u: Tensor, each: list[Features]) -> Features:
+    """The sum of several w, each in its ``unit``."""
+    return np.stack([w / unit(u, w) for w in each]).sum(0)
+
+
 def unit(u: Tensor, w: Features) -> float:
-    """The standard deviation of what is explained of w by all sites' u ``(N, G)``: the norm of the gradient that a
-    guide can follow. A tenth of w's own, if that is more."""
+    """The standard deviation of what sites' u ``(N, G)`` explain of w: the norm of the gradient that a guide of these
+    sites can follow. A tenth of w's own, if that is more."""
     return max(float(explained(u, w)[0].std()), SMALL * float(w.std()), LEAST)
 
 
 def explained(u: Tensor, w: Features) -> tuple[Features, float]:
     """What a linear regression on numbers of sites' u ``(N, G)`` says of w, less its mean, ``(N,)``; and the share of
-    its variance that is more than chance would give, 0 to 1."""
+    its standard deviation that is more than chance would give, 0 to 1."""
     x, y = np.concatenate([numbers(one) for one in u.unbind(1)], 1), w - w.mean()
     slope, _, rank, _ = np.linalg.lstsq(x, y, rcond=None)
     v = x @ slope
     found, left, freedom = np.square(v).sum(), np.square(y - v).sum(), len(y) - 1 - int(rank)
-    return v, max(0.0, 1 - float(rank * left / freedom / found)) if found and freedom > 0 else 0.0
+    return v, max(0.0, 1 - float(rank * left / freedom / found)) ** 0.5 if found and freedom > 0 else 0.0
 
 
 def numbers(u: Tensor) -> Features:
