@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TiltingSchedule:
-    """The defaults were chosen on blood smears.
+    """The defaults were chosen on blood smears and KITTI's frames.
 
     Args:
         rounds: of drawing, tilting and fitting.
         first: scenes of the first round, in which it is seen which sites tell; each is rendered.
         scenes: of each other round.
-        kept: effective share of a round's scenes that is left when they are weighted, 0 to 1.
+        kept: effective share of a round's scenes that is left when they are weighted, 0 to 1; more where what is
+            explained of them could be chance.
         steps: of maximum likelihood on them.
         rate: its largest learning rate.
         images: of the target, at most.
