@@ -166,7 +166,8 @@ def resume(
     if photographs is not None and preset is not None and run.preset.features == photographs.features:
         preset = photographs
     if preset is not None:  # field by field, so that the message names the one that differs
-        given |= dataclasses.asdict(preset)
+        unread = run.preset.unread()  # another version may have other defaults of these
+        given |= {key: value for key, value in dataclasses.asdict(preset).items() if key not in unread}
         before |= dataclasses.asdict(run.preset)
     for key, value in given.items():
         if value != before[key]:

@@ -179,6 +179,17 @@ def test_resuming_takes_what_the_run_was_begun_with(quick, discs, target, python
         quick(discs.file, target.images, out=python_run.path)
 
 
+def test_resuming_does_not_ask_for_settings_that_nothing_reads(quick, discs, target, python_run):
+    assert python_run.preset.parameter_method == "likelihood"
+    begun, out = python_run.preset, python_run.path
+    other = replace(begun, tilting=replace(begun.tilting, rounds=begun.tilting.rounds + 1))
+    again = quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
+    assert learnt(again) == learnt(python_run)
+    other = replace(begun, parameters=replace(begun.parameters, rounds=begun.parameters.rounds + 1))
+    with pytest.raises(ps.RunError, match="Expected the parameters that the run"):
+        quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
+
+
 def test_a_fit_of_objects_goes_on_with_them(quick, discs, target, tmp_path, monkeypatch):
     model, images = ps.load_model(discs.file), sources(sorted(target.images.glob("*.png")))["array"]
     whole = quick(model, images, features=Means())
