@@ -54,15 +54,22 @@ class SpriteRenderer:
             ModelError: it is a world; the drawing holds what cannot be drawn, see ``instances``.
             ProbsceneError: in a process forked from one in which Taichi ran.
         """
+        return self._rendered(drawing, True)
+
+    def labels(self, drawing: Renderable) -> RenderBatch:
+        """What rendering gives, but black images, in less time; errors as above."""
+        return self._rendered(drawing, False)
+
+    def _rendered(self, drawing: Renderable, coloured: bool) -> RenderBatch:
         if not isinstance(drawing, Drawing):
             raise ModelError(f"Expected a Drawing of sprites, actual a {type(drawing).__name__}; take MeshRenderer.")
         engine.start()
         height, width = self.canvas
         scenes, nodes = drawing.kind.shape
-        table = instances(drawing, self._sheet, self.canvas)
+        table = instances(drawing, self._sheet, self.canvas, coloured)
         first = np.searchsorted(table.scene, np.arange(scenes + 1)).astype(np.int32)
         pixels = scenes * height * width
-        image = self._background(drawing, scenes)
+        image = self._background(drawing, scenes) if coloured else self._black(scenes)
         instance = np.zeros(_even(pixels), np.int16)
         result = np.zeros((max(1, scenes), max(1, nodes), kernel.RESULTS), np.int64)
         step = _even(max(1, _CHUNK // (height * width) - 3))
@@ -71,11 +78,11 @@ class SpriteRenderer:
             part = slice(start * height * width, _even(stop * height * width))
             rgb, ids = image[3 * part.start : 3 * part.stop], instance[part]
             kernel.paint(
-                min(self.threads, stop - start), stop - start, height, width, nodes,
+                min(self.threads, stop - start), stop - start, height, width, nodes, coloured,
                 np.zeros(1, np.int32), first[start : stop + 1].copy(), table.whole, table.real, self._sheet.texels,
                 self._sheet.colours, rgb, rgb.view(np.uint32), ids, ids.view(np.int64), result[start:stop].reshape(-1),
             )  # fmt: skip
-        if drawing.photo is not None:
+        if coloured and drawing.photo is not None:
             self._finish(drawing.photo, image, scenes, toned=False)
         return _batch(
             drawing,
@@ -85,10 +92,13 @@ class SpriteRenderer:
             torch.from_numpy(result[:scenes, :nodes]),
         )
 
+    def _black(self, scenes: int) -> np.ndarray:
+        """Images, flat; they cost nothing until they are touched."""
+        return np.zeros(3 * _even(scenes * self.canvas[0] * self.canvas[1]), np.uint8)
+
     def _background(self, drawing: Drawing, scenes: int) -> np.ndarray:
-        """Images before anything is drawn, flat; black ones cost nothing until they are touched."""
-        height, width = self.canvas
-        image = np.zeros(3 * _even(scenes * height * width), np.uint8)
+        """Images before anything is drawn, flat."""
+        (height, width), image = self.canvas, self._black(scenes)
         colour = np.rint(np.clip(np.asarray(drawing.background, np.float64), 0, 1) * 255).astype(np.uint8)
         if colour.any():
             empty = np.tile(colour, height * width)

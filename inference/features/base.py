@@ -58,9 +58,9 @@ class FeatureNet(Protocol):
         target images with C = 1 where the model's colour carries nothing, else 3.
 
         A network may have three more beside it: ``embed_photographs``, which is then called for target images,
-        ``embed_drawn(examples)``, which is called for renders where their labels are at hand, and ``cells(images)``,
-        ``(N, classes, h, w)``, how many objects of each of its ``classes`` each cell of the image holds, by which a
-        verdict on layout goes."""
+        ``embed_drawn(examples)``, which is called for renders where their labels are at hand (their images may be black
+        if the network's ``by_labels`` is true), and ``cells(images)``, ``(N, classes, h, w)``, how many objects of each
+        of its ``classes`` each cell of the image holds, by which a verdict on layout goes."""
         ...
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 
 from probscene.batch import RenderBatch, Renderer
+from probscene.drawing import Drawing
 from probscene.errors import ModelError, ProbsceneError
 from probscene.generator import Command
 from probscene.model import SceneModel
@@ -126,6 +127,10 @@ class _AnyRenderer:
                 "draws its scenes: scene_model(..., generator=Command([...]))."
             )
         return (self._meshes if isinstance(drawing, World) else self._sprites)(drawing)
+
+    def labels(self, drawing: Renderable) -> RenderBatch:
+        """The same; images may be black."""
+        return self._sprites.labels(drawing) if isinstance(drawing, Drawing) else self(drawing)
 
     @cached_property
     def _sprites(self) -> SpriteRenderer:

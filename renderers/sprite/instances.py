@@ -39,8 +39,11 @@ class Instances(NamedTuple):
     real: np.ndarray
 
 
-def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int]) -> Instances:
+def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int], coloured: bool = True) -> Instances:
     """Build the table, and check all that the kernel relies on.
+
+    Args:
+        coloured: see ``kernel.paint``; without colours a sprite counts as opaque where it hides what is below.
 
     Raises:
         ModelError: more than 32767 nodes, layers of another shape than the drawing, a value that is not finite, a scale
@@ -67,7 +70,7 @@ def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int]) -> Instan
     whole, real = np.zeros((rows, kernel.INTEGERS), np.int64), np.zeros((rows, kernel.REALS))
     if len(scene):
         whole[:, kernel.NODE] = np.where(labelled, node, -1)
-        _fill(whole, real, values, layer, drawing, sheet, canvas)
+        _fill(whole, real, values, layer, drawing, sheet, canvas, coloured)
     return Instances(scene, node, labelled, whole.ravel(), real.ravel())
 
 
@@ -108,7 +111,7 @@ def _level(scale: np.ndarray) -> np.ndarray:
     return np.clip((fraction == 0.5) - exponent.astype(np.int64), 0, LEVELS - 1)
 
 
-def _fill(whole, real, values, layer, drawing, sheet, canvas) -> None:
+def _fill(whole, real, values, layer, drawing, sheet, canvas, coloured) -> None:
     """Write the tables; arrays are ``(I,)``, or ``(I, 2)`` for x and y."""
     x, y, angle = (values[name].astype(np.float64) for name in ("x", "y", "angle"))
     scale = np.stack([values["scale_x"], values["scale_y"]], 1).astype(np.float64)
@@ -117,7 +120,7 @@ def _fill(whole, real, values, layer, drawing, sheet, canvas) -> None:
     texel = np.maximum(scale * cell, 0.25)  # pixels; what is yet smaller has faded away
     variant, size = _variants(values["sprite"], level, (texel > 1).any(1), layer, drawing, sheet)
     wide = np.stack([variant.width, variant.height], 1).astype(np.float64)
-    inset = variant.inset[:, None]
+    inset = (variant.inset if coloured else variant.solid)[:, None]
     hard = ((variant.touches != 0) & (texel > 1).any(1))[:, None]
 
     # Positions at which the sprite may be seen and at which it is opaque. An edge is cut over one pixel, or over the
@@ -148,7 +151,7 @@ def _fill(whole, real, values, layer, drawing, sheet, canvas) -> None:
         )
     x0, y0 = np.floor(middle_x - half_x - 0.5), np.floor(middle_y - half_y - 0.5)
     x1, y1 = np.ceil(middle_x + half_x + 0.5), np.ceil(middle_y + half_y + 0.5)
-    y1 = np.where(wide.min(1) > 0, y1, y0)
+    y1 = np.where((wide.min(1) > 0) & (coloured | (variant.faint == 0)), y1, y0)
 
     step_x = np.stack([cos, sin], 1) / texel
     step_y = np.stack([-sin, cos], 1) / texel

@@ -87,7 +87,7 @@ def coverage(real: ti.template(), r, u: i64, v: i64):
 
 @ti.func
 def paint_sprite(
-    k, scene, height, width, nodes,
+    k, scene, height, width, nodes, coloured,
     whole: ti.template(), real: ti.template(), texels: ti.template(), colours: ti.template(), image: ti.template(),
     words: ti.template(), instance: ti.template(), quads: ti.template(), result: ti.template(),
 ):  # fmt: skip
@@ -131,25 +131,27 @@ def paint_sprite(
                     pixel = line + ti.cast(c, ti.i32)
                     u, v = u_row + du * c, v_row + dv * c
                     if pixel & 3 == 0 and c + 4 <= end:
-                        p0, p1, p2, p3 = colour, colour, colour, colour
-                        if copied:
-                            at = ti.cast(base + (v >> 32) * stride + (u >> 32), ti.i32)
-                            p0, p1, p2, p3 = colours[at], colours[at + 1], colours[at + 2], colours[at + 3]
-                        elif not even:
-                            p0 = opaque(texels, base, stride, u, v, red, green, blue)
-                            p1 = opaque(texels, base, stride, u + du, v + dv, red, green, blue)
-                            p2 = opaque(texels, base, stride, u + 2 * du, v + 2 * dv, red, green, blue)
-                            p3 = opaque(texels, base, stride, u + 3 * du, v + 3 * dv, red, green, blue)
                         quad = pixel >> 2
-                        words[3 * quad] = p0 | p1 << 24
-                        words[3 * quad + 1] = p1 >> 8 | p2 << 16
-                        words[3 * quad + 2] = p2 >> 16 | p3 << 8
+                        if coloured:
+                            p0, p1, p2, p3 = colour, colour, colour, colour
+                            if copied:
+                                at = ti.cast(base + (v >> 32) * stride + (u >> 32), ti.i32)
+                                p0, p1, p2, p3 = colours[at], colours[at + 1], colours[at + 2], colours[at + 3]
+                            elif not even:
+                                p0 = opaque(texels, base, stride, u, v, red, green, blue)
+                                p1 = opaque(texels, base, stride, u + du, v + dv, red, green, blue)
+                                p2 = opaque(texels, base, stride, u + 2 * du, v + 2 * dv, red, green, blue)
+                                p3 = opaque(texels, base, stride, u + 3 * du, v + 3 * dv, red, green, blue)
+                            words[3 * quad] = p0 | p1 << 24
+                            words[3 * quad + 1] = p1 >> 8 | p2 << 16
+                            words[3 * quad + 2] = p2 >> 16 | p3 << 8
                         quads[quad] = labels
                         c += 4
                     else:
-                        rgb = opaque(texels, base, stride, u, v, red, green, blue)
-                        for channel in ti.static(range(3)):
-                            image[pixel * 3 + channel] = ti.cast(rgb >> (8 * channel), ti.u8)
+                        if coloured:
+                            rgb = opaque(texels, base, stride, u, v, red, green, blue)
+                            for channel in ti.static(range(3)):
+                                image[pixel * 3 + channel] = ti.cast(rgb >> (8 * channel), ti.u8)
                         instance[pixel] = label
                         c += 1
                 col = outside
@@ -166,16 +168,16 @@ def paint_sprite(
                         row_left, row_right = ti.min(row_left, col), col + 1
                     if on_canvas and 0 <= x0 + col and x0 + col < width:
                         pixel = line + ti.cast(col, ti.i32)
-                        p = pixel * 3
-                        rest = (
-                            (65280 - alpha) * 257 + 255
-                        ) >> 8  # 65535 where the sprite is clear, 0 where it is opaque
-                        c0 = ti.cast(s & 0xFFFF, u32) * red + ti.cast(image[p], u32) * rest
-                        c1 = ti.cast((s >> 16) & 0xFFFF, u32) * green + ti.cast(image[p + 1], u32) * rest
-                        c2 = ti.cast((s >> 32) & 0xFFFF, u32) * blue + ti.cast(image[p + 2], u32) * rest
-                        image[p] = ti.cast((c0 + 32768) >> 16, ti.u8)
-                        image[p + 1] = ti.cast((c1 + 32768) >> 16, ti.u8)
-                        image[p + 2] = ti.cast((c2 + 32768) >> 16, ti.u8)
+                        if coloured:
+                            p = pixel * 3
+                            # 65535 where the sprite is clear, 0 where it is opaque
+                            rest = ((65280 - alpha) * 257 + 255) >> 8
+                            c0 = ti.cast(s & 0xFFFF, u32) * red + ti.cast(image[p], u32) * rest
+                            c1 = ti.cast((s >> 16) & 0xFFFF, u32) * green + ti.cast(image[p + 1], u32) * rest
+                            c2 = ti.cast((s >> 32) & 0xFFFF, u32) * blue + ti.cast(image[p + 2], u32) * rest
+                            image[p] = ti.cast((c0 + 32768) >> 16, ti.u8)
+                            image[p + 1] = ti.cast((c1 + 32768) >> 16, ti.u8)
+                            image[p + 2] = ti.cast((c2 + 32768) >> 16, ti.u8)
                         if solid:
                             instance[pixel] = label
                 col += 1
@@ -242,6 +244,7 @@ def paint(
     height: ti.i32,
     width: ti.i32,
     nodes: ti.i32,
+    coloured: ti.i32,
     queue: ti.types.ndarray(ti.i32, 1),
     first: ti.types.ndarray(ti.i32, 1),
     whole: ti.types.ndarray(ti.i64, 1),
@@ -254,7 +257,7 @@ def paint(
     quads: ti.types.ndarray(ti.i64, 1),
     result: ti.types.ndarray(ti.i64, 1),
 ):
-    """Paint every scene over what ``image`` holds.
+    """Paint every scene over what ``image`` holds; where it is not ``coloured``, ids and results alone.
 
     ``first (scenes + 1)`` says where the instances of each scene begin; ``words`` and ``quads`` are ``image`` and
     ``instance`` seen as 32-bit and 64-bit words; ``queue`` and ``result`` hold zeros.
@@ -263,11 +266,14 @@ def paint(
         if j % 512 == 0:
             scene = ti.atomic_add(queue[0], 1)
             while scene < scenes:
+                covers = coloured != 0  # what lies below all labels covers none
                 for k in range(first[scene], first[scene + 1]):
-                    paint_sprite(
-                        k, scene, height, width, nodes,
-                        whole, real, texels, colours, image, words, instance, quads, result,
-                    )  # fmt: skip
+                    covers = covers or whole[k * INTEGERS + NODE] >= 0
+                    if covers:
+                        paint_sprite(
+                            k, scene, height, width, nodes, coloured != 0,
+                            whole, real, texels, colours, image, words, instance, quads, result,
+                        )  # fmt: skip
                 for node in range(nodes):
                     t = (scene * nodes + node) * RESULTS
                     if result[t + WHOLE_PIXELS] > 0:

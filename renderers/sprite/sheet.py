@@ -11,6 +11,7 @@ from probscene.errors import ModelError
 LEVELS = 32
 _LIMIT = 1 << 25  # texels kept between calls, 256 MiB
 _MOST = (1 << 31) - 1  # the kernel's indices are 32-bit
+_FAINT, _SOLID = 126, 129  # texels up to the one, and from the other on, have samples of less or more than one half
 _LANES = np.array([0, 16, 32, 48], np.uint64)
 
 
@@ -27,6 +28,8 @@ class Variant(NamedTuple, Generic[Whole]):
     top: Whole
     inset: Whole  # margin within which every texel is opaque
     even: Whole  # 1 if these are all of one colour
+    solid: Whole  # margin within which every sample's alpha is at least one half
+    faint: Whole  # 1 if no sample's is
     touches: Whole  # 1 if an outermost texel of the level is not clear
 
 
@@ -61,7 +64,7 @@ class Sheet:
         return self._sizes[atlas]
 
     def find(self, atlas: Atlas, sprite: np.ndarray, level: np.ndarray, magnified: np.ndarray) -> np.ndarray:
-        """The variants of sprites ``(I,)`` at levels ``(I, 2)`` for x and y: ``(I, 8)`` int64, ``Variant``'s fields."""
+        """Variants of sprites ``(I,)`` at levels ``(I, 2)`` for x and y: ``(I, 10)`` int64, ``Variant``'s fields."""
         keys = ((sprite * LEVELS + level[:, 0]) * LEVELS + level[:, 1]) * 2 + magnified
         unique, inverse = np.unique(keys, return_inverse=True)
         rows = self._rows.setdefault(atlas, {})
@@ -94,7 +97,8 @@ class Sheet:
         framed = np.pad(texels, ((1, 1), (1, 1), (0, 0)), mode="edge" if hard else "constant")
         offset = self._store((framed.astype(np.uint64) << _LANES).sum(-1, dtype=np.uint64).ravel())
         even = len(inside) > 0 and bool((inside == inside[0]).all())
-        return Variant(offset, width, height, left, top, inset, int(even), int(touches))
+        solid, faint = _inset(texels[..., 3], _SOLID), texels[..., 3].max(initial=0) <= _FAINT
+        return Variant(offset, width, height, left, top, inset, int(even), solid, int(faint), int(touches))
 
     def _store(self, words: np.ndarray) -> int:
         offset, self._used = self._used, self._used + words.size
@@ -122,8 +126,8 @@ def shrink(sprite: np.ndarray, level_x: int, level_y: int) -> np.ndarray:
     return np.rint(colour).astype(np.uint8)
 
 
-def _inset(alpha: np.ndarray) -> int:
-    rows, columns = np.nonzero(alpha < 255)
+def _inset(alpha: np.ndarray, least: int = 255) -> int:
+    rows, columns = np.nonzero(alpha < least)
     if not len(rows):
         return 0
     height, width = alpha.shape

@@ -114,6 +114,28 @@ def test_agrees_with_the_numpy_twin(drawing):
 
 
 @given(drawings())
+def test_labels_alone_are_those_of_the_pictures(drawing):
+    pictured, alone = RENDERER(drawing), RENDERER.labels(drawing)
+    assert not alone.image.any() and alone.image.shape == pictured.image.shape
+    assert _same(alone._replace(image=pictured.image), pictured)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.3, 3.0), st.floats(-3.0, 3.0))
+def test_labels_alone_begin_at_half_alpha(seed, scale, angle):
+    generator, scenes = np.random.default_rng(seed), 16
+    alphas = np.arange(120, 120 + scenes)
+    looks = [np.full((11, 11, 4), alpha, np.uint8) for alpha in alphas]
+    looks += [np.pad(generator.integers(alpha, alpha + 3, (9, 9, 4)), ((2, 1), (1, 2), (0, 0))) for alpha in alphas]
+    atlas = Atlas(tuple(look.astype(np.uint8) for look in looks))
+    sprites = Sprites("a", atlas, torch.arange(2 * scenes)[:, None], 20.3, 18.6, angle=angle, scale=scale)
+    layer = resolve(sprites, torch.ones(2 * scenes, 1, dtype=torch.bool))
+    drawing = Drawing(torch.zeros(2 * scenes, 1, dtype=torch.int64), ("a",), (layer,))
+    pictured, alone = RENDERER(drawing), RENDERER.labels(drawing)
+    assert 0 < (pictured.pixels > 0).sum() < 2 * scenes
+    assert _same(alone._replace(image=pictured.image), pictured)
+
+
+@given(drawings())
 def test_boxes_and_pixels_are_those_of_the_masks(drawing):
     batch = RENDERER(drawing)
     for n, m in np.ndindex(*drawing.kind.shape):

@@ -48,6 +48,7 @@ class PretrainedCountNet(nn.Module):
         sizes: see ``SIZES``.
 
     Attributes:
+        by_labels: see ``FeatureNet``.
         unit: ``(D,)``, how many objects 1 in each feature stands for.
         blocks: how many features are counts of things and counts of stuff.
         taught_by: fingerprint of the images that heads and rules are suited to, ``(32,)`` uint8; zeros for none.

@@ -169,6 +169,7 @@ class _Eyes:
         self.names, self.thumbs = net.names, []
         if hasattr(net, "embed_drawn"):
             self.embed_drawn = self._embed_drawn
+            self.by_labels = not keep and getattr(net, "by_labels", False)
 
     def embed(self, images: Tensor) -> Tensor:
         self._look(images)

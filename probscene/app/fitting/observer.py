@@ -64,15 +64,16 @@ class Observer:
         both = self.labelled(scenes), self.labelled(run_program(self.model, scenes.derivation))
         return Examples(*(torch.cat(parts) for parts in zip(*both, strict=True)))
 
-    def labelled(self, scenes: Scenes, rows: slice = slice(None)) -> Examples:
-        """Some of the scenes, rendered, with their labels."""
+    def labelled(self, scenes: Scenes, rows: slice = slice(None), pictured: bool = True) -> Examples:
+        """Some of the scenes, rendered, with their labels; images may be black where they need not be ``pictured``."""
         groups, grammar = self.model.groups, self.model.grammar
         group, along = None, "y"
         if groups is not None:
             derivation = scenes.derivation[rows]
             group = group_of(derivation.kind, derivation.parent, grammar.kind(groups.kind))
             along = groups.along
-        drawn = examples(self.render(scenes.drawing[rows]), self.classes, group, along)
+        render = self.render if pictured else getattr(self.render, "labels", self.render)
+        drawn = examples(render(scenes.drawing[rows]), self.classes, group, along)
         return drawn._replace(image=self._as_read(drawn.image))
 
     def embed_twice(self, num: int, net: FeatureNet) -> tuple[Tensor, Tensor]:
@@ -97,13 +98,13 @@ class Observer:
                 network that goes by labels counts what can be seen, of one drawing.
         """
 
-        embed_drawn = getattr(net, "embed_drawn", None)
+        embed_drawn, pictured = getattr(net, "embed_drawn", None), not getattr(net, "by_labels", False)
 
         def features(scenes: Scenes) -> Tensor:
             with threads(self.threads):
                 starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
                 if embed_drawn is not None:
-                    parts = (self.labelled(scenes, slice(i, i + RENDERED_AT_ONCE)) for i in starts)
+                    parts = (self.labelled(scenes, slice(i, i + RENDERED_AT_ONCE), pictured) for i in starts)
                     return torch.cat([embed_drawn(some) for some in parts])
                 images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
                 return torch.cat([net.embed(self._as_read(some)) for some in images])

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from probscene.app.datasets.generate import generate_scenes
@@ -43,6 +44,27 @@ def watched(model):
     render = view.render
     view.render = lambda drawing: rendered.append(render(drawing)) or rendered[-1]
     return view, Seen(), rendered
+
+
+class Labels(Seen):
+    """A feature network that keeps the labelled renders that it is given."""
+
+    by_labels = True
+
+    def embed_drawn(self, drawn):
+        self.drawn = drawn
+        return drawn.visible.sum(1, keepdim=True)
+
+
+@pytest.mark.parametrize("name", ["aerial2d", "driving_simple"])
+def test_who_looks_at_labels_alone_is_given_those_of_the_pictures(name):
+    model, net = load_model(name), Labels()
+    seed_everything(1)
+    scenes = sample(model, model.prior, 4)
+    Observer(model, threads=1).observe(net)(scenes)
+    whole = Observer(model, threads=1).labelled(scenes)
+    assert all(torch.equal(a, b) for a, b in zip(net.drawn[1:], whole[1:], strict=True))
+    assert net.drawn.image.shape == whole.image.shape
 
 
 def test_what_hides_something_is_drawn_again_and_the_clearest_is_seen(discs):
