@@ -52,30 +52,40 @@ class Scope(NamedTuple):
 
 SCOPES = (Scope(0.25, 16, 16), Scope(0.25, 16 / 3, 8), Scope(0.6, 16 / 3, 8), Scope(0.9, 16 / 3, 8))
 LARGE, SMALL = 0, 1  # of the scopes, those that do without labels
+AT_ONCE = 8  # images, so that they stay in the processor's cache from one rule to the next
 THRESHOLDS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.8)
 SOFT = ((0.03, 0.2), (0.05, 0.3), (0.1, 0.5), (0.2, 0.7), (0.4, 0.8), (0.6, 1.0))
 PEAKS = tuple(Rule("peaks", 3, threshold) for threshold in THRESHOLDS)
 RULES = (Rule("sum"), *(Rule("soft", window, *limits) for window in (3, 5) for limits in SOFT), *PEAKS)
 
 
-def read(probability: Tensor, rule: Rule) -> Tensor:
+def read(probability: Tensor, rule: Rule, mass: Tensor | None = None) -> Tensor:
     """Counts ``(N, C)`` by one rule.
 
     Args:
         probability: ``(N, C, h, w)``, that a place is the middle of an object.
+        mass: by the rule, see ``mass_of``, where it is known.
     """
     if rule.name == "sum":
         return probability.sum((2, 3))
+    mass = mass_of(probability, rule) if mass is None else mass
     if rule.name == "peaks":
-        mass = rule.window**2 * F.avg_pool2d(probability, rule.window, 1, rule.window // 2)
-        top = F.max_pool2d(mass, 3, 1, 1) == mass
-        return (top & (mass > rule.nothing)).float().sum((2, 3))
-    return whole(probability, rule).sum((2, 3))
+        return (mass > rule.nothing).float().sum((2, 3))
+    return _whole(probability, rule, mass).sum((2, 3))
+
+
+def mass_of(probability: Tensor, rule: Rule) -> Tensor:
+    """The probability in the window around each place ``(N, C, h, w)``; of peaks elsewhere 0."""
+    mass = rule.window**2 * F.avg_pool2d(probability, rule.window, 1, rule.window // 2)
+    return mass.where(F.max_pool2d(mass, 3, 1, 1) == mass, 0.0) if rule.name == "peaks" else mass
 
 
 def whole(probability: Tensor, rule: Rule) -> Tensor:
     """Probabilities ``(N, C, h, w)`` with objects taken to one, and faint ones to none, by a soft rule."""
-    mass = rule.window**2 * F.avg_pool2d(probability, rule.window, 1, rule.window // 2)
+    return _whole(probability, rule, mass_of(probability, rule))
+
+
+def _whole(probability: Tensor, rule: Rule, mass: Tensor) -> Tensor:
     part = ((mass - rule.nothing) / (rule.whole - rule.nothing)).clamp(0, 1)
     to_one = (1 / mass.clamp(min=rule.nothing)).clamp(min=1.0)
     return probability * part.square() * (3 - 2 * part) * to_one
@@ -83,7 +93,13 @@ def whole(probability: Tensor, rule: Rule) -> Tensor:
 
 def read_all(probability: Tensor) -> Tensor:
     """Counts ``(N, R, C)`` by every rule of ``RULES``."""
-    return torch.stack([read(probability, rule) for rule in RULES], 1)
+    return torch.cat([_read_all(some) for some in probability.split(AT_ONCE)])
+
+
+def _read_all(probability: Tensor) -> Tensor:
+    alike = {(rule.name, rule.window): rule for rule in RULES if rule.name != "sum"}
+    mass = {key: mass_of(probability, rule) for key, rule in alike.items()}
+    return torch.stack([read(probability, rule, mass.get((rule.name, rule.window))) for rule in RULES], 1)
 
 
 def read_each(probability: Tensor, rules: Tensor) -> Tensor:
