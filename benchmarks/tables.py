@@ -75,6 +75,18 @@ def learn_labelled(result: dict) -> Rows:
     return rows
 
 
+def learn_tilting(result: dict) -> Rows:
+    """A row for each sort of features and source, then the sites; a column for each seed."""
+    seeds = result["rows"]
+    rows: Rows = [["squared energy distance", *(f"seed {row['seed']}" for row in seeds)]]
+    for sort, said in (("efficientnet", "EfficientNet's features"), ("plain", "what plainly can be said")):
+        for source in ("prior", "start", "learnt", "floor"):
+            each = ("{:.3f} ({:.3f} to {:.3f})".format(*row[sort][source]) for row in seeds)
+            rows.append([f"{said}, {source}", *each])
+    rows.append(["sites that are moved", *(", ".join(f"`{site}`" for site in row["moved"]) for row in seeds)])
+    return rows
+
+
 def _of_site(site: dict | None) -> str:
     if site is None:
         return ""
@@ -103,6 +115,7 @@ TABLES: dict[str, Callable[[dict], Rows]] = {
     "learn_generator": learn_generator,
     "learn_labelled": learn_labelled,
     "learn_looks": learn_looks,
+    "learn_tilting": learn_tilting,
 }
 
 

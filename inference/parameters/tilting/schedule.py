@@ -16,6 +16,7 @@ class TiltingSchedule:
         steps: of maximum likelihood on them.
         rate: its largest learning rate.
         images: of the target, at most.
+        feature_size: of the square whose area images enter EfficientNet with, pixels; time grows with its area.
     """
 
     rounds: int = 10
@@ -25,6 +26,7 @@ class TiltingSchedule:
     steps: int = 60
     rate: float = 5e-3
     images: int = 1000
+    feature_size: int = 160
 
     @property
     def drawn(self) -> int:

@@ -38,9 +38,10 @@ def tilting_learning(run: "RunFolder", observer: Observer, guide: Guide, images:
     ``meta_sim_learning``."""
     from probscene.inference.features.pretrained import EfficientNetLite
 
-    looks, seed = (EfficientNetLite().embed, plain), batch_seed(run.record["seed"], 5)
+    schedule, seed = run.preset.tilting, batch_seed(run.record["seed"], 5)
+    looks = EfficientNetLite(schedule.feature_size).embed, plain
     real = tuple(look(images) for look in looks)
-    return TiltingLearning(run.model, guide, observer.labelled, looks, real, run.preset.tilting, seed)
+    return TiltingLearning(run.model, guide, observer.labelled, looks, real, schedule, seed)
 
 
 def sites_record(learning: WholeLearning) -> list[dict[str, Any]]:
