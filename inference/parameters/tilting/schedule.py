@@ -26,7 +26,7 @@ class TiltingSchedule:
     steps: int = 60
     rate: float = 5e-3
     images: int = 1000
-    feature_size: int = 160
+    feature_size: int = 224
 
     @property
     def drawn(self) -> int:
