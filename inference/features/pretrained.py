@@ -118,16 +118,16 @@ class EfficientNetLite(_Frozen):
         """``(N, 1280)`` of images that have entered."""
         return self.net.extract_features(x).mean((2, 3))
 
-    def pyramid(self, x: Tensor) -> tuple[list[Tensor], Tensor]:
+    def pyramid(self, x: Tensor) -> list[Tensor]:
         """Of images that have entered, ``(N, 3, h, w)``: the last maps at strides of 8, 16 and 32, each ``(N, C, h /
-        stride, w / stride)``; and ``pooled``, ``(N, 1280)``."""
+        stride, w / stride)``."""
         x = self.net._swish(self.net._bn0(self.net._conv_stem(x)))
         maps = []
         for part in self.parts:
             for block in part:
                 x = block(x)
             maps.append(x)
-        return maps, self.net._swish(self.net._bn1(self.net._conv_head(x))).mean((2, 3))
+        return maps
 
     @torch.no_grad()
     def looks(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,8 +135,8 @@ class EfficientNetLite(_Frozen):
         tell textures more than what is shown, ``(N, 80)``."""
         whole, texture = [], []
         for some in images.split(AT_ONCE):
-            maps, pooled = self.pyramid(self.enter(some))
-            whole.append(pooled)
+            maps = self.pyramid(self.enter(some))
+            whole.append(self.net._swish(self.net._bn1(self.net._conv_head(maps[-1]))).mean((2, 3)))
             texture.append(torch.cat([maps[0].mean((2, 3)), maps[0].std((2, 3))], 1))
         return torch.cat(whole), torch.cat(texture)
 

@@ -176,7 +176,7 @@ class PretrainedCountNet(nn.Module):
     def look(self, images: Tensor) -> Maps:
         """Maps of ``(N, 1 or 3, H, W)`` uint8 images."""
         net = self.frozen[0]
-        parts = [net.pyramid(net.enter(some))[0] for some in images.split(AT_ONCE)]
+        parts = [net.pyramid(net.enter(some)) for some in images.split(AT_ONCE)]
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
     def seen(self, drawn: Examples, scope: Scope) -> Tensor:
