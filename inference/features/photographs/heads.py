@@ -63,6 +63,7 @@ class PretrainedCountNet(nn.Module):
             none was drawn.
     """
 
+    by_labels = True
     unit: Tensor
     taught_by: Tensor
     rules: Tensor
