@@ -57,7 +57,12 @@ class SpriteRenderer:
         return self._rendered(drawing, True)
 
     def labels(self, drawing: Renderable) -> RenderBatch:
-        """What rendering gives, but black images, in less time; errors as above."""
+        """A drawing's labels alone, in less time: the batch that rendering gives, but for ``image (N, 3, H, W)``, which
+        is black.
+
+        Raises:
+            ModelError, ProbsceneError: as rendering does, but for what is wrong with the drawing's photo.
+        """
         return self._rendered(drawing, False)
 
     def _rendered(self, drawing: Renderable, coloured: bool) -> RenderBatch:
