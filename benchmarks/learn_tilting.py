@@ -84,33 +84,24 @@ def renders(observer: Observer, model: SceneModel, policy: Policy, number: int) 
     return torch.cat([observer.labelled(sample(model, policy, part)).image for part in parts])
 
 
-def measured(model: SceneModel, target: Tensor, seed: int, args: argparse.Namespace) -> dict:
-    """The row of one seed."""
-    held = torch.arange(len(target)) % HELD == HELD - 1
-    settings = [f"parameter_method={TILTING}", *(f"tilting.{setting}" for setting in args.set)]
-    schedule = override(preset("quick"), settings).tilting
-    observer, start, began = Observer(model, 1), model.pretraining_policy, time.process_time()
+def judged(images: Tensor) -> dict[str, Features]:
+    """Features ``(N, D)`` by what judges."""
+    judges = {"efficientnet": EfficientNetLite().embed, "plain": plain}
+    return {name: embed(images).double().numpy() for name, embed in judges.items()}
+
+
+def learn(
+    model: SceneModel, observer: Observer, photographs: Tensor, seed: int, settings: list[str]
+) -> TiltingLearning:
+    """Parameters, learnt from photographs."""
+    given = [f"parameter_method={TILTING}", *(f"tilting.{setting}" for setting in settings)]
+    schedule = override(preset("quick"), given).tilting
     seen_by = EfficientNetLite(schedule.feature_size).embed, plain
-    real = tuple(look(target[~held]) for look in seen_by)
-    learning = TiltingLearning(model, start, observer.labelled, seen_by, real, schedule, seed)
+    real = tuple(embed(photographs) for embed in seen_by)
+    learning = TiltingLearning(model, model.pretraining_policy, observer.labelled, seen_by, real, schedule, seed)
     with Display() as show:
         learning.run(lambda now, line: show("parameters", now.done, now.total, f"loss {line['loss']:.3f}", "rounds"))
-    seconds = time.process_time() - began
-    learnt = model if learning.guide is None else learning.guide.suited(model)
-    images = {
-        "prior": renders(observer, model, model.prior, args.images),
-        "start": renders(observer, model, start, args.images),
-        "learnt": renders(observer, learnt, start, args.images),
-        "floor": target[~held],
-    }
-    row: dict = {"seed": seed, "photographs": len(target), "judged": int(held.sum())}
-    for name, look in (("efficientnet", EfficientNetLite().embed), ("plain", plain)):
-        of_held = look(target[held]).double().numpy()
-        row[name] = {source: squared(look(some).double().numpy(), of_held) for source, some in images.items()}
-    shown = [images[source][: SIDE**2] for source in ("start", "learnt")]
-    picture([*shown, target[held][: SIDE**2]], args.out / f"scenes-{seed}.png")
-    moved = [site.name for site in learning.learnt]
-    return row | {"moved": moved, "renders": schedule.drawn, "seconds": round(seconds)}
+    return learning
 
 
 def main():
@@ -129,9 +120,28 @@ def main():
     model, rows = load_model(args.model), []
     folder = ImageFolder(args.photographs, model.canvas, model.channels)
     target = torch.stack([folder.load(i) for i in range(len(folder))])
+    held = torch.arange(len(target)) % HELD == HELD - 1
+    observer, start, of_held = Observer(model, 1), model.pretraining_policy, judged(target[held])
+
+    def apart(images: Tensor) -> dict[str, tuple[float, float, float]]:
+        return {judge: squared(features, of_held[judge]) for judge, features in judged(images).items()}
+
+    began = renders(observer, model, start, args.images)
+    same = {"prior": apart(renders(observer, model, model.prior, args.images)), "start": apart(began)}
+    same["floor"] = apart(target[~held])
     for seed in args.seeds:
-        rows.append(measured(model, target, seed, args))
-        print(json.dumps(rows[-1]), flush=True)
+        before = time.process_time()
+        learning = learn(model, observer, target[~held], seed, args.set)
+        row = {"seed": seed, "photographs": len(target), "judged": int(held.sum())}
+        row |= {"moved": [site.name for site in learning.learnt], "renders": learning.schedule.drawn}
+        row["seconds"] = round(time.process_time() - before)
+        learnt = model if learning.guide is None else learning.guide.suited(model)
+        images = renders(observer, learnt, start, args.images)
+        of_source = same | {"learnt": apart(images)}
+        row |= {judge: {source: found[judge] for source, found in of_source.items()} for judge in of_held}
+        picture([some[: SIDE**2] for some in (began, images, target[held])], args.out / f"scenes-{seed}.png")
+        rows.append(row)
+        print(json.dumps(row), flush=True)
         write_json(args.out / "results.json", {"command": command(__file__), "version": ps.__version__, "rows": rows})
 
 
