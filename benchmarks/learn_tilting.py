@@ -132,7 +132,7 @@ def main():
     for seed in args.seeds:
         before = time.process_time()
         learning = learn(model, observer, target[~held], seed, args.set)
-        row = {"seed": seed, "photographs": len(target), "judged": int(held.sum())}
+        row: dict = {"seed": seed, "photographs": len(target), "judged": int(held.sum())}
         row |= {"moved": [site.name for site in learning.learnt], "renders": learning.schedule.drawn}
         row["seconds"] = round(time.process_time() - before)
         learnt = model if learning.guide is None else learning.guide.suited(model)
