@@ -110,7 +110,7 @@ class EfficientNetLite(_Frozen):
         halving = [i for i, block in enumerate(blocks) if block._depthwise_conv.stride[0] == 2]
         parts = blocks[: halving[-2]], blocks[halving[-2] : halving[-1]], blocks[halving[-1] :]
         self.parts = [nn.Sequential(*part) for part in parts]
-        self.channels = tuple(part[-1]._project_conv.out_channels for part in self.parts)
+        self.channels = tuple(part[-1]._project_conv.out_channels for part in parts)
         self.requires_grad_(False).eval()
 
     def pooled(self, x: Tensor) -> Tensor:
