@@ -84,12 +84,6 @@ def renders(observer: Observer, model: SceneModel, policy: Policy, number: int) 
     return torch.cat([observer.labelled(sample(model, policy, part)).image for part in parts])
 
 
-def judged(images: Tensor) -> dict[str, Features]:
-    """Features ``(N, D)`` by what judges."""
-    judges = {"efficientnet": EfficientNetLite().embed, "plain": plain}
-    return {name: embed(images).double().numpy() for name, embed in judges.items()}
-
-
 def learn(
     model: SceneModel, observer: Observer, photographs: Tensor, seed: int, settings: list[str]
 ) -> TiltingLearning:
@@ -121,10 +115,16 @@ def main():
     folder = ImageFolder(args.photographs, model.canvas, model.channels)
     target = torch.stack([folder.load(i) for i in range(len(folder))])
     held = torch.arange(len(target)) % HELD == HELD - 1
-    observer, start, of_held = Observer(model, 1), model.pretraining_policy, judged(target[held])
+    observer, start = Observer(model, 1), model.pretraining_policy
+    judges = {"efficientnet": EfficientNetLite().embed, "plain": plain}
+
+    def seen(images: Tensor) -> dict[str, Features]:
+        return {judge: embed(images).double().numpy() for judge, embed in judges.items()}
+
+    of_held = seen(target[held])
 
     def apart(images: Tensor) -> dict[str, tuple[float, float, float]]:
-        return {judge: squared(features, of_held[judge]) for judge, features in judged(images).items()}
+        return {judge: squared(features, of_held[judge]) for judge, features in seen(images).items()}
 
     began = renders(observer, model, start, args.images)
     same = {"prior": apart(renders(observer, model, model.prior, args.images)), "start": apart(began)}
@@ -138,7 +138,7 @@ def main():
         learnt = model if learning.guide is None else learning.guide.suited(model)
         images = renders(observer, learnt, start, args.images)
         of_source = same | {"learnt": apart(images)}
-        row |= {judge: {source: found[judge] for source, found in of_source.items()} for judge in of_held}
+        row |= {judge: {source: found[judge] for source, found in of_source.items()} for judge in judges}
         picture([some[: SIDE**2] for some in (began, images, target[held])], args.out / f"scenes-{seed}.png")
         rows.append(row)
         print(json.dumps(row), flush=True)
