@@ -38,9 +38,13 @@ class CountSchedule:
         crop: their side in pixels of the reduced image.
         window: side of the middle part of a crop that counts, cells; the rest is context.
         anywhere: fraction of the crops at random places.
+        balanced: whether the others are around objects of every class in a step's images alike; else around all objects
+            alike, of which a class that is rare has few.
         learning_rate: of Adam, after a warm-up of 50 steps; it falls to 0 along a cosine.
         muon_rate: of Muon, which takes the inner convolutions, likewise.
         count_weight: of the squared error of the soft counts.
+        relative: whether each squared error is over one more than the count, as counts vary with their size: where
+            there are twenty trees, the errors of what is rare are as nothing beside theirs.
         group_weight: of the cross-entropy and the error of the cells' votes for their group, a cell.
         min_visible: objects less visible than this are not counted.
     """
@@ -52,9 +56,11 @@ class CountSchedule:
     crop: int = 48
     window: int = 4
     anywhere: float = 0.2
+    balanced: bool = False
     learning_rate: float = 8e-3
     muon_rate: float = 0.1
     count_weight: float = 0.5
+    relative: bool = False
     group_weight: float = 0.5
     min_visible: float = 0.25
 
@@ -179,12 +185,18 @@ class CountBatches:
         s = self.schedule
         scene, node = (label >= 0).nonzero(as_tuple=True)
         near = round(s.crops * (1 - s.anywhere)) if len(scene) else 0
-        pick = torch.randperm(len(scene))[:near] if near <= len(scene) else torch.randint(len(scene), (near,))
+        pick = self._pick(label[scene, node], near)
         jitter = (torch.rand(near, 2) - 0.5) * (s.window * STRIDE)
         which = torch.cat([scene[pick], torch.randint(len(label), (s.crops - near,))])
         size = torch.tensor([width, height])
         around = torch.cat([centre[scene[pick], node[pick]] + jitter, torch.rand(s.crops - near, 2) * size])
         return which, torch.minimum((around.floor().long() - s.crop // 2).clamp(min=-s.crop), size)
+
+    def _pick(self, label: Tensor, num: int) -> Tensor:
+        """``(num,)``, which objects crops are taken around, of objects of the classes ``label (S,)``."""
+        if self.schedule.balanced and num:
+            return torch.multinomial(1 / torch.bincount(label)[label], num, replacement=True)
+        return torch.randperm(len(label))[:num] if num <= len(label) else torch.randint(len(label), (num,))
 
 
 def _cut(image: Tensor, which: Tensor, corner: Tensor, size: int) -> Tensor:

@@ -92,7 +92,7 @@ class CountTraining:
                 group["lr"] = rate * factor
         number = batch.target.shape[1]
         logits = self.net(batch.image)
-        loss = count_loss(logits[:, :number], batch.target, batch.margin, s.count_weight)
+        loss = count_loss(logits[:, :number], batch.target, batch.margin, s.count_weight, s.relative)
         if batch.votes is not None and batch.group_cells is not None:
             loss = loss + s.group_weight * group_loss(logits[:, number:], batch.votes, batch.margin)
             self.net.group_cells.lerp_(batch.group_cells, max(0.01, 1 / (self.done + 1)))
@@ -109,15 +109,19 @@ class CountTraining:
         return loss.item()
 
 
-def count_loss(logits: Tensor, target: Tensor, margin: int, count_weight: float) -> Tensor:
+def count_loss(logits: Tensor, target: Tensor, margin: int, count_weight: float, relative: bool = False) -> Tensor:
     """Cross-entropy of the cells, summed over an image, and the squared error of its soft counts and their total.
 
     Args:
         logits, target: ``(N, 1 + classes, h, w)``.
         margin: cells at the border that do not count.
+        relative: see ``CountSchedule``.
     """
-    entropy, error, _ = _errors(logits, target, margin)
-    return (entropy + count_weight * (error.square().sum(1) + error.sum(1).square())).mean()
+    entropy, error, count = _errors(logits, target, margin)
+    of_classes, of_total = error.square(), error.sum(1).square()
+    if relative:
+        of_classes, of_total = of_classes / (1 + count), of_total / (1 + count.sum(1))
+    return (entropy + count_weight * (of_classes.sum(1) + of_total)).mean()
 
 
 def relative_count_loss(logits: Tensor, target: Tensor) -> Tensor:

@@ -18,14 +18,18 @@ DEFAULT = replace(
     parameters=ParameterSchedule(reader_steps=800, rounds=3, round_steps=500),
 )
 # Streets have ten counts, some of which spread over tens: kernels of variance 1 would leave most of 500 scenes alone.
-# Objects behind others are counted as far as they can be seen at all; the prior holds what cannot.
+# Objects behind others are counted as far as they can be seen at all; the prior holds what cannot. Images are so wide
+# that a step has four of them, objects as large as what a network for digits sees at once, and most are trees and cars.
 STREET = replace(
     QUICK,
     objective="js",
     variance=5.0,
     prior_kl_weight=0.03,
     draws_per_structure=1,
-    count=CountSchedule(min_visible=0.05),
+    count=CountSchedule(
+        crops=48, crop=64, balanced=True, relative=True, learning_rate=3e-3, muon_rate=0.02, min_visible=0.05
+    ),
+    blocks=(1, 3),
     parameters=ParameterSchedule(sure=True),
 )
 # The paper's Multi-MNIST (section 4.1, supplement): 20 epochs of 5,000 target images in batches of 500 are 200 updates.

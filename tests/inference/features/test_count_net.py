@@ -50,6 +50,32 @@ def test_loss_is_least_at_the_target():
         assert count_loss(target.clamp(min=1e-9).log() + torch.randn_like(target), target, 1, 0.5) > best
 
 
+@given(st.integers(0, 3), st.integers(0, 3), st.integers(0, 3), st.integers(0, 3))
+def test_a_relative_error_is_over_one_more_than_the_count(a, b, found_a, found_b):
+    """Of each class and of the total, as written out; the cross-entropy is that of the absolute one."""
+    target, guess = (torch.zeros(1, 3, 3, 3) for _ in range(2))
+    for cells_of, counts in ((target, (a, b)), (guess, (found_a, found_b))):
+        for label, (count, row) in enumerate(zip(counts, (0, 1), strict=True)):
+            cells_of[0, 1 + label].view(-1)[3 * row : 3 * row + count] = 1
+        cells_of[:, 0] = 1 - cells_of[:, 1:].sum(1)
+    logits = 40 * guess
+    wrong, truth = (found_a - a, found_b - b, found_a + found_b - a - b), (a, b, a + b)
+    expected = sum(e**2 / (1 + n) - e**2 for e, n in zip(wrong, truth, strict=True))
+    actual = count_loss(logits, target, 0, 0.5, relative=True) - count_loss(logits, target, 0, 0.5)
+    assert actual.item() == pytest.approx(0.5 * expected, abs=1e-3)
+
+
+@given(st.integers(0, 2**31))
+def test_balanced_crops_are_around_objects_of_every_class_alike(seed):
+    """Nine of one class and one of another: each class gets half of the crops."""
+    torch.manual_seed(seed)
+    schedule = CountSchedule(crops=400, crop=32, window=1, anywhere=0.0, balanced=True)
+    batches = CountBatches(CountNet(("a", "b"), 1, (128, 128)), lambda num: None, schedule, 0)
+    pick = batches._pick(torch.tensor([0] * 9 + [1]), schedule.crops)
+    assert 140 <= (pick == 9).sum() <= 260
+    assert (torch.bincount(pick, minlength=10)[:9] > 0).all()
+
+
 @given(st.integers(1, 3), st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31))
 def test_grey_images_pass_the_same_layers_with_the_same_gradient(N, h, w, seed):
     torch.manual_seed(seed)
