@@ -5,7 +5,8 @@
 Each seed's target is drawn by the driving models themselves with another, random distribution of structures
 (``SceneModel.target``); fits see its images. Printed for each seed is the total variation of the number of cars in a
 scene, 20,000 structures of the prior, the start and the learnt guide against 20,000 of the target's, and how long the
-fit took. The floor is as many structures of the target as it has images.
+fit took. The floor is as many structures of the target as it has images. ``read`` is how the numbers of objects that
+the features read go with those that can be seen, by correlation, in the start's scenes and in other ones of the target.
 """
 
 import argparse
@@ -14,19 +15,23 @@ import time
 from dataclasses import replace
 
 import numpy as np
+import torch
 from given import out_option
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.sources import FITTED, LEARNT, before
+from probscene.app.evaluation.sources import FITTED, LEARNT, START, before
+from probscene.app.evaluation.visible import Seen, shown
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import preset
+from probscene.app.fitting.scene_features import images_of
 from probscene.app.fitting.storage import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.derive import derive_complete
+from probscene.inference.features.base import FeatureNet
 from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
 from probscene.model import SceneModel
 from probscene.policy import Policy
@@ -34,6 +39,7 @@ from probscene.sampling import seed_everything
 
 FLOOR = "floor"
 TRUTH = 20_000  # structures
+READ = 1024  # scenes
 
 
 def counted(model: SceneModel, policy: Policy, num: int = TRUTH) -> np.ndarray:
@@ -46,6 +52,17 @@ def counted(model: SceneModel, policy: Policy, num: int = TRUTH) -> np.ndarray:
 def sampled_anew(model: SceneModel, num: int) -> np.ndarray:
     """``(num, classes)``, of structures of a target that ``counted`` has not drawn: the floor."""
     return counted(model, model.prior, TRUTH + num)[TRUTH:]
+
+
+def correlations(model: SceneModel, policy: Policy, net: FeatureNet, least: float) -> dict[str, float]:
+    """By class, of what the features read in scenes and what is seen there of ``least`` of its silhouette or more."""
+    seen = shown(model, policy, READ, 99, Seen(shares=dict.fromkeys(model.classes, least)))
+    read = torch.cat([net.embed(images) for images in images_of(model, policy, READ, 99)]).numpy()
+    return {
+        name: round(float(np.corrcoef(seen[:, c], read[:, list(net.names).index(name)])[0, 1]), 3)
+        for c, name in enumerate(model.classes)
+        if name in net.names
+    }
 
 
 def main():
@@ -80,6 +97,11 @@ def main():
             }
             apart = wasserstein(histogram(found[:, 0]), histogram(truth[:, 0]))
             row[name] = {"total_variation": each, "cars_wasserstein": round(float(apart), 3)}
+        net = run.network()
+        if net is not None:
+            least = chosen.count.min_visible
+            sides = {START: (run.model, run.model.pretraining_policy), "target": (target, target.prior)}
+            row["read"] = {name: correlations(*side, net, least) for name, side in sides.items()}
         rows.append(row)
         print(json.dumps(row), flush=True)
         write_json(args.out / "results.json", rows)
