@@ -120,15 +120,18 @@ def count_loss(logits: Tensor, target: Tensor, margin: int, count_weight: float,
     entropy, error, count = _errors(logits, target, margin)
     of_classes, of_total = error.square(), error.sum(1).square()
     if relative:
-        of_classes, of_total = of_classes / (1 + count), of_total / (1 + count.sum(1))
+        of_classes, of_total = _relative(error, count), _relative(error.sum(1), count.sum(1))
     return (entropy + count_weight * (of_classes.sum(1) + of_total)).mean()
 
 
 def relative_count_loss(logits: Tensor, target: Tensor) -> Tensor:
-    """``count_loss`` with each class's squared error over one more than its count, as counts vary with their size, and
-    without the total: where there are twenty trees, the others' errors are as nothing beside theirs."""
+    """The relative ``count_loss`` without the total."""
     entropy, error, count = _errors(logits, target, 0)
-    return (entropy + (error.square() / (1 + count)).sum(1)).mean()
+    return (entropy + _relative(error, count).sum(1)).mean()
+
+
+def _relative(error: Tensor, count: Tensor) -> Tensor:
+    return error.square() / (1 + count)
 
 
 def _errors(logits: Tensor, target: Tensor, margin: int) -> tuple[Tensor, Tensor, Tensor]:
