@@ -17,16 +17,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 from given import out_option
+from torch.nn.functional import one_hot
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.sources import FITTED, LEARNT, START, before
-from probscene.app.evaluation.visible import Seen, shown
 from probscene.app.files import write_json
+from probscene.app.fitting.observer import RENDERED_AT_ONCE, Observer
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.scene_features import images_of
 from probscene.app.fitting.storage import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
@@ -35,7 +35,7 @@ from probscene.inference.features.base import FeatureNet
 from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.sampling import seed_everything
+from probscene.sampling import sample, seed_everything
 
 FLOOR = "floor"
 TRUTH = 20_000  # structures
@@ -56,12 +56,18 @@ def sampled_anew(model: SceneModel, num: int) -> np.ndarray:
 
 def correlations(model: SceneModel, policy: Policy, net: FeatureNet, least: float) -> dict[str, float]:
     """By class, of what the features read in scenes and what is seen there of ``least`` of its silhouette or more."""
-    seen = shown(model, policy, READ, 99, Seen(shares=dict.fromkeys(model.classes, least)))
-    read = torch.cat([net.embed(images) for images in images_of(model, policy, READ, 99)]).numpy()
+    seed_everything(99)
+    observer, parts = Observer(model, 1), []
+    for _ in range(0, READ, RENDERED_AT_ONCE):
+        drawn = observer.labelled(sample(model, policy, RENDERED_AT_ONCE))
+        label = drawn.label.masked_fill(drawn.visible < least, -1)
+        parts.append((one_hot(label + 1, len(model.classes) + 1)[..., 1:].sum(1), net.embed(drawn.image)))
+    seen, read = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
+    columns = {name: i for i, name in enumerate(net.names)}
     return {
-        name: round(float(np.corrcoef(seen[:, c], read[:, list(net.names).index(name)])[0, 1]), 3)
+        name: round(float(np.corrcoef(seen[:, c], read[:, columns[name]])[0, 1]), 3)
         for c, name in enumerate(model.classes)
-        if name in net.names
+        if name in columns
     }
 
 
