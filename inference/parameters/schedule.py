@@ -15,7 +15,7 @@ class ParameterSchedule:
         round_reader_steps, round_scene_renders, round_steps: of each.
         energy_steps, energy_scenes: of the energy distance at the end, and renders a step.
         images: of the target, at most, that are read.
-        reader_images: renders a step of the reader.
+        reader_images: renders a step of the reader; of large images fewer, but at least 4.
         reader_rate, scene_rate, rate, energy_rate: largest learning rates.
         sure: keep only sites whose readings come surely nearer to held-out images', even where whole images come nearer
             with all: for models with many sites, of which most are right. A spacing alone hardly makes them so.

@@ -89,6 +89,42 @@ def test_the_ratio_is_that_of_plain_sums_in_blocks_of_any_size(D, N, L, leave_on
     assert (bounded <= np.log(2) + 1e-9).all()
 
 
+@given(st.integers(1, 3), st.integers(2, 30), st.integers(1, 90), st.booleans(), st.integers(0, 2**31))
+def test_equal_sizes_are_parts_of_the_larger_sample(D, N, L, leave_one_out, seed):
+    generator = torch.Generator().manual_seed(seed)
+    generated, real = (torch.randn(size, D, generator=generator, dtype=torch.float64) for size in (N, L))
+
+    def mean_log_density(data, parts, i, left_out):
+        found = []
+        for k in range(parts):
+            some = [data[j] for j in range(k, len(data), parts) if j != left_out]
+            found.append(gaussian_kde(generated[i : i + 1], torch.stack(some), 0.7)[0])
+        return sum(found) / parts
+
+    of_real, of_generated, expected = max(1, round(L / N)), max(1, min(N // 2, round(N / L))), []
+    for i in range(N):
+        own = mean_log_density(generated, of_generated, i, i if leave_one_out else -1)
+        expected.append(own - mean_log_density(real, of_real, i, -1))
+    ours = KDELogRatio(0.7, None, leave_one_out, equal_sizes=True)(generated, real)
+    assert torch.allclose(ours, torch.stack(expected), atol=1e-6)
+
+
+@pytest.mark.parametrize(("N", "L"), [(40, 800), (800, 40)])
+def test_equal_sizes_take_away_the_bias_of_thin_tails(N, L):
+    """Of two samples of one distribution: the mean log ratio where it has a twentieth of its mass."""
+    torch.manual_seed(0)
+
+    def bias(ratio):
+        found = []
+        for _ in range(300):
+            generated, real = torch.rand(N, 1).log().neg(), torch.rand(L, 1).log().neg()
+            found.append(ratio(generated, real)[(generated > 3)[:, 0]].sum() / N)
+        return float(torch.stack(found).mean()), float(torch.stack(found).std()) / 300**0.5
+
+    (plain, _), (equal, error) = (bias(KDELogRatio(0.1, None, equal_sizes=equal)) for equal in (False, True))
+    assert abs(equal) < 4 * error < abs(plain) / 2
+
+
 @pytest.mark.parametrize("ratio", [KDELogRatio, JensenShannon])
 def test_a_cost_carries_no_gradient(ratio):
     generated = torch.randn(6, 3, requires_grad=True)

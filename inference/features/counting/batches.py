@@ -5,7 +5,6 @@ many of them a second; the last part trains on whole images, without which crops
 letters: N images, M nodes, K crops.
 """
 
-import math
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -47,6 +46,8 @@ class CountSchedule:
             there are twenty trees, the errors of what is rare are as nothing beside theirs.
         group_weight: of the cross-entropy and the error of the cells' votes for their group, a cell.
         min_visible: objects less visible than this are not counted.
+        rounding: whether what is read is drawn toward whole numbers, see ``toward_whole``; for counts whose
+            errors are far below one half.
     """
 
     steps: int = 3600
@@ -63,6 +64,7 @@ class CountSchedule:
     relative: bool = False
     group_weight: float = 0.5
     min_visible: float = 0.25
+    rounding: bool = True
 
 
 class Votes(NamedTuple):
@@ -99,6 +101,12 @@ class CountBatch(NamedTuple):
     group_cells: Tensor | None
 
 
+def images_a_step(most: int, area: float) -> int:
+    """``most``, of images of up to 128 x 128 pixels when reduced; of images of a larger ``area``, which hold more
+    objects, as many as have those pixels together, but at least 4."""
+    return min(most, max(FEWEST, round(most * FULL / area)))
+
+
 class CountBatches:
     """The batches of a training, drawn 16 steps at a time, each draw seeded by its number.
 
@@ -114,8 +122,7 @@ class CountBatches:
     @property
     def images(self) -> int:
         """Images a step."""
-        area = math.prod(self.net.canvas) / self.net.reduce**2
-        return min(self.schedule.images, max(FEWEST, round(self.schedule.images * FULL / area)))
+        return images_a_step(self.schedule.images, self.net.area)
 
     def after(self, done: int) -> Generator[list[CountBatch]]:
         """The batches that are left after ``done`` steps, a draw at a time, while another thread makes the next."""

@@ -37,7 +37,8 @@ class CountFeatures(Features):
 
     def build(self, model: SceneModel) -> CountNet:
         """Untrained."""
-        return CountNet(model.classes, model.channels, model.canvas, self.width, self.blocks, model.groups)
+        size, rounding = (self.width, self.blocks), self.schedule.rounding
+        return CountNet(model.classes, model.channels, model.canvas, *size, model.groups, rounding)
 
     def training(
         self, net: CountNet, renders: Renders, photographs: Callable[[], Photographs], seed: int

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...features.base import FeatureNet, enter
+from ...features.counting.batches import images_a_step
 from ...features.counting.net import CountNet, conv
 
 if TYPE_CHECKING:
@@ -39,6 +40,10 @@ class Eye(nn.Module):
         """Of ``(N, 1 or 3, H, W)`` uint8 images."""
         raise NotImplementedError
 
+    def images_a_step(self, most: int) -> int:
+        """How many images it is shown in a step of its training, at most ``most``."""
+        return most
+
     @staticmethod
     def of(net: FeatureNet) -> "Eye | None":
         """That which suits what structure was learnt by; None where nothing does."""
@@ -54,7 +59,7 @@ class RenderEye(Eye):
 
     def __init__(self, counts: CountNet):
         super().__init__()
-        self.channels, self.reduce = counts.channels, counts.reduce
+        self.channels, self.reduce, self.area = counts.channels, counts.reduce, counts.area
         fine, coarse, (b, c) = counts.stages()
         self.fine, self.coarse = copy.deepcopy(fine), copy.deepcopy(coarse)
         self.side, self.down = nn.Conv2d(b, WIDTH, 1, bias=False), nn.Conv2d(c, WIDTH, 1, bias=False)
@@ -66,6 +71,10 @@ class RenderEye(Eye):
         """Reduced images, padded to whole cells."""
         x = enter(images, self.channels, self.reduce)
         return F.pad(x, (0, -x.shape[-1] % (2 * STRIDE), 0, -x.shape[-2] % (2 * STRIDE)))
+
+    def images_a_step(self, most: int) -> int:
+        """See ``Eye``; fewer where they are large."""
+        return images_a_step(most, self.area)
 
     def forward(self, x: Tensor) -> Tensor:
         """See ``Eye``."""

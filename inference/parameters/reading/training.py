@@ -61,7 +61,7 @@ class ReaderTraining(StepTraining):
         reader: trained in place.
         draw: so many valued renders.
         steps: of AdamW.
-        images: a step.
+        images: a step, at most; see ``Eye.images_a_step``.
         learning_rate: the largest.
         seed: of everything random.
     """
@@ -82,7 +82,7 @@ class ReaderTraining(StepTraining):
         groups = [{"params": rest}, *([{"params": knowing, "lr": KEPT * learning_rate}] if knowing else [])]
         adam = torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
         super().__init__(reader, adam, steps, seed, warming=30)
-        self.reader, self.draw, self.images = reader, draw, images
+        self.reader, self.draw, self.images = reader, draw, reader.eye.images_a_step(images)
 
     def loss(self) -> Tensor:
         """See ``StepTraining``."""

@@ -27,10 +27,18 @@ STREET = replace(
     prior_kl_weight=0.03,
     draws_per_structure=1,
     count=CountSchedule(
-        crops=48, crop=64, balanced=True, relative=True, learning_rate=3e-3, muon_rate=0.02, min_visible=0.05
+        steps=7200,
+        crops=48,
+        crop=64,
+        balanced=True,
+        relative=True,
+        learning_rate=3e-3,
+        muon_rate=0.02,
+        min_visible=0.05,
+        rounding=False,
     ),
     blocks=(1, 3),
-    parameters=ParameterSchedule(sure=True),
+    parameters=ParameterSchedule(scene_renders=12288, round_scene_renders=4096, sure=True),
 )
 # The paper's Multi-MNIST (section 4.1, supplement): 20 epochs of 5,000 target images in batches of 500 are 200 updates.
 PAPER = Preset(

@@ -8,6 +8,7 @@ from probscene import load_model
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import enter
 from probscene.inference.features.counting.batches import FEWEST, FULL, CountBatches, CountSchedule, cells
+from probscene.inference.features.counting.choices import CountFeatures
 from probscene.inference.features.counting.net import STRIDE, CountNet, toward_whole
 from probscene.inference.features.counting.training import CountTraining, count_loss
 from probscene.inference.features.presence import PresenceFeatures, PresenceNet, PresenceTraining
@@ -105,6 +106,13 @@ def test_embedding_is_the_map_summed_and_indifferent_to_place(dots):
     assert torch.allclose(one[:, :2], toward_whole(direct), atol=1e-4)
     assert torch.allclose(one[:, 2], toward_whole(direct.sum(1)), atol=1e-4)
     assert torch.allclose(one, other, atol=1e-3)
+    net.rounding = False
+    assert torch.allclose(net.embed(image), torch.cat([direct, direct.sum(1, keepdim=True)], 1), atol=1e-4)
+
+
+def test_a_schedule_says_whether_counts_are_drawn_toward_whole_numbers(dots):
+    nets = [CountFeatures(CountSchedule(rounding=rounding)).build(dots) for rounding in (False, True)]
+    assert [net.rounding for net in nets] == [False, True]
 
 
 def test_counts_are_drawn_toward_whole_numbers_in_order():

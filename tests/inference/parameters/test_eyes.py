@@ -9,6 +9,7 @@ from probscene.inference.features.photographs.heads import PretrainedCountNet
 from probscene.inference.features.presence import PresenceNet
 from probscene.inference.parameters.reading.eyes import WIDTH, Eye, RenderEye, cell_colours
 from probscene.inference.parameters.reading.reader import Reader
+from probscene.inference.parameters.reading.training import ReaderTraining
 
 CLASSES = ("red", "blue")
 
@@ -50,6 +51,17 @@ def test_colours_are_those_of_each_cell(channels):
     x = np.broadcast_to(images.numpy(), (2, 3, 24, 32)).reshape(2, 3, 6, 4, 8, 4) / 128.0 - 1
     assert np.allclose(found[:, :3], x.mean((3, 5)), atol=1e-5)
     assert np.allclose(found[:, 3:], 3 * x.std((3, 5)), atol=1e-2)
+
+
+@pytest.mark.parametrize(("size", "images"), [(24, 12), (12, 7), (6, 4)])
+def test_the_reader_is_shown_fewer_renders_that_are_larger(size, images):
+    """Objects of 24 pixels may be reduced to a quarter, those of 6 not at all."""
+    counts, asked = CountNet(CLASSES, 3, (188, 600), width=(4, 8, 8)), []
+    counts.fit_to(size)
+    training = ReaderTraining(Reader(RenderEye(counts), 2, 1, 1), asked.append, images=12)
+    with pytest.raises(AttributeError):
+        training.loss()  # of no renders
+    assert asked == [images]
 
 
 def test_features_without_places_give_no_eye():
