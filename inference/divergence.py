@@ -202,11 +202,9 @@ def _own_log_sums(points: Tensor, variance: float, leave_one_out: bool, parts: i
     """``_log_sums`` of points ``(B, N, d)`` at themselves: the mean of those of ``parts`` that they are split into."""
     found = torch.zeros_like(points[..., 0])
     for k in range(parts):
-        inside = torch.arange(points.shape[1]) % parts == k
-        data = points[:, inside]
-        found[:, inside] += _log_sums(data, data, variance, leave_one_out)
-        if parts > 1:
-            found[:, ~inside] += _log_sums(points[:, ~inside], data, variance)
+        data = points[:, k::parts]
+        for j in range(parts):
+            found[:, j::parts] += _log_sums(points[:, j::parts], data, variance, leave_one_out and j == k)
     return found / parts
 
 
