@@ -37,8 +37,8 @@ class CountFeatures(Features):
 
     def build(self, model: SceneModel) -> CountNet:
         """Untrained."""
-        size, rounding = (self.width, self.blocks), self.schedule.rounding
-        return CountNet(model.classes, model.channels, model.canvas, *size, model.groups, rounding)
+        rounding = self.schedule.rounding
+        return CountNet(model.classes, model.channels, model.canvas, self.width, self.blocks, model.groups, rounding)
 
     def training(
         self, net: CountNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
