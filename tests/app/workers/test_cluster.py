@@ -39,16 +39,23 @@ def doubling(pause=0.0, fault=None):
     return do
 
 
-def unwritable(node, code, *task):
-    """The work of ``generate``, where one node's disk takes no files."""
+def unwritable(node, code, tried, *arguments):
+    """The work of ``generate``, where one node's disk takes no files; others leave it chunks until it has tried."""
     import ray
 
     def fails(*_):
+        tried.touch()
         raise OSError(code, os.strerror(code))
 
-    make = _actor(*task)
-    if ray.get_runtime_context().get_node_id() == node:
-        os.replace = fails
+    def waits(chunk):
+        while chunk and not tried.exists():
+            time.sleep(0.05)
+        return make(chunk)
+
+    make = _actor(*arguments)
+    if ray.get_runtime_context().get_node_id() != node:
+        return waits
+    os.replace = fails
     return make
 
 
@@ -175,7 +182,7 @@ def test_what_a_task_raises_is_told_with_its_node(nodes):
 def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, tmp_path, monkeypatch, code, what):
     run, node, out = RunFolder.at(fitted), simulated.nodes[1].node_id, tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(datasets, "_actor", partial(unwritable, node, code))
+        patch.setattr(datasets, "_actor", partial(unwritable, node, code, tmp_path / "tried"))
         with pytest.raises(MachineError, match=f"On node .*: .*{what}"):
             generate(run, 700, out, seed=3, cluster=nodes)
     generate(run, 700, tmp_path / "alone", seed=3)
