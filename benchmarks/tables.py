@@ -54,6 +54,22 @@ def learn_looks(result: dict) -> Rows:
     return rows
 
 
+def learn_driving(result: dict) -> Rows:
+    """Two rows for each source, of cars, then the other classes' total variation; a column for each target."""
+    targets, sources = result["rows"], ("prior", "start", "learnt", "floor")
+    rows: Rows = [["", *(f"target {row['seed']}" for row in targets), "mean"]]
+    for distance, said in (("total_variation", "cars, TV"), ("wasserstein", "cars, Wasserstein-1")):
+        for source in sources:
+            each = [row[source]["car"][distance] for row in targets]
+            figures = [f"{value:.3f} ({low:.3f} to {high:.3f})" for value, low, high in each]
+            rows.append([f"{said}, {source}", *figures, f"{np.mean([value for value, *_ in each]):.3f}"])
+    for name in (name for name in targets[0]["learnt"] if name != "car"):
+        each = [[row[source][name]["total_variation"][0] for source in sources] for row in targets]
+        figures = [", ".join(f"{value:.2f}" for value in four) for four in (*each, np.mean(each, 0))]
+        rows.append([f"{name}, TV, the four in the same order", *figures])
+    return rows
+
+
 def learn_generator(result: dict) -> Rows:
     """A row for each quantity, the mean of the seeds and their range."""
     sources = ("prior", "start", "learnt", "floor")
@@ -112,6 +128,7 @@ def _figure(figure: dict) -> str:
 
 TABLES: dict[str, Callable[[dict], Rows]] = {
     "ablate": ablate,
+    "learn_driving": learn_driving,
     "learn_generator": learn_generator,
     "learn_labelled": learn_labelled,
     "learn_looks": learn_looks,

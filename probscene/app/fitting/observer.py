@@ -81,7 +81,7 @@ class Observer:
         observe, scenes = self.observe(net), sample(self.model, self.model.pretraining_policy, num)
         return observe(scenes), observe(run_program(self.model, scenes.derivation))
 
-    def object_size(self, num: int = 64) -> float:
+    def object_size(self, num: int = 256) -> float:
         """How small objects are in the prior's renders, pixels: a tenth of those that can be seen have boxes of less
         than the square of this; infinite where there are none."""
         batch = self.render(sample(self.model, self.model.prior, num).drawing)

@@ -1,3 +1,6 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -113,6 +116,15 @@ def test_embedding_is_the_map_summed_and_indifferent_to_place(dots):
 def test_a_schedule_says_whether_counts_are_drawn_toward_whole_numbers(dots):
     nets = [CountFeatures(CountSchedule(rounding=rounding)).build(dots) for rounding in (False, True)]
     assert [net.rounding for net in nets] == [False, True]
+
+
+def test_fits_of_all_seeds_look_at_one_resolution(dots):
+    """Objects of a size at which a few more or fewer in a sample decide."""
+    renders, choice = SimpleNamespace(object_size=lambda: 11.5 + float(torch.rand(())), draw=None), CountFeatures()
+    nets = [choice.build(replace(dots, canvas=(256, 256))) for _ in range(20)]
+    for seed, net in enumerate(nets):
+        choice.training(net, renders, None, seed)
+    assert len({net.reduce for net in nets}) == 1
 
 
 def test_counts_are_drawn_toward_whole_numbers_in_order():
