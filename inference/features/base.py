@@ -1,6 +1,6 @@
 """Feature networks: what they are trained on and how images enter them.
 
-They are trained on the model's own prior renders only, whose labels come free. Axis letters: N scenes, M nodes, D
+They are trained on the model's own renders only, whose labels come free. Axis letters: N scenes, M nodes, D
 features, C H W.
 """
 
@@ -78,8 +78,9 @@ class Renders(Protocol):
 
     model: SceneModel
 
-    def draw(self, num: int) -> Examples:
-        """``num`` labelled renders of the prior."""
+    def draw(self, num: int, beyond_prior: bool = False) -> Examples:
+        """``num`` labelled renders of the prior; or of the policy that guides are pretrained on, which may have more of
+        everything."""
         ...
 
     def draw_twice(self, num: int) -> Examples:

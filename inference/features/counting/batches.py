@@ -30,6 +30,8 @@ class CountSchedule:
 
     Args:
         steps: of Adam.
+        beyond_prior: whether scenes are drawn by the policy that guides are pretrained on, instead of the prior. Guides
+            can pass the prior's longest lists, and a network that has not seen so many objects reads too few.
         whole: fraction of the steps, the last ones, on whole images.
         images: images a step, of up to 128 x 128 pixels when reduced; of larger ones, whose crops are as many and
             whose drawing takes longer, fewer to the same number of pixels, but at least 4.
@@ -51,6 +53,7 @@ class CountSchedule:
     """
 
     steps: int = 3600
+    beyond_prior: bool = False
     whole: float = 0.25
     images: int = 16
     crops: int = 64

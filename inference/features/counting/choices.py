@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from probscene.model import SceneModel
@@ -16,7 +17,7 @@ from .training import CountTraining
 
 @dataclass(frozen=True)
 class CountFeatures(Features):
-    """``CountNet``, trained on the prior's renders.
+    """``CountNet``, trained on renders of the prior, or of what guides are pretrained on.
 
     Args:
         schedule: of its training.
@@ -46,7 +47,8 @@ class CountFeatures(Features):
         """On renders alone, reduced no more than the model's small objects bear."""
         seed_everything(0)  # how large objects are is the model's, and the same for all seeds
         net.fit_to(renders.object_size())
-        return CountTraining(net, renders.draw, self.schedule, seed=batch_seed(seed, 1))
+        draw = partial(renders.draw, beyond_prior=self.schedule.beyond_prior)
+        return CountTraining(net, draw, self.schedule, seed=batch_seed(seed, 1))
 
 
 def slow_settings(preset: Any) -> dict[str, Any]:

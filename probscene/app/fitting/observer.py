@@ -53,9 +53,11 @@ class Observer:
         carriers = {parent for parent, _ in relations(model.grammar)}
         self.covered = torch.tensor([kind in carriers for kind in model.grammar.kinds] + [True])  # the last is padding
 
-    def draw(self, num: int) -> Examples:
-        """``num`` labelled renders of the prior."""
-        return self.labelled(sample(self.model, self.model.prior, num))
+    def draw(self, num: int, beyond_prior: bool = False) -> Examples:
+        """``num`` labelled renders of the prior; or of the policy that guides are pretrained on, which may have more of
+        everything."""
+        policy = self.model.pretraining_policy if beyond_prior else self.model.prior
+        return self.labelled(sample(self.model, policy, num))
 
     def draw_twice(self, num: int) -> Examples:
         """Labelled renders of ``num`` structures of the policy that guides are pretrained on, and as many more of the

@@ -28,6 +28,7 @@ STREET = replace(
     draws_per_structure=1,
     count=CountSchedule(
         steps=7200,
+        beyond_prior=True,
         crops=48,
         crop=64,
         balanced=True,

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene import load_model
+from probscene.app.fitting.observer import Observer
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import enter
 from probscene.inference.features.counting.batches import FEWEST, FULL, CountBatches, CountSchedule, cells
@@ -16,6 +17,8 @@ from probscene.inference.features.counting.net import STRIDE, CountNet, toward_w
 from probscene.inference.features.counting.training import CountTraining, count_loss
 from probscene.inference.features.presence import PresenceFeatures, PresenceNet, PresenceTraining
 from probscene.model import Groups
+from probscene.structure import StructurePrior
+from probscene.structure import counts as lengths
 
 
 @given(st.sampled_from([1, 2, 4, 8]), st.integers(9, 40), st.integers(9, 40), st.integers(0, 2**31))
@@ -120,11 +123,20 @@ def test_a_schedule_says_whether_counts_are_drawn_toward_whole_numbers(dots):
 
 def test_fits_of_all_seeds_look_at_one_resolution(dots):
     """Objects of a size at which a few more or fewer in a sample decide."""
-    renders, choice = SimpleNamespace(object_size=lambda: 11.5 + float(torch.rand(())), draw=None), CountFeatures()
+    renders, choice = SimpleNamespace(object_size=lambda: 11.5 + float(torch.rand(())), draw=print), CountFeatures()
     nets = [choice.build(replace(dots, canvas=(256, 256))) for _ in range(20)]
     for seed, net in enumerate(nets):
         choice.training(net, renders, None, seed)
     assert len({net.reduce for net in nets}) == 1
+
+
+@pytest.mark.parametrize("beyond", [False, True])
+def test_a_schedule_says_whether_a_network_sees_more_than_the_prior_has(dots, beyond):
+    more = StructurePrior(dots.grammar, Things=lengths(0, 0, 0, 0, 0, 1))
+    choice = CountFeatures(CountSchedule(beyond_prior=beyond))
+    renders = Observer(replace(dots, pretraining=more), threads=1)
+    number = (choice.training(choice.build(dots), renders, None, 0).batches.draw(32).label >= 0).sum(1)
+    assert (number == 5).all() if beyond else (number <= 4).all()
 
 
 def test_counts_are_drawn_toward_whole_numbers_in_order():
