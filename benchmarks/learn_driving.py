@@ -64,6 +64,14 @@ def apart(counts: np.ndarray, truth: np.ndarray) -> dict[str, list[float]]:
     }
 
 
+def distances(model: SceneModel, counts: dict[str, np.ndarray], truth: np.ndarray) -> dict[str, dict]:
+    """``apart`` of each class, by source, whose counts and the truth's are ``(N, classes)``."""
+    return {
+        name: {c: apart(found[:, i], truth[:, i]) for i, c in enumerate(model.classes)}
+        for name, found in counts.items()
+    }
+
+
 def sampled_anew(model: SceneModel, num: int) -> np.ndarray:
     """``(num, classes)``, of structures of a target that ``counted`` has not drawn: the floor."""
     return counted(model, model.prior, TRUTH + num)[TRUTH:]
@@ -111,8 +119,7 @@ def main():
         policies = {**before(run.model), LEARNT: run.guide}
         counts = {name: counted(model, policy) for name, policy in policies.items()}
         counts[FLOOR] = sampled_anew(target, args.images)
-        for name, found in counts.items():
-            row[name] = {c: apart(found[:, i], truth[:, i]) for i, c in enumerate(model.classes)}
+        row |= distances(model, counts, truth)
         net = run.network()
         if net is not None:
             least = chosen.count.min_visible

@@ -8,8 +8,8 @@ It separates learning from reading. A seed's target is the model's own (``SceneM
 channel: some are hidden, the more of them there are, crowds are read as too few, and the rest is noise. The numbers of
 the channel are about those of the count network of streets. With ``--again`` each target is learnt from several seeds.
 Printed for each fit are total variation and Wasserstein-1 from the target of the number of objects of each class, of
-the start, the learnt guide and the floor, as ``learn_driving.py`` has them, and how far what is read of both is apart
-(``read``). FOLDER holds ``results.json``.
+the prior, the start, the learnt guide and the floor, as ``learn_driving.py`` has them, and how far what is read of both
+is apart (``read``). FOLDER holds ``results.json``.
 """
 
 import argparse
@@ -20,10 +20,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from given import command, out_option
-from learn_driving import FLOOR, apart, counted, sampled_anew
+from learn_driving import FLOOR, counted, distances, sampled_anew
 from torch import Tensor
 
-from probscene.app.evaluation.sources import LEARNT, START
+from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import make_folder, write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE, Preset
@@ -111,16 +111,12 @@ def measured(model: SceneModel, seed: int, again: int, args: argparse.Namespace)
     target, channel, began = model.target(seed), Channel(model), time.monotonic()
     guide = learn(model, channel, channel.sample(target, target.prior, args.images, 1000 + seed), chosen, again)
     truth = counted(model, target.prior)
-    counts = {START: counted(model, model.pretraining_policy), LEARNT: counted(model, guide)}
+    counts = {name: counted(model, policy) for name, policy in {**before(model), LEARNT: guide}.items()}
     counts[FLOOR] = sampled_anew(target, args.images)
-    row: dict = {"seed": seed, "again": again, "seconds": round(time.monotonic() - began, 1)}
-    row |= {
-        name: {c: apart(found[:, i], truth[:, i]) for i, c in enumerate(model.classes)}
-        for name, found in counts.items()
-    }
+    row = {"seed": seed, "again": again, "seconds": round(time.monotonic() - began, 1)}
     sides = (model, guide), (target, target.prior)
     own, other = (channel.sample(*side, args.images, 98).round().long().numpy() for side in sides)
-    return row | {"read": {c: apart(own[:, i], other[:, i]) for i, c in enumerate(model.classes)}}
+    return row | distances(model, counts, truth) | distances(model, {"read": own}, other)
 
 
 def main():
@@ -142,7 +138,7 @@ def main():
             print(json.dumps(rows[-1]), flush=True)
             write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
     first = model.classes[0]
-    for name in (START, LEARNT, FLOOR, "read"):
+    for name in (name for name in (*FITTED, FLOOR, "read") if name in rows[0]):
         each = [row[name][first]["total_variation"][0] for row in rows]
         print(f"{name:8} {first}, total variation: mean {np.mean(each):.3f}, {min(each):.3f} to {max(each):.3f}")
 
