@@ -25,6 +25,7 @@ from torch import Tensor
 
 from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import make_folder, write_json
+from probscene.app.fitting.learnt.structure import score_function
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE, Preset
 from probscene.app.fitting.presets import preset
@@ -32,16 +33,13 @@ from probscene.app.loading import load_model
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.inference.guides.base import Guide
-from probscene.inference.guides.lstm import make_guide
-from probscene.inference.guides.scenario import ScenarioGuide
+from probscene.inference.guides.scenario import guide_of
 from probscene.inference.learn import Trainer
-from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import Scenes, seed_everything
-from probscene.scenarios import JointGrammar
 
 HIDDEN = 0.02  # share of a class's objects that is hidden, for each that there is
 CROWD, BEYOND = 6.0, 0.75  # what is more than the former is read as so much of it
@@ -72,32 +70,12 @@ class Channel:
             return self.read(derive_complete(self.grammar, policy, num, model.max_steps)[0])
 
 
-def untrained(model: SceneModel, chosen: Preset) -> Guide:
-    """The guide of a fit."""
-    settings, grammar = chosen.guide_settings(), model.grammar
-    if isinstance(grammar, JointGrammar):
-        guide: Guide = ScenarioGuide(grammar, model.max_steps, **settings)
-    else:
-        guide = make_guide(grammar=grammar, max_steps=model.max_steps, **settings)
-    guide.bind(model.support)
-    return guide
-
-
 def learn(model: SceneModel, channel: Channel, real: Tensor, chosen: Preset, seed: int) -> Guide:
     """A guide, by what a fit of the preset does."""
     seed_everything(batch_seed(seed, 2))
-    guide, start = untrained(model, chosen), model.pretraining_policy
-    objective = ScoreFunction(
-        channel,
-        chosen.divergence(),
-        baseline=chosen.baseline,
-        updates=chosen.updates,
-        scale=chosen.scale,
-        strata=guide.strata,
-        incompletion_weight=chosen.incompletion_weight,
-        prior=start,
-        prior_kl_weight=chosen.prior_kl_weight,
-    )
+    guide, start = guide_of(model.grammar, model.max_steps, **chosen.guide_settings()), model.pretraining_policy
+    guide.bind(model.support)
+    objective = score_function(chosen, model, channel, chosen.divergence(), guide)
     pretrain(guide, start, chosen.pretrain_derivations, chosen.pretrain_epochs, learning_rate=chosen.pretrain_rate)
     scenes, images, rate = chosen.num_scenes, chosen.num_real, chosen.learning_rate
     seeds = batch_seed(seed, 3)

@@ -8,6 +8,7 @@ References:
     [1] Devaranjan, Kar, Fidler, *Meta-Sim2*, ECCV 2020, section 3.3: the kernel density log ratio.
     [2] Gretton et al., *A Kernel Two-Sample Test*, JMLR 2012: MMD and its witness function.
     [3] Nowozin, Cseke, Tomioka, *f-GAN*, NeurIPS 2016, table 1: divergences as functions of the density ratio.
+    [4] Anscombe, *The transformation of Poisson, binomial and negative-binomial data*, Biometrika 1948.
 """
 
 import math
@@ -27,6 +28,12 @@ class Divergence(Protocol):
     """``(generated (N, D), real (L, D)) -> cost (N,)``, lower where a scene should become more likely."""
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor: ...
+
+
+def anscombe(features: Tensor) -> Tensor:
+    """Counts whose variance is about as large as they are, so that all have variance 1 [4]: ``2 sqrt(x + 3/8)``, less
+    its value at 0. Odd, so that it also takes values below 0, as networks may read them; of the same shape."""
+    return 2 * features.sign() * ((features.abs() + 0.375).sqrt() - math.sqrt(0.375))
 
 
 def gaussian_kde(points: Tensor, data: Tensor, variance: float, leave_one_out: bool = False) -> Tensor:
@@ -57,12 +64,16 @@ class KDELogRatio:
     measurements of both.
 
     Args:
-        variance: of the joint kernel, in squared feature units; None is the paper's ``H = d I``, the feature dimension.
+        variance: of the joint kernel, in squared units of what is compared; None is the paper's ``H = d I``, the
+            feature dimension.
         marginal_variance: of the kernels of the single features; None leaves them out, as in the paper.
         leave_one_out: leave a scene out of its own density estimate, without which rare scenes are punished for being
             rare: the paper keeps it in.
         equal_sizes: estimate both densities from as many scenes. The larger sample is split into parts about as large
             as the smaller one, and the log densities of the parts are averaged, which are all too low by as much.
+        stabilised: compare counts after Anscombe's transformation (not in the paper). A network is farther off the more
+            there is, so that one kernel in counts is too wide for what is rare or too narrow for what there is much of.
+            Near a count x a variance v is then about one of ``v x`` in counts.
 
     Raises:
         ProbsceneError: too few scenes, or features that are not finite.
@@ -72,9 +83,12 @@ class KDELogRatio:
     marginal_variance: float | None = 0.1
     leave_one_out: bool = True
     equal_sizes: bool = False
+    stabilised: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
         _check(generated, real)
+        if self.stabilised:
+            generated, real = anscombe(generated), anscombe(real)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         cost = self.of_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
         if self.marginal_variance is not None and generated.shape[1] > 1:

@@ -67,3 +67,18 @@ class ScenarioGuide(Guide):
     def strata(self, derivation: Derivation) -> Tensor:
         """``(N,)`` int64, whose guide's each scene is."""
         return self.grammar.scenario(derivation)
+
+
+def guide_of(
+    grammar: Grammar, max_steps: int, make: Callable[[Grammar, int], Guide] | None = None, **settings
+) -> Guide:
+    """An untrained guide of a grammar; of a joint one, a guide for each scenario.
+
+    Args:
+        max_steps: T_max.
+        make: makes a guide from a grammar and T_max, instead of ``make_guide``.
+        settings: of ``make_guide``.
+    """
+    if isinstance(grammar, JointGrammar):
+        return ScenarioGuide(grammar, max_steps, make=make, **settings)
+    return make_guide(grammar=grammar, max_steps=max_steps, **settings) if make is None else make(grammar, max_steps)

@@ -9,7 +9,7 @@ from scipy.stats import gaussian_kde as scipy_kde
 
 from probscene.errors import ProbsceneError
 from probscene.inference import divergence as module
-from probscene.inference.divergence import MMD, Blockwise, JensenShannon, KDELogRatio, gaussian_kde
+from probscene.inference.divergence import MMD, Blockwise, JensenShannon, KDELogRatio, anscombe, gaussian_kde
 from probscene.inference.guides.lstm import LSTMGuide
 
 
@@ -107,6 +107,28 @@ def test_equal_sizes_are_parts_of_the_larger_sample(D, N, L, leave_one_out, seed
         expected.append(own - mean_log_density(real, of_real, i, -1))
     ours = KDELogRatio(0.7, None, leave_one_out, equal_sizes=True)(generated, real)
     assert torch.allclose(ours, torch.stack(expected), atol=1e-6)
+
+
+@given(st.floats(4, 200), st.integers(0, 2**31))
+def test_anscombe_gives_counts_of_any_mean_a_variance_of_one(mean, seed):
+    counts = torch.from_numpy(np.random.default_rng(seed).poisson(mean, 20000)).double()
+    assert 0.9 < anscombe(counts).var() < 1.1
+
+
+@given(st.lists(st.floats(-50, 500), min_size=2, max_size=40))
+def test_anscombe_keeps_the_order_and_is_odd(values):
+    x = torch.tensor(values, dtype=torch.float64).sort().values
+    assert (anscombe(x).diff() >= 0).all()
+    assert torch.equal(anscombe(-x), -anscombe(x))
+    assert torch.allclose(anscombe(x.abs()), 2 * (x.abs() + 3 / 8).sqrt() - 2 * (3 / 8) ** 0.5)
+
+
+@pytest.mark.parametrize("kind", [KDELogRatio, JensenShannon])
+def test_stabilised_ratios_are_those_of_transformed_counts(kind):
+    generated, real = torch.rand(20, 3) * 30, torch.rand(50, 3) * 30
+    plain, stabilised = kind(0.8, 0.1), kind(0.8, 0.1, stabilised=True)
+    assert torch.equal(stabilised(generated, real), plain(anscombe(generated), anscombe(real)))
+    assert not torch.allclose(stabilised(generated, real), plain(generated, real))
 
 
 @pytest.mark.parametrize(("N", "L"), [(40, 800), (800, 40)])

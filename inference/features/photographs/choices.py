@@ -79,8 +79,8 @@ class PretrainedCountFeatures(Features):
     def settings(self, preset: Any) -> dict[str, Any]:
         """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
         each structure is drawn once. Photographs' counts are noisy, and few: the prior of a preset that has such a
-        weight holds them more. Parameters are not learnt by what a reader reads in photographs, of which it has
-        seen none."""
+        weight holds them more. They come in units of their bandwidth, which the kernel takes as they are. Parameters
+        are not learnt by what a reader reads in photographs, of which it has seen none."""
         return {
             "parameter_method": "tilting",
             "pairs": 1000,
@@ -89,5 +89,6 @@ class PretrainedCountFeatures(Features):
             "draws_per_structure": 1,
             "variance": None if preset.variance is None else 1.0,
             "marginal_variance": 0.1,
+            "stabilised": False,
             "prior_kl_weight": max(preset.prior_kl_weight, 0.1) if preset.prior_kl_weight else 0.0,
         }

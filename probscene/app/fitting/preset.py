@@ -57,7 +57,8 @@ class Preset:
         guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``; ``FILE.py:NAME`` for one's own.
         objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
             value for each scene; ``"mmd"``, MMD as a reward that all scenes share; ``FILE.py:NAME`` for one's own.
-        variance, marginal_variance, leave_one_out, equal_sizes: see ``KDELogRatio``; the first one also of ``MMD``.
+        variance, marginal_variance, leave_one_out, equal_sizes, stabilised: see ``KDELogRatio``; the first one also of
+            ``MMD``.
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         on_prior: guides are pretrained on the prior itself and may take whatever the grammar has, as in the paper; else
             on the policy that the model names for it, within its support.
@@ -95,6 +96,7 @@ class Preset:
     marginal_variance: float | None = 0.1
     leave_one_out: bool = True
     equal_sizes: bool = False
+    stabilised: bool = False
     pretrain_derivations: int = 5000
     pretrain_epochs: int = 10
     pretrain_rate: float = 1e-3
@@ -255,7 +257,7 @@ class Preset:
         if of_any:
             found["variance"] = of_any
         if of_kde:
-            found |= dict.fromkeys(("marginal_variance", "leave_one_out", "equal_sizes"), of_kde)
+            found |= dict.fromkeys(("marginal_variance", "leave_one_out", "equal_sizes", "stabilised"), of_kde)
         return found
 
     def guide_settings(self) -> dict[str, Any]:
@@ -274,4 +276,4 @@ class Preset:
         if self.objective in ("mmd", "witness"):
             return MMD(self.variance, shared=self.objective == "mmd")
         ratio = JensenShannon if self.objective == "js" else KDELogRatio
-        return ratio(self.variance, self.marginal_variance, self.leave_one_out, self.equal_sizes)
+        return ratio(self.variance, self.marginal_variance, self.leave_one_out, self.equal_sizes, self.stabilised)

@@ -17,13 +17,14 @@ DEFAULT = replace(
     batches=120,
     parameters=ParameterSchedule(reader_steps=800, rounds=3, round_steps=500),
 )
-# Streets have ten counts, some of which spread over tens: kernels of variance 1 would leave most of 500 scenes alone.
+# Streets have ten counts, some of which spread over tens, and a network is farther off the more there is: in counts, a
+# kernel of one width is too wide for a pedestrian or too narrow for a wood.
 # Objects behind others are counted as far as they can be seen at all; the prior holds what cannot. Images are so wide
 # that a step has four of them, objects as large as what a network for digits sees at once, and most are trees and cars.
 STREET = replace(
     QUICK,
     objective="js",
-    variance=5.0,
+    stabilised=True,
     prior_kl_weight=0.03,
     draws_per_structure=1,
     count=CountSchedule(

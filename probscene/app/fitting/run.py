@@ -11,11 +11,9 @@ from probscene.errors import RunError
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, Features
 from probscene.inference.guides.base import Guide
-from probscene.inference.guides.lstm import make_guide
-from probscene.inference.guides.scenario import ScenarioGuide
+from probscene.inference.guides.scenario import guide_of
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.scenarios import JointGrammar
 
 from ..files import make_folder, write_json, write_whole
 from ..labelling.few import FewLabels
@@ -239,12 +237,7 @@ class RunFolder(Storage):
         if make is None and is_file_part(kind):
             self._unchanged_part(kind)
             make = as_guide_maker(load_part(kind))
-        if isinstance(model.grammar, JointGrammar):
-            made = ScenarioGuide(model.grammar, model.max_steps, make=make, **settings)
-        elif make is not None:
-            made = make(model.grammar, model.max_steps)
-        else:
-            made = make_guide(grammar=model.grammar, max_steps=model.max_steps, **settings)
+        made = guide_of(model.grammar, model.max_steps, make, **settings)
         made = made if make is None else check_guide(made, model.max_steps)
         if self.record.get("within_support"):  # runs of before have none, and stay as they were
             made.bind(None if model.support is None else model.support.holding(model.prior, self.unread))

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from probscene.dataset import Images
+from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.guides.base import Guide
@@ -31,6 +32,7 @@ from ...workers.cluster import Cluster
 from ...workers.crew import Crew
 from ..observer import RENDERED_AT_ONCE, Observe, Observer, Part
 from ..parts import inner
+from ..preset import Preset
 from ..run import RunFolder
 from ..storage import Keeper
 from .outcome import compared
@@ -192,11 +194,18 @@ def _objective(
     guide: Guide,
     pool: RenderPool | None,
 ) -> ScoreFunction:
-    preset = run.preset
-    held = Held(model, {*run.unread, *(model.stuff if run.readings else ())}, preset.num_scenes)
+    held = Held(model, {*run.unread, *(model.stuff if run.readings else ())}, run.preset.num_scenes)
+    observe = held.beside(observe if pool is None else pool.around(observe))
+    return score_function(run.preset, model, observe, held.added_to(run.divergence(inner(net))), guide)
+
+
+def score_function(
+    preset: Preset, model: SceneModel, observe: Observe, divergence: Divergence, guide: Guide
+) -> ScoreFunction:
+    """What a guide of the model is learnt by, with the preset's settings."""
     return ScoreFunction(
-        held.beside(observe if pool is None else pool.around(observe)),
-        held.added_to(run.divergence(inner(net))),
+        observe,
+        divergence,
         baseline=preset.baseline,
         updates=preset.updates,
         scale=preset.scale,
