@@ -130,13 +130,17 @@ class MMD:
         variance: of the kernel; None is the feature dimension.
         shared: every scene pays the one discrepancy of the batch (the baseline of [1], which cannot assign credit);
             otherwise each pays its own witness value ``2 (E k(x, G) - E k(x, R))``, the same gradient in expectation.
+        stabilised: as of ``KDELogRatio``.
     """
 
     variance: float | None = 1.0
     shared: bool = True
+    stabilised: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
         _check(generated, real)
+        if self.stabilised:
+            generated, real = anscombe(generated), anscombe(real)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         N, L = len(generated), len(real)
         within = torch.exp(-0.5 / variance * _squared_distances(generated, generated)).fill_diagonal_(0.0)

@@ -69,6 +69,7 @@ def test_pretrained_features_bring_their_own_unit():
         assert QUICK.with_features(features).divergence() == KDELogRatio(1.0, single)
         assert preset("paper").with_features(features).variance is None
     assert street.with_features("count").divergence() == street.divergence()
+    assert street.with_objective("witness").divergence() == MMD(street.variance, shared=False, stabilised=True)
     assert street.with_features("count=efficientnet").prior_kl_weight > street.prior_kl_weight > 0
     assert QUICK.with_features("count=efficientnet").prior_kl_weight == 0
 

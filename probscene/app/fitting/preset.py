@@ -57,8 +57,8 @@ class Preset:
         guide: ``"lstm"``, ``"pcfg"`` or ``"grammar-vae"``, see ``make_guide``; ``FILE.py:NAME`` for one's own.
         objective: ``"kde"``, the log density ratio; ``"js"``, bounded, of the same densities; ``"witness"``, MMD with a
             value for each scene; ``"mmd"``, MMD as a reward that all scenes share; ``FILE.py:NAME`` for one's own.
-        variance, marginal_variance, leave_one_out, equal_sizes, stabilised: see ``KDELogRatio``; the first one also of
-            ``MMD``.
+        variance, marginal_variance, leave_one_out, equal_sizes, stabilised: see ``KDELogRatio``; the first and the last
+            also of ``MMD``.
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         on_prior: guides are pretrained on the prior itself and may take whatever the grammar has, as in the paper; else
             on the policy that the model names for it, within its support.
@@ -255,9 +255,9 @@ class Preset:
         of_kde = "" if self.objective in ("kde", "js") else "only the objectives kde and js estimate densities"
         of_any = "" if self.objective in OBJECTIVES else f"the objective {self.objective!r} has settings of its own"
         if of_any:
-            found["variance"] = of_any
+            found |= dict.fromkeys(("variance", "stabilised"), of_any)
         if of_kde:
-            found |= dict.fromkeys(("marginal_variance", "leave_one_out", "equal_sizes", "stabilised"), of_kde)
+            found |= dict.fromkeys(("marginal_variance", "leave_one_out", "equal_sizes"), of_kde)
         return found
 
     def guide_settings(self) -> dict[str, Any]:
@@ -274,6 +274,6 @@ class Preset:
         if is_file_part(self.objective):
             return CheckedDivergence(as_divergence(load_part(self.objective)))
         if self.objective in ("mmd", "witness"):
-            return MMD(self.variance, shared=self.objective == "mmd")
+            return MMD(self.variance, self.objective == "mmd", self.stabilised)
         ratio = JensenShannon if self.objective == "js" else KDELogRatio
         return ratio(self.variance, self.marginal_variance, self.leave_one_out, self.equal_sizes, self.stabilised)
