@@ -31,8 +31,8 @@ class Divergence(Protocol):
 
 
 def anscombe(features: Tensor) -> Tensor:
-    """Counts whose variance is about as large as they are, so that all have variance 1 [4]: ``2 sqrt(x + 3/8)``, less
-    its value at 0. Odd, so that it also takes values below 0, as networks may read them; of the same shape."""
+    """``2 sqrt(x + 3/8)`` less its value at 0, of the same shape: Poisson counts come out with a variance of about 1,
+    whatever their mean [4]. Below 0, where networks may read, it is odd."""
     return 2 * features.sign() * ((features.abs() + 0.375).sqrt() - math.sqrt(0.375))
 
 
@@ -86,9 +86,7 @@ class KDELogRatio:
     stabilised: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        _check(generated, real)
-        if self.stabilised:
-            generated, real = anscombe(generated), anscombe(real)
+        generated, real = _compared(generated, real, self.stabilised)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         cost = self.of_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
         if self.marginal_variance is not None and generated.shape[1] > 1:
@@ -138,9 +136,7 @@ class MMD:
     stabilised: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        _check(generated, real)
-        if self.stabilised:
-            generated, real = anscombe(generated), anscombe(real)
+        generated, real = _compared(generated, real, self.stabilised)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         N, L = len(generated), len(real)
         within = torch.exp(-0.5 / variance * _squared_distances(generated, generated)).fill_diagonal_(0.0)
@@ -231,6 +227,12 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
     centre = b.mean(0)
     a, b = a - centre, b - centre
     return (a.square().sum(1, keepdim=True) + b.square().sum(1) - 2 * a @ b.T).clamp_(min=0.0)
+
+
+def _compared(generated: Tensor, real: Tensor, stabilised: bool) -> tuple[Tensor, Tensor]:
+    """Features, checked, and transformed where they are to be stabilised."""
+    _check(generated, real)
+    return (anscombe(generated), anscombe(real)) if stabilised else (generated, real)
 
 
 def _check(generated: Tensor, real: Tensor) -> None:

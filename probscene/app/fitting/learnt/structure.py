@@ -202,7 +202,12 @@ def _objective(
 def score_function(
     preset: Preset, model: SceneModel, observe: Observe, divergence: Divergence, guide: Guide
 ) -> ScoreFunction:
-    """What a guide of the model is learnt by, with the preset's settings."""
+    """The loss by which a guide of the model learns, with the preset's settings.
+
+    Args:
+        observe: features ``(N, D)`` of a batch of scenes.
+        divergence: of these from the target's.
+    """
     return ScoreFunction(
         observe,
         divergence,
