@@ -3,13 +3,15 @@
     type  truncated  occluded  alpha  left top right bottom  height width length  x y z  rotation_y
 
 Boxes are in 0-based pixels of the image as it is in its file. A type counts as the class of the model that has its
-name, whatever the case, else by ``TYPES``; types that the model has no class for, and DontCare, are left out, which the
-notes say. So are objects whose middle lies where the target's image is cut, see ``Images``. Labelled are the
-classes that one of KITTI's own types counts as, and those that occur.
+name, whatever the case, else by ``TYPES``; types that the model has no class for are left out, which the notes say. So
+are objects whose middle lies where the target's image is cut, see ``Images``. What stands in a region marked DontCare
+is not labelled: the notes say how many images have such regions. Labelled are the classes that one of KITTI's own types
+counts as, and those that occur.
 """
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -100,7 +102,8 @@ def read_kitti(folder: Path, model: SceneModel, target: Images, some: bool = Fal
         [_box(one, name, files[i]) for one in objects if (name := of_type[one.type])] for i, objects in found.items()
     ]
     notes = (*_unread(folder, target), *_notes(occurring, of_type))
-    return on_canvas(target, list(found), boxes, classes, notes, min_height)
+    read = on_canvas(target, list(found), boxes, classes, notes, min_height)
+    return read._replace(notes=(*read.notes, *_marked(found.values(), min_height)))
 
 
 def _box(one: Object, name: str, file: Path) -> Box:
@@ -151,6 +154,19 @@ def _unread(folder: Path, target: Images) -> list[str]:
 def _notes(occurring: Counter, of_type: dict[str, str | None]) -> list[str]:
     """Which types count as something of another name, and which not at all."""
     renamed = [f"{name} as {own}" for name in occurring if (own := of_type[name]) and own.casefold() != name.casefold()]
-    out = [f"{number} {name}" for name, number in occurring.most_common() if of_type[name] is None]
+    others = ((name, number) for name, number in occurring.most_common() if of_type[name] is None and name != DONT_CARE)
+    out = [f"{number} {name}" for name, number in others]
     notes = [f"Counted are {', '.join(sorted(renamed))}."] if renamed else []
     return notes + ([f"Not counted, since the model has no such class: {', '.join(out)}."] if out else [])
+
+
+def _marked(found: Iterable[list[Object]], min_height: float) -> list[str]:
+    """How many images have a region without labels that could hold an object which counts."""
+    each = [[one.bottom - one.top for one in objects if one.type == DONT_CARE] for objects in found]
+    marked = sum(max(heights, default=-1.0) >= min_height for heights in each)
+    high = f" that are at least {min_height:g} pixels high" if min_height else ""
+    note = (
+        f"{marked} of {len(each)} images have regions marked {DONT_CARE}{high}; objects there are not labelled, so "
+        "that these images may show more than their labels say."
+    )
+    return [note] if marked else []

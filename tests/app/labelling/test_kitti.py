@@ -53,7 +53,10 @@ def test_counts_are_those_of_the_lines(tmp_path_factory, frames):
     assert counts.tolist() == [[sum(CLASS.get(t) == c for t in types) for c in classes] for types in frames]
     out = Counter(type for types in frames for type in types if type in OTHERS)
     assert notes[0] == f"Not read, since x has no such image: {len(frames):06d}.txt."
-    assert all(f"{number} {type}" in notes[-1] for type, number in out.items())
+    regions = out.pop("DontCare", 0)
+    assert all(any(f"{number} {type}" in note for note in notes) for type, number in out.items())
+    marked = sum("DontCare" in types for types in frames)
+    assert (f"{marked} of {len(frames)} images have regions marked DontCare" in notes[-1]) == bool(regions)
     assert any("Cyclist as bike" in note for note in notes) == any("Cyclist" in types for types in frames)
 
 
@@ -65,6 +68,19 @@ def test_low_objects_are_counted_only_where_not_said_otherwise(tmp_path):
     read = read_kitti(tmp_path, STREET, target, min_height=25)
     counts, notes = read.counts, read.notes
     assert counts[:, 0].tolist() == [2, 0] and "2 objects of less than 25 pixels" in notes[-1]
+
+
+def test_regions_count_as_marked_where_an_object_in_them_could_be_counted(tmp_path):
+    for name, height in (("a", 24.9), ("b", 25), ("c", 60)):
+        (tmp_path / f"{name}.txt").write_text(f"{line('Car')}\n{line('DontCare', height)}\n{line('DontCare', 3)}\n")
+    target = images("x", ["a.png", "b.png", "c.png"])
+    *_, note = read_kitti(tmp_path, STREET, target, min_height=25).notes
+    assert note == (
+        "2 of 3 images have regions marked DontCare that are at least 25 pixels high; objects there are not labelled, "
+        "so that these images may show more than their labels say."
+    )
+    assert "3 of 3 images have regions marked DontCare; objects" in read_kitti(tmp_path, STREET, target).notes[-1]
+    assert not read_kitti(tmp_path, STREET, target, min_height=61).notes[-1].count("DontCare")
 
 
 def test_objects_whose_middle_is_cut_away_are_not_counted(tmp_path):
@@ -208,7 +224,8 @@ def test_the_commands_take_the_folder(call, fitted, target, labelled, tmp_path):
         model = RunFolder.at(fitted).model
         assert record["sources"]["prior"]["mean_number"] == shown(model, model.prior, 100, 0, Seen()).sum() / 100
         assert SEEN in record["notes"] and SEEN in done.out
-        assert "40 DontCare" in record["notes"][-1] and "40 DontCare" in done.out
+        said = "40 of 40 images have regions marked DontCare"
+        assert said in record["notes"][-1] and said in " ".join(done.out.split())
         done = call(command, fitted, *words, *more, "--min-height", 9)
         assert done.code == 0, done.err
         record = json.loads((tmp_path / "e.json").read_text())
