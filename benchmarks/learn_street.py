@@ -6,7 +6,9 @@
 Fits see the images alone. ``LABELS`` is KITTI's ``label_2``, or a CSV of counts, of the same images. Cars of scenes are
 counted as the labels count them, of 2,000 rendered scenes (``probscene evaluate``). Printed for each seed: total
 variation and Wasserstein-1 of the number of cars from the labels', FID and KID in EfficientNet's features, each for the
-prior, the start and what was learnt; FOLDER holds the runs, ``results.json`` and a histogram, ``cars.png``. Where
+prior, the start and what was learnt, and as ``read`` how what is read of cars goes with the labels: in all frames, and,
+of KITTI's, in those of which regions marked DontCare, whose objects have no labels, cover less than 1 % and in the
+others. FOLDER holds the runs, ``results.json`` and a histogram, ``cars.png``. Where
 parameters are learnt, too, the same distances of learnt structures with the prior's parameters follow as ``structure``,
 and of frames and of images of each source what a photographer would say: how bright they are, their contrast,
 saturation and noise, and the row of the horizon, each the mean with the interval of 95 % of bootstraps over images; and
@@ -28,17 +30,19 @@ import numpy as np
 import torch
 from given import needed, out_option
 from learn_parameters import drawn
+from read_photographs import correlation
 from torch import Tensor
 
 from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import Evaluation, evaluate
-from probscene.app.evaluation.labels import read_labels
+from probscene.app.evaluation.labels import Labels, read_labels
 from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
+from probscene.app.labelling.kitti import DONT_CARE, read_objects
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
@@ -50,6 +54,7 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import MaxNLocator
 
 DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
+MARKED = 0.01  # of a frame
 
 
 def cars(found: Evaluation) -> dict[str, np.ndarray]:
@@ -85,6 +90,25 @@ def from_all(found: Evaluation, counts: Path) -> dict:
         for name, each in cars(found).items()
         if name in (*FITTED, "truth")
     }
+
+
+def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) -> dict[str, list[float]]:
+    """The correlation of what is read of cars with the labels, and in how many frames."""
+    net = run.network()
+    assert net is not None and truth.classes is not None
+    read = net.embed(torch.stack([frames.load(i) for i in range(len(frames))])).numpy()[:, net.names.index("car")]
+    true, every = truth.structures.counts[:, truth.classes.index("car")], np.full(len(frames), True)
+    which = {"all": every}
+    if labels.is_dir():
+        found = [read_objects(labels / f"{path.stem}.txt") for path in frames.paths]
+        covered = np.array([
+            sum((one.right - one.left) * (one.bottom - one.top) for one in objects if one.type == DONT_CARE)
+            for objects in found
+        ])  # fmt: skip
+        marked = covered >= MARKED * np.prod(frames.sizes, 1)
+        which |= {"labelled": ~marked, "marked": marked}
+    each = {name: (correlation(read[some], true[some]), some.sum()) for name, some in which.items() if some.any()}
+    return {name: [round(r, 3), int(number)] for name, (r, number) in each.items()}
 
 
 def said(images: Tensor) -> dict[str, list[float]]:
@@ -173,6 +197,7 @@ def main():
         truth = read_labels(args.labels, run.model, target, False, args.min_height)
         found = evaluate(run, target, truth, lambda *_: None, num=2000, features=["efficientnet"])
         rows.append({"seed": seed, "seconds": seconds, **row(found)})
+        rows[-1]["read"] = reading(run, target, args.labels, truth)
         if args.all is not None:
             rows[-1] |= {"all": from_all(found, args.all)}
         if run.parameters:
