@@ -8,13 +8,13 @@ counted as the labels count them, of 2,000 rendered scenes (``probscene evaluate
 variation and Wasserstein-1 of the number of cars from the labels', FID and KID in EfficientNet's features, each for the
 prior, the start and what was learnt, and as ``read`` how what is read of cars goes with the labels: in all frames, and,
 of KITTI's, in those of which regions marked DontCare, whose objects have no labels, cover less than 1 % and in the
-others. FOLDER holds the runs, ``results.json`` and a histogram, ``cars.png``. Where
-parameters are learnt, too, the same distances of learnt structures with the prior's parameters follow as ``structure``,
-and of frames and of images of each source what a photographer would say: how bright they are, their contrast,
-saturation and noise, and the row of the horizon, each the mean with the interval of 95 % of bootstraps over images; and
-KID and FID of 500 images of each source, drawn with one seed. ``--all`` names a CSV with a column ``Car_ge25px``, the
-cars of 25 pixels and more in all of KITTI's label files: how far each source, and the labels of the frames, are from
-these follows as ``all``.
+others; as ``structures`` how many objects of each class their scenes have, seen or not. FOLDER holds the runs,
+``results.json`` and a histogram, ``cars.png``. Where parameters are learnt, too, the same distances of learnt
+structures with the prior's parameters follow as ``structure``, and of frames and of images of each source what a
+photographer would say: how bright they are, their contrast, saturation and noise, and the row of the horizon, each the
+mean with the interval of 95 % of bootstraps over images; and KID and FID of 500 images of each source, drawn with one
+seed. ``--all`` names a CSV with a column ``Car_ge25px``, the cars of 25 pixels and more in all of KITTI's label files:
+how far each source, and the labels of the frames, are from these follows as ``all``.
 """
 
 import argparse
@@ -37,6 +37,7 @@ from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import Evaluation, evaluate
 from probscene.app.evaluation.labels import Labels, read_labels
 from probscene.app.evaluation.sources import FITTED, LEARNT, before
+from probscene.app.evaluation.structure_counts import sampled
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import BOTH, STRUCTURE
@@ -54,7 +55,7 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import MaxNLocator
 
 DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
-MARKED = 0.01  # of a frame
+MARKED, SCENES = 0.01, 2000  # of a frame; for means of structures
 
 
 def cars(found: Evaluation) -> dict[str, np.ndarray]:
@@ -109,6 +110,15 @@ def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) ->
         which |= {"labelled": ~marked, "marked": marked}
     each = {name: (correlation(read[some], true[some]), some.sum()) for name, some in which.items() if some.any()}
     return {name: [round(r, 3), int(number)] for name, (r, number) in each.items()}
+
+
+def structures(run: RunFolder) -> dict[str, dict[str, float]]:
+    """How many objects of each class scenes of each source have in the mean."""
+    means = {
+        name: sampled(run.model, policy, SCENES, 0).counts.mean(0).round(2).tolist()
+        for name, policy in {**before(run.model), LEARNT: run.guide}.items()
+    }
+    return {name: dict(zip(run.model.classes, each, strict=True)) for name, each in means.items()}
 
 
 def said(images: Tensor) -> dict[str, list[float]]:
@@ -197,7 +207,7 @@ def main():
         truth = read_labels(args.labels, run.model, target, False, args.min_height)
         found = evaluate(run, target, truth, lambda *_: None, num=2000, features=["efficientnet"])
         rows.append({"seed": seed, "seconds": seconds, **row(found)})
-        rows[-1]["read"] = reading(run, target, args.labels, truth)
+        rows[-1] |= {"read": reading(run, target, args.labels, truth), "structures": structures(run)}
         if args.all is not None:
             rows[-1] |= {"all": from_all(found, args.all)}
         if run.parameters:
