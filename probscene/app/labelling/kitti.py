@@ -90,7 +90,7 @@ def read_kitti(folder: Path, model: SceneModel, target: Images, some: bool = Fal
             f"Expected a label file in {folder} for every image of {target.path}, actual none named {names}"
             f"{'' if some else '; if only some are labelled, add --some-labels'}."
         )
-    occurring = Counter(one.type for objects in found.values() for one in objects)
+    occurring = Counter(one.type for objects in found.values() for one in objects if one.type != DONT_CARE)
     of_type = {name: _class(name, model.classes) for name in (*TYPES, *occurring)}
     classes = tuple(name for name in model.classes if name in of_type.values())
     if not classes:
@@ -99,11 +99,11 @@ def read_kitti(folder: Path, model: SceneModel, target: Images, some: bool = Fal
             f"actual {', '.join(occurring) or 'no object'}."
         )
     boxes = [
-        [_box(one, name, files[i]) for one in objects if (name := of_type[one.type])] for i, objects in found.items()
+        [_box(one, name, files[i]) for one in objects if (name := of_type.get(one.type))]
+        for i, objects in found.items()
     ]
-    notes = (*_unread(folder, target), *_notes(occurring, of_type))
-    read = on_canvas(target, list(found), boxes, classes, notes, min_height)
-    return read._replace(notes=(*read.notes, *_marked(found.values(), min_height)))
+    notes = (*_unread(folder, target), *_notes(occurring, of_type), *_marked(found.values(), min_height))
+    return on_canvas(target, list(found), boxes, classes, notes, min_height)
 
 
 def _box(one: Object, name: str, file: Path) -> Box:
@@ -140,7 +140,7 @@ def _class(type: str, classes: tuple[str, ...]) -> str | None:
     """The class that a type counts as."""
     own = {name.casefold(): name for name in reversed(classes)}
     names = (type.casefold(), *TYPES.get(type, ()))
-    return next((own[name] for name in names if name in own and type != DONT_CARE), None)
+    return next((own[name] for name in names if name in own), None)
 
 
 def _unread(folder: Path, target: Images) -> list[str]:
@@ -154,8 +154,7 @@ def _unread(folder: Path, target: Images) -> list[str]:
 def _notes(occurring: Counter, of_type: dict[str, str | None]) -> list[str]:
     """Which types count as something of another name, and which not at all."""
     renamed = [f"{name} as {own}" for name in occurring if (own := of_type[name]) and own.casefold() != name.casefold()]
-    others = ((name, number) for name, number in occurring.most_common() if of_type[name] is None and name != DONT_CARE)
-    out = [f"{number} {name}" for name, number in others]
+    out = [f"{number} {name}" for name, number in occurring.most_common() if of_type[name] is None]
     notes = [f"Counted are {', '.join(sorted(renamed))}."] if renamed else []
     return notes + ([f"Not counted, since the model has no such class: {', '.join(out)}."] if out else [])
 
