@@ -97,9 +97,9 @@ def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) ->
     """The correlation of what is read of cars with the labels, and in how many frames."""
     net = run.network()
     assert net is not None and truth.classes is not None
-    read = net.embed(torch.stack([frames.load(i) for i in range(len(frames))])).numpy()[:, net.names.index("car")]
-    true, every = truth.structures.counts[:, truth.classes.index("car")], np.full(len(frames), True)
-    which = {"all": every}
+    read = net.embed(frames.some(len(frames))).numpy()[:, net.names.index("car")]
+    true = truth.structures.counts[:, truth.classes.index("car")]
+    which = {"all": np.full(len(frames), True)}
     if labels.is_dir():
         found = [read_objects(labels / f"{path.stem}.txt") for path in frames.paths]
         covered = np.array([
@@ -151,7 +151,7 @@ def said(images: Tensor) -> dict[str, list[float]]:
 
 def looks(run: RunFolder, frames: ImageFolder, num: int) -> dict:
     """What is said of frames and of each source's images, and how far these are from the frames."""
-    real = torch.stack([frames.load(i) for i in range(len(frames))])
+    real = frames.some(len(frames))
     structure = copy(run.guide)
     structure.suits = None
     policies = {**before(run.model), "structure": structure, LEARNT: run.guide}
