@@ -8,11 +8,13 @@
 4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
    reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
 5. What is read in the guide's renders is brought to what is read in the target (``energy``).
+6. The reader learns the scene's sites that it reads with little skill once more, from renders that are like the target
+   but have the prior's values of them. These are weighted until what is read is distributed as in the target.
 
 Axis letters: N scenes, L images, K objects.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import cached_property, partial
 from typing import Any, cast
 
@@ -25,7 +27,7 @@ from probscene.sampling import seed_everything
 
 from ..training import Report, Training, batch_seed, of_prefix
 from .best import Best, HeldOut
-from .energy import EnergyDistance, OwnReadings, site_rows
+from .energy import EnergyDistance, OwnReadings, WeightedEnergyDistance, site_rows
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
 from .reading.assembly import Assembly, along_the_widest
@@ -33,10 +35,10 @@ from .reading.eyes import Eye
 from .reading.missing import Missing
 from .reading.reader import Reader
 from .reading.skill import Skill
-from .reading.training import EACH, OverallTraining, ReaderTraining, Valued
-from .reading.tried import TriedReader, matched
+from .reading.training import OverallTraining, ReaderTraining, Valued
+from .reading.tried import TriedReader
 from .reading.valued import Label, ValuedRenders, joined
-from .schedule import ParameterSchedule
+from .schedule import EACH, ENERGY, LIKELIHOOD, OF_GUIDE, READING, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
 from .sites import Site, find_sites
 
 TRIED = 500  # renders that a reader is tried on
@@ -45,7 +47,6 @@ MISSED = 400  # renders in which it is seen what is not found
 OWN = 0.65  # of a round's renders are the guide's own
 AHEAD = 8  # steps for which they are drawn together
 ARRANGED = 0.5  # of the other renders are arranged
-READING, SCENES, LIKELIHOOD, ENERGY = "reading", "scenes", "likelihood", "energy"
 
 
 class ParameterLearning:
@@ -91,12 +92,7 @@ class ParameterLearning:
         self.renders = ValuedRenders(model, label, self.node_sites, self.scene_sites)
         reader = Reader(eye, len(model.classes), len(self.node_sites), len(self.scene_sites))
         self.tried = TriedReader(model, reader, self.node_sites, self.scene_sites)
-        overall, again = schedule.scene_renders // EACH, schedule.round_scene_renders // EACH
-        phases = [(READING, schedule.reader_steps), (SCENES, overall), (LIKELIHOOD, schedule.steps)]
-        once_more = [(READING, schedule.round_reader_steps), (SCENES, again), (LIKELIHOOD, schedule.round_steps)]
-        phases += [*once_more * schedule.rounds, (ENERGY, schedule.energy_steps)]
-        phases = [(what, steps) for what, steps in phases if steps and (what != SCENES or self.scene_sites)]
-        self.phases, self.lengths = [what for what, _ in phases], [steps for _, steps in phases]
+        self.phases, self.lengths = zip(*schedule.phases(bool(self.scene_sites)), strict=True)
         self.total, self.done, self.phase = sum(self.lengths), 0, 0
         self.guide: ParameterGuide | None = None
         self.missing: Missing | None = None  # while likelihood is gone up
@@ -139,7 +135,7 @@ class ParameterLearning:
 
             self.inner.run(heard)
             self.inner = self.missing = None
-            if self.phases[self.phase] in (LIKELIHOOD, ENERGY) and self.best is not None and self.guide is not None:
+            if self.phases[self.phase] in OF_GUIDE and self.best is not None and self.guide is not None:
                 self.best.after(self.guide)
             self.phase += 1
             self.done = sum(self.lengths[: self.phase])
@@ -193,7 +189,7 @@ class ParameterLearning:
         if what == READING:
             rate = schedule.reader_rate / (1 if first else 2)
             return ReaderTraining(self.tried.reader, self._drawn, steps, schedule.reader_images, rate, seed)
-        if what == SCENES:
+        if what in (SCENES, UNCLEAR):
             rate = schedule.scene_rate / (1 if first else 2)
             return OverallTraining(self.tried.reader.overall, self._entered, EACH * steps, rate, seed)
         guide = self.guide
@@ -202,6 +198,9 @@ class ParameterLearning:
             seed_everything(batch_seed(self.seed, 7, self.phase))
             self.missing = self.tried.missing(self._own_scenes(MISSED))
         values, made = self._read()
+        if what == WEIGHTS:
+            own = self._own(made, schedule.weighted_scenes, self._unclear)
+            return WeightedEnergyDistance(guide.net, values, own, [*self._unclear.values()], steps, schedule.rate, seed)
         if what == ENERGY:
             own, scenes, rate = partial(self._own, made), schedule.energy_scenes, schedule.energy_rate
             return EnergyDistance(guide.net, values, own, self.tried.noisy, steps, scenes, rate, seed)
@@ -214,14 +213,14 @@ class ParameterLearning:
         what = self.phases[self.phase]
         if what == SCENES:
             return self.tried.skill is not None and not len(self.tried.columns[1])
-        return what == ENERGY and not self.tried.noisy.any()
+        return not self._unclear if what in (UNCLEAR, WEIGHTS) else what == ENERGY and not self.tried.noisy.any()
 
     def _entered(self, num: int) -> tuple[Tensor, Tensor]:
         """Renders for what is read of the whole scene."""
-        own = 0 if self.guide is None else round(OWN * num)
+        own, last = 0 if self.guide is None else round(OWN * num), self.phases[self.phase] == UNCLEAR
         drawn = [self.renders.draw(num - own, self.model.pretraining_policy, arranged=ARRANGED)]
         if own:
-            drawn.append(self._own_scenes(own))
+            drawn.append(self._own_scenes(own, self._unclear if last else ()))
         entered = [self.tried.reader.eye.enter(some.drawn.image) for some in drawn]
         return torch.cat(entered), torch.cat([some.overall for some in drawn])
 
@@ -235,14 +234,23 @@ class ParameterLearning:
             drawn = [self.renders.draw(AHEAD * (num - own), self.model.pretraining_policy, arranged=ARRANGED)]
             self.ahead = (self.phase, part), [*drawn, self._own_scenes(AHEAD * own)] if own else drawn
             seed_everything(batch_seed(training.seed, training.done))  # as where they were drawn before
-        numbers = (num - own, own)
-        parts = [some.of(slice(place * n, (place + 1) * n)) for some, n in zip(self.ahead[1], numbers, strict=False)]
-        return joined(parts)  # both in each step, as batch norm is of what a step looks at
+        parts = zip(self.ahead[1], (num - own, own), strict=False)
+        # Both in each step, as batch norm is of what a step looks at.
+        return joined([some.of(slice(place * n, (place + 1) * n)) for some, n in parts])
 
-    def _own_scenes(self, num: int) -> Valued:
-        """The guide's renders."""
+    def _own_scenes(self, num: int, kept: Collection[str] = ()) -> Valued:
+        """The guide's renders, in which sites of some names have their prior."""
         assert self.guide is not None
-        return self.renders.draw(num, self.structure, self.guide.suited(self.model))
+        self.guide.passed = frozenset(kept)
+        valued = self.renders.draw(num, self.structure, self.guide.suited(self.model))
+        self.guide.passed = frozenset()
+        return valued
+
+    @property
+    def _unclear(self) -> dict[str, int]:
+        """The guide's sites of scenes that are read with little skill, by name which they are."""
+        assert self.guide is not None
+        return {site.name: g for g, site in enumerate(self.guide.scene_sites) if site.name in self.tried.unclear}
 
     def _try(self) -> None:
         """See what the reader can read in the prior's renders."""
@@ -274,24 +282,16 @@ class ParameterLearning:
         return {s: {name: site_rows(values.site(i)) for name, values in read.items()} for i, s in enumerate(names)}
 
     @torch.no_grad()
-    def lost(self) -> tuple[dict[str, float], Tensor]:
+    def lost(self) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Sites that cannot be read in renders of the guide, where unclear sites have their prior, see
-        ``TriedReader.lost``; and these renders, ``(L, C, H, W)`` uint8, none where no site is unclear."""
-        if self.guide is None or not self.tried.unclear:
-            return {}, torch.zeros(0)
-        self.guide.passed = self.tried.unclear
-        valued = self._own_scenes(TRIED)
-        self.guide.passed = frozenset()
-        return self.tried.lost(valued), valued.drawn.image
+        ``TriedReader.lost``; and ``(L, C, H, W)`` uint8 such renders, ``"without"``, and others, ``"learnt"``."""
+        without, learnt = self._own_scenes(TRIED, self.tried.unclear), self._own_scenes(TRIED)
+        return self.tried.lost(without), {"without": without.drawn.image, "learnt": learnt.drawn.image}
 
     @torch.no_grad()
-    def _own(self, made: Assembly, num: int) -> OwnReadings:
-        """What it reads in renders of the guide."""
-        valued = self._own_scenes(num)
-        found = self.tried.reader.find(valued.drawn.image)
-        read, which = self.tried.values(made, found, num, matched(found, valued))
-        node, scene = self.tried.columns
-        return OwnReadings(valued.kind, valued.parent, valued.u[..., node], valued.overall[:, scene], read, which)
+    def _own(self, made: Assembly, num: int, kept: Collection[str] = ()) -> OwnReadings:
+        """What it reads in renders of the guide, see ``_own_scenes``."""
+        return self.tried.own(made, self._own_scenes(num, kept))
 
     @cached_property
     def _assembly(self) -> Assembly:

@@ -63,11 +63,7 @@ class ParameterNet(nn.Module):
         self.scene_join = nn.ModuleList(nn.Sequential(nn.Linear(hidden, hidden), nn.SiLU()) for _ in range(G))
         self.scene_out = nn.ModuleList(nn.Linear(hidden, K) for _ in range(G))
         for layer in (*self.out, *self.scene_out):
-            weight, bias = cast(nn.Linear, layer).weight, cast(nn.Linear, layer).bias
-            nn.init.zeros_(weight)
-            nn.init.zeros_(bias)
-            with torch.no_grad():
-                bias[components : 2 * components] = SMALL * torch.linspace(-1, 1, components)
+            begin(cast(nn.Linear, layer))
 
     def scene_mixture(self, graph: Graph, scene: Tensor, g: int) -> LogisticMixture:
         """Of the scenes' site number ``g``, ``(N, 1)``, given those before it.
@@ -239,6 +235,15 @@ class Given(NamedTuple):
     parent: Tensor
     before: Tensor
     ties: Ties
+
+
+@torch.no_grad()
+def begin(layer: nn.Linear) -> None:
+    """The last layer of a mixture from its beginning, the prior."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    _, location, _ = layer.bias.chunk(3)
+    location.copy_(SMALL * torch.linspace(-1, 1, len(location)))
 
 
 def code(u: Tensor) -> Tensor:

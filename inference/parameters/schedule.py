@@ -2,6 +2,11 @@
 
 from dataclasses import dataclass
 
+READING, SCENES, LIKELIHOOD, ENERGY = "reading", "scenes", "likelihood", "energy"
+UNCLEAR, WEIGHTS = "unclear", "weights"
+OF_SCENES, OF_GUIDE = (SCENES, UNCLEAR, WEIGHTS), (LIKELIHOOD, ENERGY, WEIGHTS)
+EACH = 2  # renders for each step in which sites of scenes are learnt to be read
+
 
 @dataclass(frozen=True)
 class ParameterSchedule:
@@ -13,7 +18,9 @@ class ParameterSchedule:
         steps: of maximum likelihood on what is read first.
         rounds: of training the reader further on the guide's own renders, reading again and learning again.
         round_reader_steps, round_scene_renders, round_steps: of each.
-        energy_steps, energy_scenes: of the energy distance at the end, and renders a step.
+        energy_steps, energy_scenes: of the energy distance then, and renders a step.
+        weighted_scenes: renders that are weighted at the end, where sites of scenes are read with little skill; the
+            reader learns these from ``scene_renders`` once more, and weights take ``round_steps``.
         images: of the target, at most, that are read.
         reader_images: renders a step of the reader; of large images fewer, but at least 4.
         reader_rate, scene_rate, rate, energy_rate: largest learning rates.
@@ -30,6 +37,7 @@ class ParameterSchedule:
     round_steps: int = 300
     energy_steps: int = 40
     energy_scenes: int = 100
+    weighted_scenes: int = 1000
     images: int = 1000
     reader_images: int = 12
     reader_rate: float = 4e-3
@@ -42,5 +50,18 @@ class ParameterSchedule:
     def drawn(self) -> int:
         """About how many renders are drawn in all."""
         steps = self.reader_steps + self.rounds * self.round_reader_steps
-        of_scenes = self.scene_renders + self.rounds * self.round_scene_renders
+        of_scenes = 2 * self.scene_renders + self.rounds * self.round_scene_renders + self.weighted_scenes
         return steps * self.reader_images + of_scenes + self.energy_steps * self.energy_scenes
+
+    def phases(self, of_scenes: bool) -> list[tuple[str, int]]:
+        """What is trained, one after the other, and for how many steps.
+
+        Args:
+            of_scenes: whether the model has sites of scenes.
+        """
+        overall, again = self.scene_renders // EACH, self.round_scene_renders // EACH
+        first = [(READING, self.reader_steps), (SCENES, overall), (LIKELIHOOD, self.steps)]
+        once_more = [(READING, self.round_reader_steps), (SCENES, again), (LIKELIHOOD, self.round_steps)]
+        last = [(UNCLEAR, overall), (WEIGHTS, self.round_steps)] if self.weighted_scenes else []
+        phases = [*first, *once_more * self.rounds, (ENERGY, self.energy_steps), *last]
+        return [(what, steps) for what, steps in phases if steps and (of_scenes or what not in OF_SCENES)]

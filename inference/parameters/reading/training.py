@@ -19,6 +19,7 @@ from ...features.counting.batches import STRIDE as CELL
 from ...features.counting.batches import cells, shares
 from ...steps import StepTraining
 from ...training import batch_seed
+from ..schedule import EACH
 from .overall import NUMBERS, Overall, looks
 from .reader import Reader, value_loss
 
@@ -26,7 +27,6 @@ MIN_VISIBLE = 0.25
 KEPT = 0.25  # of the rate, for convolutions that know the classes already
 SCENE_IMAGES = 64  # of a step on sites of scenes
 TOGETHER, APART = 256, 64  # renders that are drawn at once; steps from then until the next are
-EACH = 2  # renders for each step
 
 
 class Valued(NamedTuple):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from probscene.model import SceneModel
 
+from ..energy import OwnReadings
 from ..graph import Graph
 from ..likelihood import Values
 from ..sites import Site, having
@@ -159,6 +160,13 @@ class TriedReader:
         mean, sd = (part.where(has, torch.nan) for part in (both[..., :-2], sd))
         values = Values(kind, parent, mean, sd, scene_mean, scene_sd, turns, both[..., -1].nan_to_num(0.0))
         return values, both[..., -2].nan_to_num(-1).long()
+
+    def own(self, made: Assembly, valued: Valued) -> OwnReadings:
+        """What it reads in renders, with what they show."""
+        found = self.reader.find(valued.drawn.image)
+        read, which = self.values(made, found, len(valued.kind), matched(found, valued))
+        node, scene = self.columns
+        return OwnReadings(valued.kind, valued.parent, valued.u[..., node], valued.overall[:, scene], read, which)
 
     def assembly(self, valued: Valued) -> Assembly:
         """What some scenes of the prior have in common."""

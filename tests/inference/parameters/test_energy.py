@@ -1,11 +1,20 @@
 """Refinement by an energy distance of readings."""
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
-from probscene.inference.parameters.energy import EnergyDistance, OwnReadings, energy_distance, moving
+from probscene.inference.parameters.energy import (
+    EnergyDistance,
+    OwnReadings,
+    WeightedEnergyDistance,
+    WeightedRows,
+    energy_distance,
+    moving,
+)
 from probscene.inference.parameters.graph import Graph
 from probscene.inference.parameters.likelihood import Values
 from probscene.inference.parameters.net import ParameterNet
@@ -153,3 +162,59 @@ def test_a_site_alone_is_compared_by_its_objects_and_no_others():
     shifted = read._replace(nodes=read.nodes + torch.tensor([0.3, 0.0]), scene=read.scene + 0.3)
     found = [float(energy_distance(shifted.site(i), read.site(i))) for i in range(SITES + 1)]
     assert found[0] > 0.01 and found[2] > 0.01 and found[1] < 1e-6
+
+
+def scenes_of(scene):
+    """Readings of scenes without nodes, or what was drawn in them, ``(N, G)``."""
+    kind, none = torch.full((len(scene), 1), -1), torch.zeros(len(scene), 1, 0)
+    turns = torch.zeros(scene.shape[1], dtype=torch.bool)
+    return Values(kind, kind, none, none, scene, torch.full_like(scene, 0.1), turns)
+
+
+@given(st.integers(0, 2**31), st.integers(2, 40), st.integers(2, 40))
+def test_weighted_renders_are_as_far_from_the_target_as_scipy_says(seed, number, images):
+    rng = np.random.default_rng(seed)
+    own, target, weight = rng.random((number, 2)), rng.random((images, 2)), rng.random(number) + 1e-3
+    rows = WeightedRows.of(*(scenes_of(torch.from_numpy(values)) for values in (own, target)), 1)
+    distance, _ = rows.compared(torch.from_numpy(weight / weight.sum()))
+    expected = stats.energy_distance(own[:, 1], target[:, 1], weight) ** 2
+    assert float(distance) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_distance_of_one_distribution_from_itself_is_as_expected():
+    """In the mean of many samples, some renders of which weigh more than others."""
+    rng, weight, each = np.random.default_rng(0), np.linspace(0.1, 1.0, 30), []
+    weight = torch.from_numpy(weight / weight.sum())
+    for _ in range(400):
+        own, target = (scenes_of(torch.from_numpy(rng.beta(2, 5, (number, 1)))) for number in (30, 50))
+        each.append([float(x) for x in WeightedRows.of(own, target, 0).compared(weight)])
+    distance, expected = np.mean(each, 0)
+    assert distance == pytest.approx(expected, rel=0.1)
+
+
+def test_what_is_read_with_little_skill_is_learnt_by_weights():
+    """Of three sites read with a third of their variance: one lies in a part of its prior, one has its prior, and one
+    is not to be learnt. A reader guesses toward the middle, so that its readings look alike."""
+    torch.manual_seed(0)
+    net = ParameterNet(1, 0, 3, hidden=12)
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    before = {key: value.clone() for key, value in net.state_dict().items()}
+    u, true = torch.rand(1000, 3), torch.rand(1000, 3)
+    true[:, 0] = 0.6 + 0.3 * true[:, 0]
+
+    def read(u):
+        return 0.5 + 0.3 * (u - 0.5) + 0.12 * torch.randn_like(u)
+
+    own, target = scenes_of(read(u)), scenes_of(read(true))
+    own = OwnReadings(own.kind, own.parent, own.nodes, u, own, own.kind)
+    WeightedEnergyDistance(net, target, own, [0, 1], steps=300).run()
+    graph = Graph.of(own.kind, own.parent)
+    with torch.no_grad():
+        learnt = [net.scene_mixture(graph, u, g).icdf(torch.rand(1000, 1))[:, 0].numpy() for g in range(2)]
+    away = [stats.wasserstein_distance(values, true[:, g].numpy()) for g, values in enumerate(learnt)]
+    of_prior = stats.wasserstein_distance(u[:, 0].numpy(), true[:, 0].numpy())
+    assert away[0] < 0.4 * of_prior and away[1] < 0.06
+    after = net.state_dict()
+    changed = {key for key in after if not torch.equal(after[key], before[key])}
+    assert changed == {f"scene_out.{g}.{part}" for g in (0, 1) for part in ("weight", "bias")}

@@ -14,7 +14,7 @@ from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.reading import missing, reader
 from probscene.inference.parameters.reading.eyes import RenderEye
 from probscene.inference.parameters.reading.skill import Skill
-from probscene.inference.parameters.schedule import ParameterSchedule
+from probscene.inference.parameters.schedule import LIKELIHOOD, UNCLEAR, WEIGHTS, ParameterSchedule
 from probscene.renderers.sprites import SpriteRenderer
 
 
@@ -118,8 +118,10 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     assert learning.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
 
 
-def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
-    """In the middle of likelihood, which looks at objects that the guide of before was missing."""
+@pytest.mark.parametrize("phase", [LIKELIHOOD, UNCLEAR, WEIGHTS])
+def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
+    """In the middle of likelihood, which looks at objects that the guide of before was missing; and of the last
+    phases, in whose renders some sites have their prior."""
     monkeypatch.setattr(reader, "LEAST_MASS", (0.1,))  # an untrained reader finds something
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
     monkeypatch.setattr(missing, "FEWEST", 1)
@@ -127,7 +129,7 @@ def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
     for renders in ("TRIED", "ASSEMBLED", "MISSED"):
         monkeypatch.setattr(f"probscene.inference.parameters.learning.{renders}", 60)
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
-    few = {"scene_renders": 4, "round_scene_renders": 4, "energy_steps": 0}
+    few = {"scene_renders": 60, "round_scene_renders": 4, "energy_steps": 0, "weighted_scenes": 60}
     schedule = ParameterSchedule(reader_steps=1, steps=2, rounds=1, round_reader_steps=1, round_steps=30, **few)
     images = torch.randint(256, (30, 3, 64, 64), dtype=torch.uint8)
 
@@ -140,8 +142,9 @@ def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
         pass
 
     def interrupt(training, _):
-        if training.done >= training.total - 20:
-            assert len(training.missing.label)
+        if training.phase >= training.phases.index(LIKELIHOOD) + 3 and training.phases[training.phase] == phase:
+            assert phase != LIKELIHOOD or len(training.missing.label)
+            assert 0 < training.inner.done < training.inner.total
             raise Interrupted
 
     whole, first, second = begun(), begun(), begun()

@@ -51,8 +51,15 @@ class Judged(NamedTuple):
     sites: dict[str, dict[str, Any]]
 
 
-def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLearning, held: Tensor) -> Judged:
-    """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features."""
+def judged(
+    run: "RunFolder",
+    guide: Guide,
+    learning: ParameterLearning | WholeLearning,
+    held: Tensor,
+    more: Callable[[], Tensor],
+) -> Judged:
+    """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features.
+    What is read with little skill takes ``more`` of them to tell."""
     learnt = learning.guide
     if learnt is None:
         return Judged({"kept": "prior"}, {}, {})
@@ -75,9 +82,11 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLe
     careful = kept == "prior" or run.preset.parameters.sure
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         seed_everything(batch_seed(run.record["seed"], 6, 4))
-        lost, without = learning.lost()
-        beside = {"without": without} if len(without) else {}
-        learnt.passed = passed(learning, images | beside, careful) | lost.keys()
+        doubtful = dict[str, Tensor]()
+        if learning.tried.unclear:
+            lost, doubtful = learning.lost()
+            doubtful["target"] = more()
+        learnt.passed = passed(learning, images, doubtful, careful) | lost.keys()
         if learnt.passed:
             apart = compared()
         if apart.sure and judge is not None:
@@ -104,14 +113,18 @@ def judged(run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLe
     return Judged(distances, lost, sites)
 
 
-def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool) -> frozenset[str]:
+def passed(
+    learning: ParameterLearning, images: dict[str, Tensor], doubtful: dict[str, Tensor], careful: bool
+) -> frozenset[str]:
     """Sites that keep their prior, by what is read in learnt renders, in the prior's and in the target: those of which
     learnt renders are surely farther from the target; where one is careful, those of which they are not surely nearer,
     as there is nothing to be learnt of them, or it was not. What is read of unclear sites is mostly what other sites
-    make of it: they are learnt where renders with the other learnt sites alone, ``"without"``, are surely farther. All
-    sites together keep to the chance of a mistake that one comparison has: with thirty of them, three would be nearer
-    by chance."""
+    make of it: they are learnt where renders with the other learnt sites alone, ``"without"`` among the doubtful, are
+    surely farther. All sites together keep to the chance of a mistake that one comparison has: with thirty of them,
+    three would be nearer by chance."""
     read, unclear = learning.site_rows(images), learning.tried.unclear
+    if unclear:
+        read |= {name: of for name, of in learning.site_rows(doubtful).items() if name in unclear}
     chance = (1 - SURE) / max(1, len(read))
 
     def passes(of: dict[str, tuple[Tensor, Tensor]], unclear: bool) -> bool:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 NAME = "parameters"  # of the file with the record, and before the names of tensors beside a guide's
 READER = "reader"  # of the file with what finds objects, until structure was learnt again
 HELD = 5  # one image of the target in so many is not learnt from, and judges
-JUDGED = 200  # images of each side, at most
+JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and of what is read with little skill
 
 
 def learn_parameters(
@@ -98,7 +98,8 @@ def learn_parameters(
         if isinstance(learning, ParameterLearning) and isinstance(eye, RenderEye):
             run.write_tensors(READER, of_counts(learning.tried.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
-        run.write_parameters(_record(run, guide, learning, _some(target, held, JUDGED)))
+        judges = _some(target, held, JUDGED), lambda: _some(target, held, DOUBTFUL)
+        run.write_parameters(_record(run, guide, learning, *judges))
         run.write_tensors(NAME, kept)
         (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
     say(_said(run.parameters))
@@ -150,16 +151,20 @@ def _some(images: Images, which: Tensor, most: int) -> Tensor:
 
 
 def _record(
-    run: "RunFolder", guide: Guide, learning: ParameterLearning | WholeLearning, held: Tensor
+    run: "RunFolder",
+    guide: Guide,
+    learning: ParameterLearning | WholeLearning,
+    held: Tensor,
+    more: Callable[[], Tensor],
 ) -> dict[str, Any]:
-    """For JSON."""
+    """For JSON, see ``judged``."""
     method = {"method": run.preset.parameter_method}
     if not isinstance(learning, ParameterLearning):
-        return method | {"sites": sites_record(learning), **judged(run, guide, learning, held).distances}
+        return method | {"sites": sites_record(learning), **judged(run, guide, learning, held, more).distances}
     assert learning.tried.skill is not None
     shares = learning.tried.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
-    found = judged(run, guide, learning, held)
+    found = judged(run, guide, learning, held, more)
     passed = frozenset() if learning.guide is None else learning.guide.passed
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
