@@ -88,7 +88,7 @@ def main():
     true = truth(rng, 20_000)
     tabletop = load_model(str(MODEL))
     for seed in args.seeds:
-        how = {"preset": args.preset, "seed": seed, "features": "count", "threads": 1}
+        how = {"preset": args.preset, "seed": seed, "threads": 1}
         run = ps.fit(str(MODEL), target, out=args.out / f"run-{seed}", **how)
         policies = {"prior": tabletop.prior, "start": tabletop.pretraining_policy, "learnt": run.guide}
         sources = {name: drawn(tabletop, policy, seed) for name, policy in policies.items()}

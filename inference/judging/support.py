@@ -84,18 +84,16 @@ def fidelity(generated: ArrayLike, real: ArrayLike, k: int = 5) -> Fidelity:
     )
 
 
-def told_apart(one: Features, other: Features) -> float:
-    """How often the nearest neighbour of an image, among all others of both sides, is of its own side: about 0.5 for
-    two samples of one distribution of equal size, 1 where every image shows where it comes from.
+def outside(images: Features, others: Features, k: int) -> Mask:
+    """``(L,)`` whether an image lies in none of the balls that hold the k nearest others of one of the others: those of
+    precision [1], but none larger than their median, as the ball of an outlier would hold what resembles none.
 
     Args:
-        one, other: ``(N, D)`` each.
+        images, others: ``(L, D)`` and ``(N, D)``.
+        k: neighbours.
     """
-    both = np.concatenate([one, other])
-    distances = cdist(both, both)
-    np.fill_diagonal(distances, np.inf)
-    side = np.arange(len(both)) < len(one)
-    return float((side[distances.argmin(1)] == side).mean())
+    radius = radii(others, k)
+    return ~(cdist(images, others) <= np.minimum(radius, np.median(radius))).any(1)
 
 
 def foreign(real: Features, scenes: Features) -> Mask:

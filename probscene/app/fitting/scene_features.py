@@ -14,19 +14,19 @@ from probscene.dataset import Images
 from probscene.errors import RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
-from probscene.inference.judging.support import told_apart
+from probscene.inference.judging.support import outside
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.sampling import sample
 from probscene.threads import threads
 
-from ..chunks import CHUNK, as_written, chunk_randomness, draw_chunk
+from ..chunks import CHUNK, as_written, draw_chunk
 from ..loading import renderer_for
 from .observer import RENDERED_AT_ONCE
 from .run import RunFolder
 
-ASKED = 24  # renders, and as many of the target's images, that are asked where they come from
-UNLIKE = 0.95  # how often they show it, from which on they are told apart
+RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``unlike`` judges
+NEIGHBOURS = 8
+UNLIKE = 0.87  # from this share on the target's images look unlike renders
 
 Each = Callable[[int], None]
 """Told how many more images are done."""
@@ -55,18 +55,29 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
         yield as_written(model, render(scenes.drawing[: num - first]).image)
 
 
-def unlike(model: SceneModel, target: Images) -> float:
-    """How surely the target's images are told from the model's renders: see ``told_apart``, by EfficientNet-Lite's
-    pooled features and by the texture in its finest maps, whichever tells less. Other structures do not tell images
-    apart so well as a camera does."""
+def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], None] | None = None) -> float:
+    """The share of the target's images that lie ``outside`` renders, by EfficientNet-Lite's pooled features or by the
+    texture in its finest maps, whichever is less. Images of other structures and layouts lie among renders of the
+    pretraining policy, at least in part; a camera's do not.
+
+    Args:
+        progress: told how many of how many images are looked at.
+    """
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
-    with threads(1), chunk_randomness(0, 0):
-        drawn = renderer_for(model)(sample(model, model.pretraining_policy, ASKED).drawing).image
-    rows = np.linspace(0, len(target) - 1, min(ASKED, len(target))).astype(int)
-    sides = (as_written(model, drawn), torch.stack([target.load(row) for row in rows]))
-    looks = [EfficientNetLite().looks(images) for images in sides]
-    return min(told_apart(one.double().numpy(), other.double().numpy()) for one, other in zip(*looks, strict=True))
+    rows, look = np.linspace(0, len(target) - 1, min(ASKED, len(target))).astype(int), EfficientNetLite()
+    total, of_renders = RENDERS + len(rows), []
+    with threads(1):
+        for images in images_of(model, model.pretraining_policy, RENDERS):
+            of_renders.append(look.looks(images))
+            if progress is not None:
+                progress(sum(len(some) for some, _ in of_renders), total)
+        of_target = look.looks(torch.stack([target.load(row) for row in rows]))
+    if progress is not None:
+        progress(total, total)
+    drawn = [torch.cat(some).double().numpy() for some in zip(*of_renders, strict=True)]
+    pairs = zip(of_target, drawn, strict=True)
+    return min(float(outside(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in pairs)
 
 
 def features_of(

@@ -35,7 +35,7 @@ from .run import RunFolder
 from .scene_features import UNLIKE, unlike
 from .storage import TIMING, check_free, timing
 
-BEFORE = ("reading", "features", "readings", "target", "pretraining")
+BEFORE = ("reading", "likeness", "features", "readings", "target", "pretraining")
 STAGES = (*BEFORE, "structure", "parameters", "structure-again", "outcome")
 
 Target = Path | str | Sequence[Path | str] | Any
@@ -216,11 +216,11 @@ def _suited(
     """The preset for renders or that for photographs; which, and why, is said where it is the latter."""
     if labelled:
         return photographs
-    told = unlike(model, images)
-    if told < UNLIKE:
+    share = unlike(model, images, show.stage("likeness"))
+    if share < UNLIKE:
         return preset
     show.say(
-        f"Note: the target's images look unlike the model's renders ({told:.0%} of both are told apart), so features "
+        f"Note: the target's images look unlike the model's renders ({share:.0%} of them like none), so features "
         f"that count in photographs are taken; --features {preset.features} keeps the others, --features "
         f"{photographs.features} says so from the start."
     )

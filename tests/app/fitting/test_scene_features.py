@@ -4,12 +4,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib.cbook import get_sample_data
 
 from probscene.app.datasets.generate import generate
 from probscene.app.fitting import scene_features as seen
 from probscene.app.fitting.run import RunFolder
+from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError, RunError
+from probscene.image_array import ImageArray
 from probscene.inference.features.base import embed_all
 
 
@@ -44,6 +47,20 @@ def test_the_target_is_seen_as_the_fit_has_seen_it(run, target):
     images = ImageFolder(target.images, run.model.canvas, run.model.channels)
     kept = run.read_tensors("real")["features"]
     assert torch.allclose(seen.features_in(run, images, seen.own_net(run)), kept, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["multi_mnist", "aerial2d"])
+def test_other_structures_and_layouts_do_not_look_unlike_and_photographs_do(name):
+    model = load_model(name)
+    target = model.target(0)
+    drawn = torch.cat(list(seen.images_of(target, target.prior, seen.ASKED)))
+    same = ImageArray(drawn.permute(0, 2, 3, 1).numpy(), model.canvas, model.channels)
+    assert seen.unlike(model, same) < seen.UNLIKE
+    side, rng = 200, np.random.default_rng(0)
+    photograph = cv2.imread(get_sample_data("grace_hopper.jpg", asfileobj=False))[..., ::-1]
+    corners = rng.integers(0, np.subtract(photograph.shape[:2], side), (12, 2))
+    parts = np.stack([photograph[y : y + side, x : x + side] for y, x in corners])
+    assert seen.unlike(model, ImageArray(parts, model.canvas, model.channels)) > seen.UNLIKE
 
 
 def test_networks_by_their_words(run, tmp_path):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sklearn.neighbors import NearestNeighbors
 
-from probscene.inference.judging.support import fidelity, foreign, likeness, radii, unlike_floor
+from probscene.inference.judging.support import fidelity, foreign, likeness, outside, radii, unlike_floor
 
 SETS = st.tuples(st.integers(8, 25), st.integers(8, 25)).flatmap(
     lambda s: st.tuples(*(arrays(np.float64, (n, 2), elements=st.integers(-9, 9).map(float)) for n in s))
@@ -44,6 +44,22 @@ def test_precision_recall_density_and_coverage_by_definition(sets, k):
     assert found.recall == pytest.approx(np.mean([any(near[i, j] <= theirs[j] for j in range(N)) for i in range(L)]))
     assert found.density == pytest.approx(sum(near[i, j] <= ball[i] for i in range(L) for j in range(N)) / (k * N))
     assert found.coverage == pytest.approx(np.mean([any(near[i, j] <= ball[i] for j in range(N)) for i in range(L)]))
+
+
+@given(SETS, st.integers(1, 6))
+def test_images_outside_by_definition(sets, k):
+    images, others = (each + np.random.default_rng(s).normal(size=each.shape) / 100 for s, each in enumerate(sets))
+    ball = reach(others, k)
+    within = np.linalg.norm(images[:, None] - others, axis=-1) <= np.minimum(ball, np.median(ball))
+    assert np.array_equal(outside(images, others, k), [not any(row) for row in within])
+    assert not outside(others, others, k).any()
+
+
+def test_an_outlier_holds_nothing_that_is_far():
+    rng = np.random.default_rng(0)
+    images, others = rng.normal([6, 0], 0.1, (20, 2)), rng.normal(size=(100, 2))
+    others[0] = [12, 0]  # its ball of three neighbours holds the images, as they lie between it and the rest
+    assert outside(images, others, 3).all() and fidelity(images, others, 3).precision == 1
 
 
 @settings(max_examples=10)
