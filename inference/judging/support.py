@@ -93,7 +93,7 @@ def outside(images: Features, others: Features, k: int) -> Mask:
         k: neighbours.
     """
     radius = radii(others, k)
-    return ~(cdist(images, others) <= np.minimum(radius, np.median(radius))).any(1)
+    return (cdist(images, others) - np.minimum(radius, np.median(radius))).min(1) > 0
 
 
 def foreign(real: Features, scenes: Features) -> Mask:
