@@ -26,6 +26,7 @@ from .run import RunFolder
 
 RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``unlike`` judges
 NEIGHBOURS = 8
+ALIKE = 0.5  # below this share no more renders are asked for
 UNLIKE = 0.87  # from this share on the target's images look unlike renders
 
 Each = Callable[[int], None]
@@ -58,7 +59,7 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
 def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], None] | None = None) -> float:
     """The share of the target's images that lie ``outside`` renders, by EfficientNet-Lite's pooled features or by the
     texture in its finest maps, whichever is less. Images of other structures and layouts lie among renders of the
-    pretraining policy, at least in part; a camera's do not.
+    pretraining policy, at least in part; a camera's do not. Fewer renders do where they hold half of the images.
 
     Args:
         progress: told how many of how many images are looked at.
@@ -66,18 +67,21 @@ def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], Non
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
     rows, look = np.linspace(0, len(target) - 1, min(ASKED, len(target))).astype(int), EfficientNetLite()
-    total, of_renders = RENDERS + len(rows), []
+    total, of_renders, share = RENDERS + len(rows), [], 1.0
     with threads(1):
+        of_target = look.looks(torch.stack([target.load(row) for row in rows]))
         for images in images_of(model, model.pretraining_policy, RENDERS):
             of_renders.append(look.looks(images))
+            drawn = [torch.cat(some).double().numpy() for some in zip(*of_renders, strict=True)]
+            sides = zip(of_target, drawn, strict=True)
+            share = min(float(outside(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in sides)
+            if share < ALIKE:
+                break
             if progress is not None:
-                progress(sum(len(some) for some, _ in of_renders), total)
-        of_target = look.looks(torch.stack([target.load(row) for row in rows]))
+                progress(len(rows) + len(drawn[0]), total)
     if progress is not None:
         progress(total, total)
-    drawn = [torch.cat(some).double().numpy() for some in zip(*of_renders, strict=True)]
-    pairs = zip(of_target, drawn, strict=True)
-    return min(float(outside(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in pairs)
+    return share
 
 
 def features_of(
