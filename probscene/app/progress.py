@@ -26,7 +26,7 @@ from rich.text import Text
 
 STAGES = {
     "reading": ("Target's images", "images"),
-    "likeness": ("Comparing with renders", "images"),
+    "likeness": ("Likeness", "images"),
     "looking": ("Looking at images", "images"),
     "features": ("Feature network", "steps"),
     "readings": ("Readings", "images"),
