@@ -67,7 +67,7 @@ def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], Non
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
     rows, look = np.linspace(0, len(target) - 1, min(ASKED, len(target))).astype(int), EfficientNetLite()
-    total, of_renders, share = RENDERS + len(rows), [], 1.0
+    total, of_renders, share = len(rows) + RENDERS, [], 1.0
     with threads(1):
         of_target = look.looks(torch.stack([target.load(row) for row in rows]))
         for images in images_of(model, model.pretraining_policy, RENDERS):
@@ -75,12 +75,12 @@ def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], Non
             drawn = [torch.cat(some).double().numpy() for some in zip(*of_renders, strict=True)]
             sides = zip(of_target, drawn, strict=True)
             share = min(float(outside(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in sides)
-            if share < ALIKE:
-                break
+            done = len(rows) + len(drawn[0])
+            total = done if share < ALIKE else total
             if progress is not None:
-                progress(len(rows) + len(drawn[0]), total)
-    if progress is not None:
-        progress(total, total)
+                progress(done, total)
+            if done == total:
+                break
     return share
 
 
