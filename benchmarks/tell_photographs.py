@@ -3,8 +3,8 @@
     python benchmarks/tell_photographs.py [--models multi_mnist aerial2d driving] [--targets 5]
         [--photographs MODEL=FOLDER ...]
 
-Printed for each is the share of its images that look like no render of the model (``unlike``). From ``UNLIKE`` on a
-fit takes features for photographs. Drawn targets have other structures and layouts and, those of ``driving``, other
+Printed for each is the share of its images that look like no render of the model, see ``unlike``, which asks for fewer
+renders where most do. From ``UNLIKE`` on a fit takes features for photographs. Drawn targets have other structures and layouts and, those of ``driving``, other
 light, weather and camera (``SceneModel.target``, ``learn_looks.hidden``).
 """
 
