@@ -4,8 +4,8 @@
         [--photographs MODEL=FOLDER ...]
 
 Printed for each is the share of its images that look like no render of the model, see ``unlike``, which asks for fewer
-renders where most do. From ``UNLIKE`` on a fit takes features for photographs. Drawn targets have other structures and layouts and, those of ``driving``, other
-light, weather and camera (``SceneModel.target``, ``learn_looks.hidden``).
+renders where most do. From ``UNLIKE`` on a fit takes features for photographs. Drawn targets have other structures and
+layouts and, those of ``driving``, other light, weather and camera (``SceneModel.target``, ``learn_looks.hidden``).
 """
 
 import argparse
