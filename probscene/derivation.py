@@ -7,6 +7,7 @@ steps, M nodes, K rules, R nonterminals and J objects of one rule.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -161,36 +162,54 @@ def expand(grammar: Grammar, choose: Callable[..., Tensor], N: int, max_steps: i
     # Scenes lie side by side, so that the next entry is N further.
     stack = np.zeros((4, (deepest + R) * N), np.int64)
     stack[0, :N], stack[3] = V, -1
-    scene, above = np.arange(N), N * np.arange(R)[:, None]
-    top, spare, nodes = scene + N, scene + deepest * N + above, np.zeros(N, np.int64)
-    children, owners = grammar.children.T.contiguous().numpy(), grammar.child_owner.T.contiguous().numpy()  # (R, K)
-    same = children == grammar.lhs.numpy()
-    inside = ~same & grammar.recursive[grammar.lhs].numpy()
-    grows, num_objects = N * (grammar.num_children.numpy() - 1), grammar.num_objects.numpy()
+    table, above = _productions(grammar, N), N * np.arange(R)[:, None]
+    top, nodes = np.arange(N) + N, np.zeros(N, np.int64)
     previous, history = torch.full((N,), -1), []
     for t in range(max_steps):
-        symbol, repeat, parent_repeat, owner = (part.take(top) for part in stack)
-        if not np.count_nonzero(symbol < V):
+        entry = stack.take(top, 1)
+        symbol, repeat, parent_repeat, owner = entry
+        going_on = symbol < V
+        number = np.count_nonzero(going_on)
+        if not number:
             break
         frontier = Frontier(*map(torch.from_numpy, (symbol, repeat, parent_repeat)))
-        rule = np.where(symbol < V, choose(t, frontier, previous).numpy(), -1)
-        previous, active, k = torch.from_numpy(rule), rule >= 0, np.maximum(rule, 0)
+        rule = np.where(going_on, choose(t, frontier, previous).numpy(), -1)
+        previous = torch.from_numpy(rule)
         history.append((rule, nodes, owner, symbol, repeat, parent_repeat))
-        below = owners.take(k, 1)  # (R, N)
+        each = table.take(rule, 1)  # of -1 the last
+        children, same, inside, below = each[:-2].reshape(4, R, N)
         # Writing the padding too is harmless: what lies above the new top is overwritten before it is popped.
-        at = np.where(active, top + above, spare)
-        stack[0][at] = children.take(k, 1)
-        stack[1][at] = (repeat + 1) * same.take(k, 1)
-        stack[2][at] = parent_repeat + (repeat - parent_repeat) * inside.take(k, 1)
+        at = top + above
+        stack[0][at] = children
+        stack[1][at] = (repeat + 1) * same
+        stack[2][at] = parent_repeat + (repeat - parent_repeat) * inside
         stack[3][at] = np.where(below < 0, owner, nodes + below)
-        top = top + grows.take(k) * active
-        nodes = nodes + num_objects.take(k) * active
+        if np.count_nonzero(rule >= 0) < number:  # given rules that end too early
+            left = going_on & (rule < 0)
+            stack[:, top[left]] = entry[:, left]
+        top = top + each[-2]
+        nodes = nodes + each[-1]
     if not history:
         history.append((np.full(N, -1), nodes, nodes, np.full(N, V), nodes, nodes))
     columns = np.ascontiguousarray(np.array(history).transpose(1, 2, 0))  # (6, N, T)
     rules, base, owner, symbol, repeat, parent_repeat = torch.from_numpy(columns).unbind()
     kind, parent = _scene_graph(grammar, rules, base, owner, torch.from_numpy(nodes))
     return Derivation(rules, torch.from_numpy(top < N), kind, parent, Frontier(symbol, repeat, parent_repeat))
+
+
+@lru_cache(64)
+def _productions(grammar: Grammar, N: int) -> np.ndarray:
+    """``(4 R + 2, K + 1)`` of each rule, and last of none, which pushes the finished scene: R symbols to push, whether
+    each is its parent's nonterminal, whether it is inside that as in a list, and the rule's object that it hangs below;
+    how far the top of the stack moves; how many objects there are."""
+    children, below = grammar.children.T, grammar.child_owner.T
+    same = children == grammar.lhs
+    inside = ~same & grammar.recursive[grammar.lhs]
+    numbers = torch.stack([N * (grammar.num_children - 1), grammar.num_objects])
+    table = pad(torch.cat([children, same.long(), inside.long(), below, numbers]), (0, 1))
+    R = len(children)
+    table[:R, -1], table[3 * R : 4 * R, -1] = len(grammar.nonterminals), -1
+    return table.numpy()
 
 
 def _scene_graph(grammar: Grammar, rules: Tensor, base: Tensor, owner: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:

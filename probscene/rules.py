@@ -5,6 +5,7 @@ Axis letters: N scenes, K rules.
 
 from typing import Any
 
+import numpy as np
 import pyro.distributions as dist
 import torch
 from torch import Tensor
@@ -46,7 +47,7 @@ def looked_up(prior: StructurePrior, frontier: Frontier) -> Tensor:
     """``drawn`` of a table, ``(N,)``, in numpy, see ``expand``."""
     rows = prior.cumulative.take(prior.state(*(part.numpy() for part in frontier)), 1)  # (K, N)
     least = rows[-1] * (1 - torch.rand(rows.shape[1]).numpy())
-    return torch.from_numpy((rows < least).sum(0))
+    return torch.from_numpy((rows < least).sum(0, dtype=np.uint8 if len(rows) < 256 else None).astype(np.int64))
 
 
 class Choice:

@@ -51,9 +51,12 @@ class SceneGraph:
 
     def mask(self, *kinds: str) -> Tensor:
         """``(N, M)`` bool, the nodes of the named kinds."""
-        wanted = torch.zeros(len(self.grammar.kinds) + 1, dtype=torch.bool)  # the last is padding
-        wanted[[self.grammar.kind(name) for name in kinds]] = True
-        return wanted[self.kind]
+        wanted = {self.grammar.kind(name) for name in kinds}
+        if wanted and len(wanted) == 1 + max(wanted) - min(wanted):  # ten times as fast as looking up
+            return (self.kind >= min(wanted)) & (self.kind <= max(wanted))
+        table = torch.zeros(len(self.grammar.kinds) + 1, dtype=torch.bool)  # the last is padding
+        table[list(wanted)] = True
+        return table[self.kind]
 
     @contextmanager
     def nodes(self, *kinds: str):
