@@ -34,7 +34,6 @@ from .reading.assembly import Assembly, along_the_widest
 from .reading.eyes import Eye
 from .reading.missing import Missing
 from .reading.reader import Reader
-from .reading.skill import Skill
 from .reading.training import OverallTraining, ReaderTraining, Valued
 from .reading.tried import TriedReader
 from .reading.valued import Label, ValuedRenders, joined
@@ -48,7 +47,6 @@ OWN = 0.65  # of a round's renders are the guide's own
 AHEAD = 8  # steps for which they are drawn together
 ARRANGED = 0.5  # of the other renders are arranged
 
-
 class ParameterLearning:
     """A ``Training`` of a ``ParameterGuide``, made of trainings one after the other.
 
@@ -61,12 +59,14 @@ class ParameterLearning:
         schedule: how long.
         seed: of everything random.
         held: judges the guide after each of its trainings, which is undone where it made its scenes surely farther.
+        settle: names sites that keep their prior all the same, before those that are read with little skill are learnt.
 
     Attributes:
         unit, total, done: see ``Training``; steps of all trainings.
         sites: of the model.
         tried: the reader, and what is known of it.
         guide: what is learnt; None before it is known which sites are, and where there are none.
+        settled: the sites that ``settle`` named; None before it was asked.
     """
 
     unit = "steps"
@@ -81,8 +81,11 @@ class ParameterLearning:
         schedule: ParameterSchedule,
         seed: int = 0,
         held: HeldOut | None = None,
+        settle: Callable[["ParameterLearning"], Collection[str]] | None = None,
     ):
         self.best = None if held is None else Best(held)
+        self.settle = settle
+        self.settled: frozenset[str] | None = None
         self.model, self.structure, self.images, self.schedule, self.seed = model, structure, images, schedule, seed
         seed_everything(batch_seed(seed, 0))
         self.sites = find_sites(model)
@@ -104,10 +107,6 @@ class ParameterLearning:
         """The sites that can be read, in the order of the program; none before the reader was tried."""
         return tuple(site for site in self.sites if site in self.tried.good_sites)
 
-    def why_not(self, site: Site) -> str:
-        """Why a site keeps its prior; empty where it is learnt."""
-        return site.keeps or self.tried.why_not(site)
-
     def run(self, each: Report | None = None) -> None:
         """Take the steps that are left.
 
@@ -124,6 +123,8 @@ class ParameterLearning:
                 self.phase += 1
                 self.done = sum(self.lengths[: self.phase])
                 continue
+            if self.phases[self.phase] == UNCLEAR and self.settled is None:
+                self.settled = frozenset(self.settle(self)) if self.settle is not None else frozenset()
             if self.inner is None:
                 self.inner = self._begun()
             before = sum(self.lengths[: self.phase])
@@ -146,11 +147,9 @@ class ParameterLearning:
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
-        tensors = {f"reader.{key}": value for key, value in self.tried.reader.state_dict().items()}
-        tensors["phase"] = torch.tensor(self.phase)
-        if self.tried.skill is not None:
-            way, share = self.tried.skill
-            tensors |= {"skill.way": way, "skill.share": share, "readings": self.tried.readings_of}
+        tensors = {**self.tried.state(), "phase": torch.tensor(self.phase)}
+        if self.settled is not None:
+            tensors["settled"] = torch.tensor([site.name in self.settled for site in self.learnt])
         if self.guide is not None:
             tensors |= {f"guide.{key}": value for key, value in self.guide.net.state_dict().items()}
             tensors |= {f"best.{key}": value for key, value in (self.best.weights if self.best else {}).items()}
@@ -163,12 +162,12 @@ class ParameterLearning:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
         self.phase = int(tensors["phase"])
-        self.tried.reader.load_state_dict(of_prefix(tensors, "reader."))
-        self.tried.reader.eval()
-        if "skill.way" in tensors:
-            self.tried.skill = Skill(tensors["skill.way"], tensors["skill.share"])
-            self.tried.readings_of = tensors["readings"]
+        self.tried.restore(tensors)
+        if self.tried.skill is not None:
             self.guide = self._new_guide()
+        if "settled" in tensors:
+            each = zip(self.learnt, tensors["settled"].tolist(), strict=True)
+            self.settled = frozenset(site.name for site, is_settled in each if is_settled)
         if self.guide is not None:
             self.guide.net.load_state_dict(of_prefix(tensors, "guide."))
             if self.best is not None:
@@ -239,9 +238,9 @@ class ParameterLearning:
         return joined([some.of(slice(place * n, (place + 1) * n)) for some, n in parts])
 
     def _own_scenes(self, num: int, kept: Collection[str] = ()) -> Valued:
-        """The guide's renders, in which sites of some names have their prior."""
+        """The guide's renders, in which sites of some names have their prior, and those that are settled."""
         assert self.guide is not None
-        self.guide.passed = frozenset(kept)
+        self.guide.passed = frozenset(kept) | (self.settled or frozenset())
         valued = self.renders.draw(num, self.structure, self.guide.suited(self.model))
         self.guide.passed = frozenset()
         return valued
@@ -282,11 +281,9 @@ class ParameterLearning:
         return {s: {name: site_rows(values.site(i)) for name, values in read.items()} for i, s in enumerate(names)}
 
     @torch.no_grad()
-    def lost(self) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Sites that cannot be read in renders of the guide, where unclear sites have their prior, see
-        ``TriedReader.lost``; and ``(L, C, H, W)`` uint8 such renders, ``"without"``, and others, ``"learnt"``."""
-        without, learnt = self._own_scenes(TRIED, self.tried.unclear), self._own_scenes(TRIED)
-        return self.tried.lost(without), {"without": without.drawn.image, "learnt": learnt.drawn.image}
+    def drawn(self, kept: Collection[str]) -> Valued:
+        """Renders of the guide, in which sites of some names have their prior, as many as a reader is tried on."""
+        return self._own_scenes(TRIED, kept)
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int, kept: Collection[str] = ()) -> OwnReadings:

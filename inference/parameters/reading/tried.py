@@ -10,6 +10,7 @@ from torch import Tensor
 
 from probscene.model import SceneModel
 
+from ...training import of_prefix
 from ..energy import OwnReadings
 from ..graph import Graph
 from ..likelihood import Values
@@ -42,6 +43,21 @@ class TriedReader:
         self.model, self.reader, self.node_sites, self.scene_sites = model, reader, node_sites, scene_sites
         self.skill: Skill | None = None
         self.readings_of = torch.zeros(0, dtype=torch.int64)
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        tensors = {f"reader.{key}": value for key, value in self.reader.state_dict().items()}
+        if self.skill is not None:
+            tensors |= {"skill.way": self.skill.way, "skill.share": self.skill.share, "readings": self.readings_of}
+        return tensors
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """As it was in a ``state``, among other tensors."""
+        self.reader.load_state_dict(of_prefix(tensors, "reader."))
+        self.reader.eval()
+        if "skill.way" in tensors:
+            self.skill = Skill(tensors["skill.way"], tensors["skill.share"])
+            self.readings_of = tensors["readings"]
 
     def settle(self, valued: Valued) -> tuple[Found, Tensor]:
         """Settle how much of an object's unit has to be found: so little that in some renders the fewest objects are

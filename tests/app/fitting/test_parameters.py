@@ -20,7 +20,6 @@ from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.judging.farther import Farther
 from probscene.inference.parameters import learning
-from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.reading import reader, skill
 from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
@@ -37,6 +36,7 @@ def anything_is_read(patch):
     patch.setattr(reader, "LEAST_MASS", (1e-3,))
     patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
     patch.setattr(judged, "passed", lambda *_: frozenset())
+    patch.setattr(judged, "of_unclear", lambda *_: (frozenset(), {}))
     for renders in ("TRIED", "ASSEMBLED", "MISSED"):
         patch.setattr(learning, renders, 40)
 
@@ -241,29 +241,69 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
 
 
 def test_sites_keep_the_prior_by_what_is_read_of_them():
-    """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target. Both of the
-    unclear ``u`` and ``v`` are nearer than the prior's; ``u`` is nearer still where it alone has its prior."""
+    """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target."""
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset("uv"))
+        tried = SimpleNamespace(unclear=frozenset("u"))
 
         def site_rows(self, images):
-            assert set(images) == {"learnt", "target", "without" if "without" in images else "prior"}
+            assert set(images) == {"learnt", "prior", "target"}
             torch.manual_seed(0)
             where = {
-                "learnt": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0, "u": 0.0, "v": 0.0},
-                "prior": {"x": 1.0, "y": 0.0, "z": 0.0, "w": -2.0, "u": 1.0, "v": 1.0},
-                "without": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0, "u": 0.2, "v": 1.0},
-                "target": {"x": 0.2, "y": 0.0, "z": 0.0, "w": -1.5, "u": 0.2, "v": 0.2},
+                "learnt": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0, "u": 9.0},
+                "prior": {"x": 1.0, "y": 0.0, "z": 0.0, "w": -2.0, "u": 1.0},
+                "target": {"x": 0.2, "y": 0.0, "z": 0.0, "w": -1.5, "u": 0.2},
             }
             return {
                 site: {name: rows(where[name][site], 0 if (name, site) == ("target", "z") else 120) for name in images}
-                for site in "xyzwuv"
+                for site in "xyzwu"
             }
 
-    images, doubtful = (dict.fromkeys(("learnt", other, "target"), torch.zeros(0)) for other in ("prior", "without"))
-    assert judged.passed(Learning(), images, doubtful, careful=True) == {"y", "z", "w", "u"}
-    assert judged.passed(Learning(), images, doubtful, careful=False) == {"w", "u"}
+    images = dict.fromkeys(("learnt", "prior", "target"), torch.zeros(0))
+    assert judged.passed(Learning(), images, careful=True) == {"y", "z", "w"}
+    assert judged.passed(Learning(), images, careful=False) == {"w"}
+
+
+class Renders:
+    """What is read of a site is moved by its own value, and by what ``v`` has and ``w`` is said to have."""
+
+    def __init__(self, learnt: dict[str, float], moves: dict[str, float]):
+        self.learnt, self.moves, self.seed = learnt, moves, 0
+        self.tried = SimpleNamespace(unclear=frozenset(learnt), lost=lambda renders: {"lost": 0.1})
+        self.asked = []
+
+    def drawn(self, kept):
+        self.asked.append(kept)
+        values = {name: value * (name not in kept) for name, value in self.learnt.items()}
+        return SimpleNamespace(drawn=SimpleNamespace(image=values))
+
+    def site_rows(self, images):
+        self.seed += 1
+        torch.manual_seed(self.seed)
+
+        def read(of, name):
+            if isinstance(of, torch.Tensor):
+                return rows(1.0, 3 * len(of))
+            return rows(of[name] + sum(of[other] * by for other, by in self.moves.items() if other != name), 600)
+
+        return {name: {source: read(of, name) for source, of in images.items()} for name in self.learnt}
+
+
+def test_unclear_sites_are_learnt_where_renders_without_them_are_farther():
+    """``u`` and ``v`` are as the target has them; ``w`` is not, nor ``lost``, which would be nearer."""
+    learning = Renders({"u": 1.0, "v": 1.0, "w": -1.0, "lost": 1.0}, {})
+    kept, lost = judged.of_unclear(learning, torch.zeros(400), frozenset("k"))
+    assert kept == {"w", "lost"} and lost == {"lost": 0.1}
+    assert all("k" in each for each in learning.asked) and len(learning.asked) == 5
+    nothing = Renders({"w": -1.0, "lost": 1.0}, {})
+    assert judged.of_unclear(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"} and len(nothing.asked) == 2
+
+
+def test_what_is_learnt_wrongly_is_not_in_the_way_of_the_others():
+    """What is read of ``u`` is moved by ``w``, which is learnt wrongly: with it ``u`` comes hardly nearer."""
+    learning = Renders({"u": 1.0, "w": -1.0}, {"w": 0.4})
+    assert judged.of_unclear(learning, torch.zeros(400), frozenset())[0] == {"w"}
+    assert learning.asked[-1] == {"w"}
 
 
 def rows(mean, number):
@@ -284,7 +324,7 @@ def test_of_many_sites_none_is_learnt_by_chance():
             return nothing | {"x": {name: rows(float(name == "prior"), 120) for name in images}}
 
     images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert judged.passed(Learning(), images, {}, careful=True) == {f"n{i}" for i in range(40)}
+    assert judged.passed(Learning(), images, careful=True) == {f"n{i}" for i in range(40)}
 
 
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
@@ -308,8 +348,7 @@ def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, tar
 
 def test_a_site_that_cannot_be_read_where_the_target_is_keeps_the_prior(call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
-    lost = ParameterLearning.lost
-    monkeypatch.setattr(ParameterLearning, "lost", lambda learning: ({"x": 0.123}, lost(learning)[1]))
+    monkeypatch.setattr(judged, "of_unclear", lambda *_: (frozenset("x"), {"x": 0.123}))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
     assert done.code == 0, done.err

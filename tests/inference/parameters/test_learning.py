@@ -8,6 +8,7 @@ import torch
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.parameters.graph import Graph
+from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, log_density, posterior_draws
 from probscene.inference.parameters.net import ParameterNet
@@ -115,7 +116,7 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     learning.tried.skill = learning.tried.skill._replace(share=torch.ones_like(learning.tried.skill.share))
     site = next(site for site in learning.sites if site.name == "ball.away")
     assert [site.name for site in learning.learnt] == ["scene.bright", "floor.turn"]
-    assert learning.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
+    assert learning.tried.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
 
 
 @pytest.mark.parametrize("phase", [LIKELIHOOD, UNCLEAR, WEIGHTS])
@@ -136,7 +137,22 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
     def begun():
         torch.manual_seed(0)
         counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
-        return ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule)
+        return ParameterLearning(
+            trays, trays.prior, RenderEye(counts), label, lambda: images, schedule, settle=settle
+        )
+
+    asked, kept, suited = [], [], ParameterGuide.suited
+
+    def seen(guide, model):
+        kept.append(guide.passed)
+        return suited(guide, model)
+
+    monkeypatch.setattr(ParameterGuide, "suited", seen)
+
+    def settle(learning):
+        kept.clear()
+        asked.append(learning.phases[learning.phase])
+        return {"scene.bright"}
 
     class Interrupted(Exception):
         pass
@@ -149,12 +165,15 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
 
     whole, first, second = begun(), begun(), begun()
     whole.run()
+    assert kept and all("scene.bright" in each for each in kept)  # where the rest is learnt
     with pytest.raises(Interrupted):
         first.run(interrupt)
     second.restore(first.state())
     second.run()
     for one, other in zip(whole.guide.net.parameters(), second.guide.net.parameters(), strict=True):
         assert torch.equal(one, other)
+    assert whole.settled == second.settled == {"scene.bright"}
+    assert asked == [UNCLEAR] * 2  # of the whole, and once of the other
 
 
 def _labels(render, classes, scenes):

@@ -59,7 +59,7 @@ def judged(
     more: Callable[[], Tensor],
 ) -> Judged:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features.
-    What is read with little skill takes ``more`` of them to tell."""
+    What is read with little skill takes ``more`` of them to tell, see ``of_unclear``."""
     learnt = learning.guide
     if learnt is None:
         return Judged({"kept": "prior"}, {}, {})
@@ -68,8 +68,7 @@ def judged(
     real = look(held) if judge is None else judge.real
 
     def drawn(name: str, model: SceneModel) -> Features:
-        seed_everything(batch_seed(run.record["seed"], 6, int(name == "prior")))
-        images[name] = _renders(run, model, guide, len(held))
+        images[name] = _compared(run, model, guide, len(held), name)
         return look(images[name])
 
     of_prior = drawn("prior", run.model)
@@ -81,12 +80,12 @@ def judged(
     kept, lost = "learnt" if apart.one < apart.other else "prior", dict[str, float]()
     careful = kept == "prior" or run.preset.parameters.sure
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
-        seed_everything(batch_seed(run.record["seed"], 6, 4))
-        doubtful = dict[str, Tensor]()
+        well = passed(learning, images, careful) if learning.settled is None else learning.settled
+        badly = frozenset[str]()
         if learning.tried.unclear:
-            lost, doubtful = learning.lost()
-            doubtful["target"] = more()
-        learnt.passed = passed(learning, images, doubtful, careful) | lost.keys()
+            seed_everything(batch_seed(run.record["seed"], 6, 4))
+            badly, lost = of_unclear(learning, more(), well)
+        learnt.passed = well | badly
         if learnt.passed:
             apart = compared()
         if apart.sure and judge is not None:
@@ -113,36 +112,81 @@ def judged(
     return Judged(distances, lost, sites)
 
 
-def passed(
-    learning: ParameterLearning, images: dict[str, Tensor], doubtful: dict[str, Tensor], careful: bool
-) -> frozenset[str]:
-    """Sites that keep their prior, by what is read in learnt renders, in the prior's and in the target: those of which
-    learnt renders are surely farther from the target; where one is careful, those of which they are not surely nearer,
-    as there is nothing to be learnt of them, or it was not. What is read of unclear sites is mostly what other sites
-    make of it: they are learnt where renders with the other learnt sites alone, ``"without"`` among the doubtful, are
-    surely farther. All sites together keep to the chance of a mistake that one comparison has: with thirty of them,
-    three would be nearer by chance."""
-    read, unclear = learning.site_rows(images), learning.tried.unclear
-    if unclear:
-        read |= {name: of for name, of in learning.site_rows(doubtful).items() if name in unclear}
-    chance = (1 - SURE) / max(1, len(read))
-
-    def passes(of: dict[str, tuple[Tensor, Tensor]], unclear: bool) -> bool:
-        if careful or unclear:
-            return not _nearer(chance, of["learnt"], of["without" if unclear else "prior"], of["target"])
-        return _nearer(1 - SURE, of["prior"], of["learnt"], of["target"])
-
-    return frozenset(name for name, of in read.items() if passes(of, name in unclear))
+def settled(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Tensor) -> frozenset[str]:
+    """Sites that keep their prior, of those that are read well, as ``judged`` will have it: before the others are
+    learnt, which is done from renders that look like the target."""
+    assert learning.guide is not None
+    images, models = {"target": held}, {"prior": run.model, "learnt": learning.guide.suited(run.model)}
+    images |= {name: _compared(run, model, guide, len(held), name) for name, model in models.items()}
+    if run.preset.parameters.sure:
+        return passed(learning, images, True)
+    look = _embed()
+    prior, learnt, real = (look(images[name]) for name in ("prior", "learnt", "target"))
+    apart = farther(learnt, prior, real)
+    return passed(learning, images, apart.one >= apart.other)
 
 
-def _nearer(chance: float, *sources: tuple[Tensor, Tensor]) -> bool:
-    """Whether the first rows are nearer to the last ones than the second are, but for so small a chance."""
-    learnt, prior, target = (rows.double().numpy() for rows, _ in sources)
-    of = tuple(image.numpy() for _, image in sources)
-    if not min(map(len, of)):
-        return False
-    apart = farther(prior, learnt, target, images=(of[1], of[0], of[2]))
-    return apart.one > apart.other and apart.share >= 1 - chance
+def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool) -> frozenset[str]:
+    """Sites that keep their prior, of those that are read well, by what is read in learnt renders, in the prior's and
+    in the target: those of which learnt renders are surely farther from the target; where one is careful, those of
+    which they are not surely nearer, as there is nothing to be learnt of them, or it was not. They keep to the chance
+    of a mistake together that one comparison has: with thirty of them, three would be nearer by chance."""
+    clear = {name: of for name, of in learning.site_rows(images).items() if name not in learning.tried.unclear}
+    chance = (1 - SURE) / max(1, len(clear))
+
+    def passes(of: dict[str, tuple[Tensor, Tensor]]) -> bool:
+        if careful:
+            return _share(of, "prior", "learnt") < 1 - chance
+        return _share(of, "learnt", "prior") >= SURE
+
+    return frozenset(name for name, of in clear.items() if passes(of))
+
+
+@torch.no_grad()
+def of_unclear(
+    learning: ParameterLearning, images: Tensor, kept: frozenset[str]
+) -> tuple[frozenset[str], dict[str, float]]:
+    """Sites that keep their prior, of those that are read with little skill; and, of those among them that cannot be
+    read in scenes like the target's, the share of their variance that is read there.
+
+    What is read of such a site is mostly what other sites make of it. So renders with it are compared with renders that
+    have the same but its prior; and first it is seen which have a chance at all, as those that are learnt wrongly would
+    be in the way of the others.
+
+    Args:
+        images: of the target, ``(L, C, H, W)`` uint8; nothing was learnt from them.
+        kept: sites that are read well and keep their prior.
+    """
+    unclear = learning.tried.unclear
+    without = learning.drawn(kept | unclear)
+    lost = learning.tried.lost(without)
+    renders = {"without": without.drawn.image, "learnt": learning.drawn(kept).drawn.image}
+    read = learning.site_rows(renders | {"target": images})
+    likely = [name for name in sorted(unclear - lost.keys()) if _share(read[name], "without", "learnt") >= SURE]
+    others, chance = unclear - set(likely), (1 - SURE) / max(1, len(likely))
+    if not likely:
+        return others, lost
+    renders = {name: learning.drawn(kept | others | {name}).drawn.image for name in likely}
+    renders["learnt"] = learning.drawn(kept | others).drawn.image
+    read = learning.site_rows(renders | {"target": images})
+    return others | {name for name in likely if _share(read[name], name, "learnt") < 1 - chance}, lost
+
+
+def _share(of: dict[str, tuple[Tensor, Tensor]], far: str, near: str) -> float:
+    """Of bootstraps, in how many some rows are nearer to the target's than others are; 0 where they are not."""
+    sources = [of[name] for name in (far, near, "target")]
+    one, other, target = (rows.double().numpy() for rows, _ in sources)
+    images = tuple(image.numpy() for _, image in sources)
+    if not min(map(len, (one, other, target))):
+        return 0.0
+    apart = farther(one, other, target, images=(images[0], images[1], images[2]))
+    return apart.share if apart.one > apart.other else 0.0
+
+
+def _compared(run: "RunFolder", model: SceneModel, guide: Guide, number: int, name: str) -> Tensor:
+    """Renders with learnt parameters, or with the prior's."""
+    seed_everything(batch_seed(run.record["seed"], 6, int(name == "prior")))
+    return _renders(run, model, guide, number)
 
 
 def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:

@@ -29,7 +29,7 @@ from ..observer import Observer
 from ..parts import inner
 from ..preset import LIKELIHOOD, META_SIM
 from ..storage import Keeper
-from .judged import held_out, judged
+from .judged import held_out, judged, settled
 from .wholes import WholeLearning, meta_sim_learning, sites_record, tilting_learning
 
 if TYPE_CHECKING:
@@ -82,6 +82,7 @@ def learn_parameters(
                 run.preset.parameters,
                 batch_seed(run.record["seed"], 5),
                 held_out(run, guide, _some(target, held, JUDGED)),
+                lambda learning: settled(run, guide, learning, _some(target, held, JUDGED)),
             )
         elif method == META_SIM:
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
@@ -169,7 +170,9 @@ def _record(
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
         share, fitted = skill.get(site, torch.nan), site in learning.learnt
-        because = "scenes come no nearer to held-out images by it" if site.name in passed else learning.why_not(site)
+        because = site.keeps or learning.tried.why_not(site)
+        if site.name in passed:
+            because = "scenes come no nearer to held-out images by it"
         if site.name in passed & found.lost.keys():
             because = f"in renders that look like the target {found.lost[site.name]:.0%} of its variance can be read"
         about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}
