@@ -8,8 +8,9 @@
 4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
    reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
 5. What is read in the guide's renders is brought to what is read in the target (``energy``).
-6. The reader learns the scene's sites that it reads with little skill once more, from renders that are like the target
-   but have the prior's values of them. These are weighted until what is read is distributed as in the target.
+6. It is settled which sites keep their prior. The reader learns the scene's sites that it reads with little skill once
+   more, from renders that are like the target but have the prior's values of them; these are weighted until what is
+   read is distributed as in the target.
 
 Axis letters: N scenes, L images, K objects.
 """
@@ -46,6 +47,8 @@ MISSED = 400  # renders in which it is seen what is not found
 OWN = 0.65  # of a round's renders are the guide's own
 AHEAD = 8  # steps for which they are drawn together
 ARRANGED = 0.5  # of the other renders are arranged
+GROUPS, ANYWHERE = 4, 0.3  # of own renders for sites of scenes; how often such a site has its prior in one
+
 
 class ParameterLearning:
     """A ``Training`` of a ``ParameterGuide``, made of trainings one after the other.
@@ -195,7 +198,7 @@ class ParameterLearning:
         assert guide is not None
         if what == LIKELIHOOD and self.missing is None:
             seed_everything(batch_seed(self.seed, 7, self.phase))
-            self.missing = self.tried.missing(self._own_scenes(MISSED))
+            self.missing = self.tried.missing(self.own_scenes(num=MISSED))
         values, made = self._read()
         if what == WEIGHTS:
             own = self._own(made, schedule.weighted_scenes, self._unclear)
@@ -215,11 +218,16 @@ class ParameterLearning:
         return not self._unclear if what in (UNCLEAR, WEIGHTS) else what == ENERGY and not self.tried.noisy.any()
 
     def _entered(self, num: int) -> tuple[Tensor, Tensor]:
-        """Renders for what is read of the whole scene."""
+        """Renders for what is read of the whole scene. In some groups of the guide's renders a site has its prior; only
+        of these it is told what it is, as a reader that learnt what the guide draws would guess toward that."""
         own, last = 0 if self.guide is None else round(OWN * num), self.phases[self.phase] == UNCLEAR
         drawn = [self.renders.draw(num - own, self.model.pretraining_policy, arranged=ARRANGED)]
-        if own:
-            drawn.append(self._own_scenes(own, self._unclear if last else ()))
+        for i in range(GROUPS if own else 0):
+            anywhere = {site.name for site in self.learnt if site.of_scene and torch.rand(()) < ANYWHERE}
+            kept = {*(self._unclear if last else anywhere), *(self.settled or ())}
+            told = [site not in self.learnt or site.name in kept for site in self.scene_sites]
+            valued = self.own_scenes(kept, (own + i) // GROUPS)
+            drawn.append(valued._replace(overall=valued.overall.where(torch.tensor(told), torch.nan)))
         entered = [self.tried.reader.eye.enter(some.drawn.image) for some in drawn]
         return torch.cat(entered), torch.cat([some.overall for some in drawn])
 
@@ -231,19 +239,11 @@ class ParameterLearning:
         if (self.phase, part) != self.ahead[0]:
             seed_everything(batch_seed(self.seed, 5, self.phase, part))
             drawn = [self.renders.draw(AHEAD * (num - own), self.model.pretraining_policy, arranged=ARRANGED)]
-            self.ahead = (self.phase, part), [*drawn, self._own_scenes(AHEAD * own)] if own else drawn
+            self.ahead = (self.phase, part), [*drawn, self.own_scenes(num=AHEAD * own)] if own else drawn
             seed_everything(batch_seed(training.seed, training.done))  # as where they were drawn before
         parts = zip(self.ahead[1], (num - own, own), strict=False)
         # Both in each step, as batch norm is of what a step looks at.
         return joined([some.of(slice(place * n, (place + 1) * n)) for some, n in parts])
-
-    def _own_scenes(self, num: int, kept: Collection[str] = ()) -> Valued:
-        """The guide's renders, in which sites of some names have their prior, and those that are settled."""
-        assert self.guide is not None
-        self.guide.passed = frozenset(kept) | (self.settled or frozenset())
-        valued = self.renders.draw(num, self.structure, self.guide.suited(self.model))
-        self.guide.passed = frozenset()
-        return valued
 
     @property
     def _unclear(self) -> dict[str, int]:
@@ -280,15 +280,18 @@ class ParameterLearning:
         names = [site.name for site in (*self.node_sites, *self.scene_sites) if site in self.tried.good_sites]
         return {s: {name: site_rows(values.site(i)) for name, values in read.items()} for i, s in enumerate(names)}
 
-    @torch.no_grad()
-    def drawn(self, kept: Collection[str]) -> Valued:
-        """Renders of the guide, in which sites of some names have their prior, as many as a reader is tried on."""
-        return self._own_scenes(TRIED, kept)
+    def own_scenes(self, kept: Collection[str] = (), num: int = TRIED) -> Valued:
+        """The guide's renders, in which sites of some names have their prior, and those that are settled."""
+        assert self.guide is not None
+        self.guide.passed = frozenset(kept) | (self.settled or frozenset())
+        valued = self.renders.draw(num, self.structure, self.guide.suited(self.model))
+        self.guide.passed = frozenset()
+        return valued
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int, kept: Collection[str] = ()) -> OwnReadings:
-        """What it reads in renders of the guide, see ``_own_scenes``."""
-        return self.tried.own(made, self._own_scenes(num, kept))
+        """What it reads in renders of the guide, see ``own_scenes``."""
+        return self.tried.own(made, self.own_scenes(kept, num))
 
     @cached_property
     def _assembly(self) -> Assembly:

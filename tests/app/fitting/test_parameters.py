@@ -272,7 +272,7 @@ class Renders:
         self.tried = SimpleNamespace(unclear=frozenset(learnt), lost=lambda renders: {"lost": 0.1})
         self.asked = []
 
-    def drawn(self, kept):
+    def own_scenes(self, kept):
         self.asked.append(kept)
         values = {name: value * (name not in kept) for name, value in self.learnt.items()}
         return SimpleNamespace(drawn=SimpleNamespace(image=values))

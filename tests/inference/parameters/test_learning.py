@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from scipy.stats import kstest
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
@@ -15,7 +16,7 @@ from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.reading import missing, reader
 from probscene.inference.parameters.reading.eyes import RenderEye
 from probscene.inference.parameters.reading.skill import Skill
-from probscene.inference.parameters.schedule import LIKELIHOOD, UNCLEAR, WEIGHTS, ParameterSchedule
+from probscene.inference.parameters.schedule import LIKELIHOOD, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
 from probscene.renderers.sprites import SpriteRenderer
 
 
@@ -117,6 +118,37 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     site = next(site for site in learning.sites if site.name == "ball.away")
     assert [site.name for site in learning.learnt] == ["scene.bright", "floor.turn"]
     assert learning.tried.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
+
+
+def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, monkeypatch):
+    """Whatever the guide draws, else it would guess toward that; and it sees scenes that the guide draws."""
+    monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=1, rounds=0, energy_steps=0, reader_images=2)
+    counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.zeros(30, 3, 64, 64).byte()
+    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule)
+    learning.run()
+    learning.phase = learning.phases.index(SCENES)
+    with torch.no_grad():
+        for layer in learning.guide.net.scene_out:  # logits of 2, hardly spread
+            layer.weight.zero_()
+            layer.bias.copy_(torch.tensor([0.0, 2.0, -4.0]).repeat_interleave(len(layer.bias) // 3))
+    bright = [site.name for site in learning.scene_sites].index("scene.bright")
+    own, own_scenes = [], learning.own_scenes
+
+    def seen(kept, num):
+        valued = own_scenes(kept, num)
+        own.append(valued.overall[:, bright])
+        return valued
+
+    monkeypatch.setattr(learning, "own_scenes", seen)
+    told = torch.cat([learning._entered(200)[1][:, bright] for _ in range(6)])
+    as_drawn = torch.cat(own)
+    is_told = ~told.isnan()
+    assert kstest(told[is_told].double().numpy(), "uniform").pvalue > 1e-3
+    assert len(as_drawn) == 6 * 130 and 0 < int((~is_told).sum()) < len(as_drawn)
+    by_guide = (as_drawn - torch.tensor(2.0).sigmoid()).abs() < 0.03
+    assert int(by_guide.sum()) >= int((~is_told).sum())
 
 
 @pytest.mark.parametrize("phase", [LIKELIHOOD, UNCLEAR, WEIGHTS])

@@ -158,16 +158,16 @@ def of_unclear(
         kept: sites that are read well and keep their prior.
     """
     unclear = learning.tried.unclear
-    without = learning.drawn(kept | unclear)
+    without = learning.own_scenes(kept | unclear)
     lost = learning.tried.lost(without)
-    renders = {"without": without.drawn.image, "learnt": learning.drawn(kept).drawn.image}
+    renders = {"without": without.drawn.image, "learnt": learning.own_scenes(kept).drawn.image}
     read = learning.site_rows(renders | {"target": images})
     likely = [name for name in sorted(unclear - lost.keys()) if _share(read[name], "without", "learnt") >= SURE]
     others, chance = unclear - set(likely), (1 - SURE) / max(1, len(likely))
     if not likely:
         return others, lost
-    renders = {name: learning.drawn(kept | others | {name}).drawn.image for name in likely}
-    renders["learnt"] = learning.drawn(kept | others).drawn.image
+    renders = {name: learning.own_scenes(kept | others | {name}).drawn.image for name in likely}
+    renders["learnt"] = learning.own_scenes(kept | others).drawn.image
     read = learning.site_rows(renders | {"target": images})
     return others | {name for name in likely if _share(read[name], name, "learnt") < 1 - chance}, lost
 
