@@ -7,7 +7,7 @@
    found there (``reading.missing``).
 4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
    reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
-5. What is read in the guide's renders is brought to what is read in the target (``energy``).
+5. What is read of objects in the guide's renders is brought to what is read in the target (``energy``).
 6. It is settled which sites keep their prior. The reader learns the scene's sites that it reads with little skill once
    more, from renders that are like the target but have the prior's values of them; these are weighted until what is
    read is distributed as in the target.
@@ -222,11 +222,11 @@ class ParameterLearning:
         of these it is told what it is, as a reader that learnt what the guide draws would guess toward that."""
         own, last = 0 if self.guide is None else round(OWN * num), self.phases[self.phase] == UNCLEAR
         drawn = [self.renders.draw(num - own, self.model.pretraining_policy, arranged=ARRANGED)]
-        for i in range(GROUPS if own else 0):
+        for i in range(min(GROUPS, own)):
             anywhere = {site.name for site in self.learnt if site.of_scene and torch.rand(()) < ANYWHERE}
             kept = {*(self._unclear if last else anywhere), *(self.settled or ())}
             told = [site not in self.learnt or site.name in kept for site in self.scene_sites]
-            valued = self.own_scenes(kept, (own + i) // GROUPS)
+            valued = self.own_scenes(kept, (own + i) // min(GROUPS, own))
             drawn.append(valued._replace(overall=valued.overall.where(torch.tensor(told), torch.nan)))
         entered = [self.tried.reader.eye.enter(some.drawn.image) for some in drawn]
         return torch.cat(entered), torch.cat([some.overall for some in drawn])
