@@ -3,7 +3,6 @@
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import pyro
 import pyro.distributions as dist
@@ -238,93 +237,6 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
 
     prior, after = beside(run.model.prior), beside(run.guide)
     assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
-
-
-def test_sites_keep_the_prior_by_what_is_read_of_them():
-    """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target."""
-
-    class Learning:
-        tried = SimpleNamespace(unclear=frozenset("u"))
-
-        def site_rows(self, images):
-            assert set(images) == {"learnt", "prior", "target"}
-            torch.manual_seed(0)
-            where = {
-                "learnt": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0, "u": 9.0},
-                "prior": {"x": 1.0, "y": 0.0, "z": 0.0, "w": -2.0, "u": 1.0},
-                "target": {"x": 0.2, "y": 0.0, "z": 0.0, "w": -1.5, "u": 0.2},
-            }
-            return {
-                site: {name: rows(where[name][site], 0 if (name, site) == ("target", "z") else 120) for name in images}
-                for site in "xyzwu"
-            }
-
-    images = dict.fromkeys(("learnt", "prior", "target"), torch.zeros(0))
-    assert judged.passed(Learning(), images, careful=True) == {"y", "z", "w"}
-    assert judged.passed(Learning(), images, careful=False) == {"w"}
-
-
-class Renders:
-    """What is read of a site is moved by its own value, and by what ``v`` has and ``w`` is said to have."""
-
-    def __init__(self, learnt: dict[str, float], moves: dict[str, float]):
-        self.learnt, self.moves, self.seed = learnt, moves, 0
-        self.tried = SimpleNamespace(unclear=frozenset(learnt), lost=lambda renders: {"lost": 0.1})
-        self.asked = []
-
-    def own_scenes(self, kept):
-        self.asked.append(kept)
-        values = {name: value * (name not in kept) for name, value in self.learnt.items()}
-        return SimpleNamespace(drawn=SimpleNamespace(image=values))
-
-    def site_rows(self, images):
-        self.seed += 1
-        torch.manual_seed(self.seed)
-
-        def read(of, name):
-            if isinstance(of, torch.Tensor):
-                return rows(1.0, 3 * len(of))
-            return rows(of[name] + sum(of[other] * by for other, by in self.moves.items() if other != name), 600)
-
-        return {name: {source: read(of, name) for source, of in images.items()} for name in self.learnt}
-
-
-def test_unclear_sites_are_learnt_where_renders_without_them_are_farther():
-    """``u`` and ``v`` are as the target has them; ``w`` is not, nor ``lost``, which would be nearer."""
-    learning = Renders({"u": 1.0, "v": 1.0, "w": -1.0, "lost": 1.0}, {})
-    kept, lost = judged.of_unclear(learning, torch.zeros(400), frozenset("k"))
-    assert kept == {"w", "lost"} and lost == {"lost": 0.1}
-    assert all("k" in each for each in learning.asked) and len(learning.asked) == 5
-    nothing = Renders({"w": -1.0, "lost": 1.0}, {})
-    assert judged.of_unclear(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"} and len(nothing.asked) == 2
-
-
-def test_what_is_learnt_wrongly_is_not_in_the_way_of_the_others():
-    """What is read of ``u`` is moved by ``w``, which is learnt wrongly: with it ``u`` comes hardly nearer."""
-    learning = Renders({"u": 1.0, "w": -1.0}, {"w": 0.4})
-    assert judged.of_unclear(learning, torch.zeros(400), frozenset())[0] == {"w"}
-    assert learning.asked[-1] == {"w"}
-
-
-def rows(mean, number):
-    """What is read of a site, three times in each image."""
-    return mean + torch.randn(number, 2), torch.arange(number) // 3
-
-
-def test_of_many_sites_none_is_learnt_by_chance():
-    """Of forty learnt renders are as far away as the prior's; of one they are nearer, which is seen all the same."""
-
-    class Learning:
-        tried = SimpleNamespace(unclear=frozenset())
-
-        def site_rows(self, images):
-            torch.manual_seed(0)
-            means = {"learnt": -0.5, "prior": 0.5, "target": 0.0}
-            nothing = {f"n{i}": {name: rows(means[name], 120) for name in images} for i in range(40)}
-            return nothing | {"x": {name: rows(float(name == "prior"), 120) for name in images}}
-
-    images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert judged.passed(Learning(), images, careful=True) == {f"n{i}" for i in range(40)}
 
 
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
