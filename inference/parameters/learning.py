@@ -7,7 +7,7 @@
    found there (``reading.missing``).
 4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
    reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
-5. What is read of objects in the guide's renders is brought to what is read in the target (``energy``).
+5. What is read in the guide's renders is brought to what is read in the target (``energy``).
 6. It is settled which sites keep their prior. The reader learns the scene's sites that it reads with little skill once
    more, from renders that are like the target but have the prior's values of them; these are weighted until what is
    read is distributed as in the target.

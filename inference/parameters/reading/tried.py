@@ -111,11 +111,9 @@ class TriedReader:
 
     @property
     def noisy(self) -> Tensor:
-        """Of the sites that are learnt, in the order of ``columns``, which are refined: those of nodes that are read
-        with an error of some size. What is read of a scene's site moves with the other sites of the scene, too."""
+        """Of the sites that are learnt, in the order of ``columns``, which are read with an error of some size."""
         assert self.skill is not None
-        of_nodes = torch.arange(len(self.skill.share)) < len(self.node_sites)
-        return ((self.skill.share < SHARP) & of_nodes)[self.good]
+        return self.skill.share[self.good] < SHARP
 
     @property
     def unclear(self) -> frozenset[str]:
