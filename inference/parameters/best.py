@@ -3,10 +3,12 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from ..judging.farther import farther
 from ..judging.two_sample import Features
+from ..training import of_prefix
 from .guide import ParameterGuide
 
 
@@ -27,24 +29,45 @@ class Best:
 
     Attributes:
         weights: of the best guide's network so far; empty before the first one.
+        passed: names of its sites that had their prior where it was judged.
     """
 
     def __init__(self, held: HeldOut):
-        self.held, self.weights = held, dict[str, Tensor]()
+        self.held, self.weights, self.passed = held, dict[str, Tensor](), frozenset[str]()
         self.looks: Features | None = None
 
-    def after(self, guide: ParameterGuide) -> None:
-        """Judge a guide after a training of it; in place."""
+    def after(self, guide: ParameterGuide, passed: frozenset[str] = frozenset()) -> None:
+        """Judge a guide after a training of it; in place.
+
+        Args:
+            passed: sites that would keep their prior, as scenes will not have what was learnt of them: else they decide
+                about the others.
+        """
         now = {key: value.clone() for key, value in guide.net.state_dict().items()}
-        looks = self.held.look(guide)
+        looks = self._look(guide, passed)
         if self.weights:
             guide.net.load_state_dict(self.weights)
             if self.looks is None:  # resumed
-                self.looks = self.held.look(guide)
+                self.looks = self._look(guide, self.passed)
             if farther(looks, self.looks, self.held.real).sure:
                 return
             guide.net.load_state_dict(now)
-        self.weights, self.looks = now, looks
+        self.weights, self.looks, self.passed = now, looks, passed
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        weights = {f"weights.{key}": value for key, value in self.weights.items()}
+        return weights | {f"passed.{name}": torch.ones(()) for name in self.passed}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        self.weights, self.passed = of_prefix(tensors, "weights."), frozenset(of_prefix(tensors, "passed."))
+
+    def _look(self, guide: ParameterGuide, passed: frozenset[str]) -> Features:
+        guide.passed = passed
+        looks = self.held.look(guide)
+        guide.passed = frozenset()
+        return looks
 
 
 def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:

@@ -62,14 +62,14 @@ class ParameterLearning:
         schedule: how long.
         seed: of everything random.
         held: judges the guide after each of its trainings, which is undone where it made its scenes surely farther.
-        settle: names sites that keep their prior all the same, before those that are read with little skill are learnt.
+        settle: names sites that would keep their prior; asked where ``held`` judges and before unclear ones are learnt.
 
     Attributes:
         unit, total, done: see ``Training``; steps of all trainings.
         sites: of the model.
         tried: the reader, and what is known of it.
         guide: what is learnt; None before it is known which sites are, and where there are none.
-        settled: the sites that ``settle`` named; None before it was asked.
+        settled: the sites that ``settle`` named at the end; None before.
     """
 
     unit = "steps"
@@ -87,7 +87,7 @@ class ParameterLearning:
         settle: Callable[["ParameterLearning"], Collection[str]] | None = None,
     ):
         self.best = None if held is None else Best(held)
-        self.settle = settle
+        self.settle = settle or (lambda _: frozenset[str]())
         self.settled: frozenset[str] | None = None
         self.model, self.structure, self.images, self.schedule, self.seed = model, structure, images, schedule, seed
         seed_everything(batch_seed(seed, 0))
@@ -122,27 +122,27 @@ class ParameterLearning:
             if self.tried.skill is not None and not self.learnt:  # nothing can be read
                 self.phase, self.done = len(self.lengths), self.total
                 return
-            if self._idle:
-                self.phase += 1
-                self.done = sum(self.lengths[: self.phase])
-                continue
-            if self.phases[self.phase] == UNCLEAR and self.settled is None:
-                self.settled = frozenset(self.settle(self)) if self.settle is not None else frozenset()
-            if self.inner is None:
-                self.inner = self._begun()
-            before = sum(self.lengths[: self.phase])
-
-            def heard(training: Training, told: dict[str, float], before: int = before) -> None:
-                self.done = before + training.done
-                if each is not None:
-                    each(self, told)
-
-            self.inner.run(heard)
-            self.inner = self.missing = None
-            if self.phases[self.phase] in OF_GUIDE and self.best is not None and self.guide is not None:
-                self.best.after(self.guide)
+            if not self._idle:
+                self._run_phase(each)
             self.phase += 1
             self.done = sum(self.lengths[: self.phase])
+
+    def _run_phase(self, each: Report | None) -> None:
+        if self.phases[self.phase] == UNCLEAR and self.settled is None:
+            self.settled = frozenset(self.settle(self))
+        if self.inner is None:
+            self.inner = self._begun()
+        before = sum(self.lengths[: self.phase])
+
+        def heard(training: Training, told: dict[str, float]) -> None:
+            self.done = before + training.done
+            if each is not None:
+                each(self, told)
+
+        self.inner.run(heard)
+        self.inner = self.missing = None
+        if self.phases[self.phase] in OF_GUIDE and self.best is not None and self.guide is not None:
+            self.best.after(self.guide, frozenset((*self.settle(self), *self._unclear)))
 
     def summary(self) -> dict[str, Any]:
         """Nothing more for the log."""
@@ -155,7 +155,7 @@ class ParameterLearning:
             tensors["settled"] = torch.tensor([site.name in self.settled for site in self.learnt])
         if self.guide is not None:
             tensors |= {f"guide.{key}": value for key, value in self.guide.net.state_dict().items()}
-            tensors |= {f"best.{key}": value for key, value in (self.best.weights if self.best else {}).items()}
+            tensors |= {f"best.{key}": value for key, value in (self.best.state() if self.best else {}).items()}
         if self.missing is not None:
             tensors |= {f"missing.{key}": torch.as_tensor(part) for key, part in self.missing._asdict().items()}
         if self.inner is not None:
@@ -174,7 +174,7 @@ class ParameterLearning:
         if self.guide is not None:
             self.guide.net.load_state_dict(of_prefix(tensors, "guide."))
             if self.best is not None:
-                self.best.weights = of_prefix(tensors, "best.")
+                self.best.restore(of_prefix(tensors, "best."))
         missing, inner = of_prefix(tensors, "missing."), of_prefix(tensors, "inner.")
         if missing:
             self.missing = Missing(**missing)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 READING, SCENES, LIKELIHOOD, ENERGY = "reading", "scenes", "likelihood", "energy"
 UNCLEAR, WEIGHTS = "unclear", "weights"
-OF_SCENES, OF_GUIDE = (SCENES, UNCLEAR, WEIGHTS), (LIKELIHOOD, ENERGY, WEIGHTS)
+OF_SCENES, OF_GUIDE = (SCENES, UNCLEAR, WEIGHTS), (LIKELIHOOD, ENERGY)
 EACH = 2  # renders for each step in which sites of scenes are learnt to be read
 
 

@@ -68,7 +68,35 @@ def test_training_that_made_it_surely_worse_is_undone(trays):
     best.after(guide)  # worse
     assert float(guide.net.scene_out[0].bias[6].detach()) == 2.0
     resumed = Best(best.held)
-    resumed.weights = best.weights
+    resumed.restore(best.state())
     move(guide, (-2.0, -2.0))
     resumed.after(guide)
     assert float(guide.net.scene_out[0].bias[6].detach()) == 2.0
+
+
+def test_sites_that_would_keep_their_prior_do_not_decide_about_others(trays):
+    """What is learnt of ``floor.turn`` is wrong, and more so after the second training, which mends the other site."""
+    first, second, turn = (-1.0, -2.0), (2.0, -4.0), frozenset(["floor.turn"])
+    judges = held((0.6, 1.0), (0.8, 1.0))
+
+    def bias(guide):
+        return float(guide.net.scene_out[0].bias[6].detach())
+
+    guide, best = guide_of(trays, first), Best(judges)
+    best.after(guide, turn)
+    move(guide, second)
+    best.after(guide, turn)
+    assert bias(guide) == second[0] and best.passed == turn and not guide.passed
+    move(guide, (-3.0, 4.0))
+    best.after(guide, turn)
+    assert bias(guide) == second[0]
+    resumed = Best(judges)
+    resumed.restore(best.state())
+    move(guide, (2.5, -1.0))
+    resumed.after(guide, turn)
+    assert bias(guide) == 2.5
+    all_sites = Best(judges)
+    all_sites.after(move(guide, (0.0, 0.0)) or guide)
+    move(guide, second)
+    all_sites.after(guide)
+    assert bias(guide) == 0.0

@@ -8,6 +8,7 @@ from scipy.stats import kstest
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
+from probscene.inference.parameters.best import HeldOut
 from probscene.inference.parameters.graph import Graph
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
@@ -16,6 +17,7 @@ from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.reading import missing, reader
 from probscene.inference.parameters.reading.eyes import RenderEye
 from probscene.inference.parameters.reading.skill import Skill
+from probscene.inference.parameters.reading.tried import TriedReader
 from probscene.inference.parameters.schedule import LIKELIHOOD, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
 from probscene.renderers.sprites import SpriteRenderer
 
@@ -149,6 +151,32 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
     assert len(as_drawn) == 6 * 130 and 0 < int((~is_told).sum()) < len(as_drawn)
     by_guide = (as_drawn - torch.tensor(2.0).sigmoid()).abs() < 0.03
     assert int(by_guide.sum()) >= int((~is_told).sum())
+
+
+def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatch):
+    """Sites that would keep their prior have it there, and so have those that are learnt at the end."""
+    monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
+    monkeypatch.setattr(TriedReader, "unclear", frozenset(["scene.bright", "ball.away"]))
+    monkeypatch.setattr(TriedReader, "noisy", property(lambda tried: torch.ones(len(tried.good_sites)).bool()))
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    schedule = ParameterSchedule(
+        reader_steps=1, scene_renders=4, steps=1, rounds=1, round_reader_steps=1, round_scene_renders=2,
+        round_steps=1, energy_steps=1, energy_scenes=4, weighted_scenes=4, reader_images=2,
+    )  # fmt: skip
+    counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.zeros(30, 3, 64, 64).byte()
+    looked, would_keep = [], iter([(), ("floor.turn",), (), ("floor.turn",)])
+
+    def look(guide):
+        looked.append(guide.passed)
+        return torch.rand(30, 2).double().numpy()
+
+    learning = ParameterLearning(
+        trays, trays.prior, RenderEye(counts), label, lambda: images, schedule,
+        held=HeldOut(look, torch.rand(30, 2).double().numpy()), settle=lambda _: next(would_keep),
+    )  # fmt: skip
+    learning.run()
+    assert looked == [{"scene.bright"}, {"scene.bright", "floor.turn"}, {"scene.bright"}]
+    assert learning.settled == {"floor.turn"} and next(would_keep, None) is None
 
 
 @pytest.mark.parametrize("phase", [LIKELIHOOD, UNCLEAR, WEIGHTS])
