@@ -100,9 +100,9 @@ class EnergyDistance(StepTraining):
 class WeightedEnergyDistance(StepTraining):
     """Resumable training of the last layers of some sites of scenes, from the prior.
 
-    Its loss is by how much the squared energy distance of each site's weighted readings exceeds what it is, in the
-    mean, of as many readings from one distribution. There each ends: what is read of the target has a chance of its
-    own, and a distribution that explains that as well is far from the truth where readings are poor [2].
+    Its loss is by how much the squared energy distance of each site's weighted readings exceeds what chance makes of as
+    many readings from one distribution. There each ends: what is read of the target has a chance of its own, and a
+    distribution that explains that as well is far from the truth where readings are poor [2].
 
     Args:
         net: trained in place.
@@ -141,8 +141,7 @@ class WeightedEnergyDistance(StepTraining):
     def _excess(self, g: int, rows: "WeightedRows") -> Tensor:
         u = self.own.scene[:, g : g + 1]
         log_q = self.net.scene_mixture(self.graph, self.own.scene, g).log_prob(u.nan_to_num(0.5))
-        distance, expected = rows.compared(log_q.where(~u.isnan(), 0.0)[:, 0].double().softmax(0))
-        return F.relu(distance / expected - 1)
+        return F.relu(rows.distance(log_q.where(~u.isnan(), 0.0)[:, 0].double().softmax(0)) / rows.chance - 1)
 
 
 class WeightedRows(NamedTuple):
@@ -151,30 +150,31 @@ class WeightedRows(NamedTuple):
     Attributes:
         own: ``(N, N)`` of one render from another.
         across: ``(N,)`` of each render from the target's images, in the mean.
-        target: of one of these images from another, in the mean, and from any.
-        images: L.
+        target: of one of these images from another, in the mean.
+        chance: by how much a squared energy distance of all renders and these images, each paired with itself as well,
+            is above 0 in the mean where both are of one distribution.
     """
 
     own: Tensor
     across: Tensor
-    target: tuple[float, float]
-    images: int
+    target: float
+    chance: float
 
     @staticmethod
     def of(own: Values, target: Values, g: int) -> "WeightedRows":
         """Of a scene's site."""
         turns = own.turns[own.nodes.shape[2] :][g : g + 1]
         rows, others = (_placed(values.scene[:, g : g + 1].double(), turns) for values in (own, target))
-        between, L = _distances(others, others).sum().item(), len(others)
-        every = max(LEAST, between / max(1, L * (L - 1))), between / L**2
-        return WeightedRows(_distances(rows, rows), _distances(rows, others).mean(1), every, L)
+        N, L = len(rows), len(others)
+        between = _distances(others, others).sum().item() / max(1, L * (L - 1))
+        chance = max(LEAST, between) * (1 / N + 1 / L)
+        return WeightedRows(_distances(rows, rows), _distances(rows, others).mean(1), between, chance)
 
-    def compared(self, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared energy distance of renders of weight ``(N,)``, 1 in all, from the target; and its mean where both are
-        of one distribution."""
-        apart, every = self.target
-        distance = 2 * weight @ self.across - weight @ self.own @ weight - every
-        return distance, apart * (weight.square().sum() + 1 / self.images)
+    def distance(self, weight: Tensor) -> Tensor:
+        """Squared energy distance of renders of weight ``(N,)``, 1 in all, from the target, without bias: no render or
+        image is paired with itself. Otherwise few renders that weigh much would be near, whatever the target is."""
+        own = weight @ self.own @ weight / (1 - weight.square().sum()).clamp(min=1e-6)
+        return 2 * weight @ self.across - own - self.target
 
 
 @contextmanager

@@ -176,20 +176,41 @@ def test_weighted_renders_are_as_far_from_the_target_as_scipy_says(seed, number,
     rng = np.random.default_rng(seed)
     own, target, weight = rng.random((number, 2)), rng.random((images, 2)), rng.random(number) + 1e-3
     rows = WeightedRows.of(*(scenes_of(torch.from_numpy(values)) for values in (own, target)), 1)
-    distance, _ = rows.compared(torch.from_numpy(weight / weight.sum()))
+    weight /= weight.sum()
+
+    def itself(values, weight):  # what pairs of a row with itself take away from the distance of two of these rows
+        pairs = np.outer(weight, weight)
+        every = (pairs * np.abs(values[:, 1:] - values[:, 1])).sum()
+        return every / (pairs.sum() - np.trace(pairs)) - every
+
     expected = stats.energy_distance(own[:, 1], target[:, 1], weight) ** 2
-    assert float(distance) == pytest.approx(expected, abs=1e-9)
+    expected -= itself(own, weight) + itself(target, np.full(images, 1 / images))
+    assert float(rows.distance(torch.from_numpy(weight))) == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_distance_of_one_distribution_from_itself_is_as_expected():
-    """In the mean of many samples, some renders of which weigh more than others."""
-    rng, weight, each = np.random.default_rng(0), np.linspace(0.1, 1.0, 30), []
+def test_one_distribution_is_at_no_distance_from_itself():
+    """In the mean of many samples, some renders of which weigh more than others; with pairs of one row it is what
+    chance makes of it."""
+    rng, weight, each, paired = np.random.default_rng(0), np.geomspace(1e-4, 1.0, 30), [], []
     weight = torch.from_numpy(weight / weight.sum())
     for _ in range(400):
-        own, target = (scenes_of(torch.from_numpy(rng.beta(2, 5, (number, 1)))) for number in (30, 50))
-        each.append([float(x) for x in WeightedRows.of(own, target, 0).compared(weight)])
-    distance, expected = np.mean(each, 0)
-    assert distance == pytest.approx(expected, rel=0.1)
+        one, other = rng.beta(2, 5, (30, 1)), rng.beta(2, 5, (50, 1))
+        rows = WeightedRows.of(*(scenes_of(torch.from_numpy(values)) for values in (one, other)), 0)
+        each.append(float(rows.distance(weight)))
+        paired.append([stats.energy_distance(one[:, 0], other[:, 0]) ** 2, rows.chance])
+    assert abs(np.mean(each)) < 4 * np.std(each) / len(each) ** 0.5
+    distance, chance = np.mean(paired, 0)
+    assert distance == pytest.approx(chance, rel=0.1)
+
+
+def test_a_few_renders_in_the_middle_do_not_explain_a_target():
+    rng = np.random.default_rng(0)
+    own, target = np.sort(rng.normal(size=1000)), rng.normal(size=400)
+    rows = WeightedRows.of(*(scenes_of(torch.from_numpy(values[:, None])) for values in (own, target)), 0)
+    weight = torch.zeros(1000).double()
+    weight[490:510] = 1 / 20
+    assert float(rows.distance(weight)) > 20 * rows.chance
+    assert float(rows.distance(torch.full_like(weight, 1e-3))) < 4 * rows.chance
 
 
 def test_what_is_read_with_little_skill_is_learnt_by_weights():
@@ -218,3 +239,20 @@ def test_what_is_read_with_little_skill_is_learnt_by_weights():
     after = net.state_dict()
     changed = {key for key in after if not torch.equal(after[key], before[key])}
     assert changed == {f"scene_out.{g}.{part}" for g in (0, 1) for part in ("weight", "bias")}
+
+
+def test_what_no_weights_explain_is_not_learnt_as_a_few_values():
+    """Readings of the target that are off to one side and pile up there, as those of renders hardly do."""
+    torch.manual_seed(0)
+    net, u, true = ParameterNet(1, 0, 1, hidden=12), torch.rand(1000, 1), 0.1 + 0.3 * torch.rand(1000, 1)
+
+    def read(u, off=0.0):
+        return (u - off + 0.15 * torch.randn_like(u)).clamp(0, 1)
+
+    own, target = scenes_of(read(u)), scenes_of(read(true, 0.2))
+    own = OwnReadings(own.kind, own.parent, own.nodes, u, own, own.kind)
+    WeightedEnergyDistance(net, target, own, [0], steps=300).run()
+    with torch.no_grad():
+        learnt = net.scene_mixture(Graph.of(own.kind, own.parent), u, 0).icdf(torch.rand(1000, 1))[:, 0].numpy()
+    away, of_prior = (stats.wasserstein_distance(values, true[:, 0].numpy()) for values in (learnt, u[:, 0].numpy()))
+    assert away < 0.75 * of_prior
