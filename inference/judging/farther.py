@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from .two_sample import Features
 
-RESAMPLES, SURE = 200, 0.9
+RESAMPLES, SURE = 2000, 0.9
 EXAMINED = 1000  # rows of each sample
 
 
@@ -53,20 +53,17 @@ def farther(
     within = cdist(real, real)
     whole = [np.ones(len(x)) / len(x) for x in (one, other, real)]
     found = [_energy(*kernels[i], within, whole[i], whole[2]) for i in (0, 1)]
-    larger = 0
-    for _ in range(RESAMPLES):
-        weights = [_resampled(rng, image) for image in of]
-        drawn = [_energy(*kernels[i], within, weights[i], weights[2]) for i in (0, 1)]
-        larger += drawn[0] > drawn[1]
+    drawn = [_resampled(rng, image) for image in of]
+    resampled, others = (_energy(*kernels[i], within, drawn[i], drawn[2]) for i in (0, 1))
     distance, of_other = (float(np.sqrt(max(0.0, value))) for value in found)
-    return Farther(distance, of_other, larger / RESAMPLES)
+    return Farther(distance, of_other, float((resampled > others).mean()))
 
 
 def _resampled(rng: np.random.Generator, image: NDArray[np.integer]) -> NDArray[np.floating]:
-    """Weights of rows, each as often as its image is drawn."""
+    """Weights of rows ``(R, N)``, each as often as its image is drawn."""
     number = int(image.max()) + 1
-    weight = rng.multinomial(number, np.full(number, 1 / number))[image]
-    return weight / weight.sum() if weight.any() else np.ones(len(image)) / len(image)
+    weight = rng.multinomial(number, np.full(number, 1 / number), RESAMPLES)[:, image]
+    return weight / weight.sum(1, keepdims=True)
 
 
 def _energy(
@@ -75,7 +72,7 @@ def _energy(
     within: NDArray[np.floating],
     weight: NDArray[np.floating],
     of_real: NDArray[np.floating],
-) -> float:
-    """Squared, of weighted samples; a pair of an image and its copy is left out of neither side, so that both compared
-    distances are off by the same."""
-    return float(2 * weight @ across @ of_real - weight @ theirs @ weight - of_real @ within @ of_real)
+) -> NDArray[np.floating]:
+    """Squared, of samples of weights ``(..., N)`` and ``(..., L)``; a pair of an image and its copy is left out of
+    neither side, so that both compared distances are off by the same."""
+    return ((2 * weight @ across - of_real @ within) * of_real).sum(-1) - (weight @ theirs * weight).sum(-1)

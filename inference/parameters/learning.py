@@ -62,7 +62,7 @@ class ParameterLearning:
         schedule: how long.
         seed: of everything random.
         held: judges the guide after each of its trainings, which is undone where it made its scenes surely farther.
-        settle: names sites that would keep their prior; asked where ``held`` judges and before unclear ones are learnt.
+        settle: names sites that would keep their prior where ``held`` judges, and then, for good, before unclear ones.
 
     Attributes:
         unit, total, done: see ``Training``; steps of all trainings.
@@ -84,10 +84,10 @@ class ParameterLearning:
         schedule: ParameterSchedule,
         seed: int = 0,
         held: HeldOut | None = None,
-        settle: Callable[["ParameterLearning"], Collection[str]] | None = None,
+        settle: Callable[["ParameterLearning", bool], Collection[str]] | None = None,
     ):
         self.best = None if held is None else Best(held)
-        self.settle = settle or (lambda _: frozenset[str]())
+        self.settle = settle or (lambda *_: frozenset[str]())
         self.settled: frozenset[str] | None = None
         self.model, self.structure, self.images, self.schedule, self.seed = model, structure, images, schedule, seed
         seed_everything(batch_seed(seed, 0))
@@ -129,7 +129,7 @@ class ParameterLearning:
 
     def _run_phase(self, each: Report | None) -> None:
         if self.phases[self.phase] == UNCLEAR and self.settled is None:
-            self.settled = frozenset(self.settle(self))
+            self.settled = frozenset(self.settle(self, True))
         if self.inner is None:
             self.inner = self._begun()
         before = sum(self.lengths[: self.phase])
@@ -142,7 +142,7 @@ class ParameterLearning:
         self.inner.run(heard)
         self.inner = self.missing = None
         if self.phases[self.phase] in OF_GUIDE and self.best is not None and self.guide is not None:
-            self.best.after(self.guide, frozenset((*self.settle(self), *self._unclear)))
+            self.best.after(self.guide, frozenset((*self.settle(self, False), *self._unclear)))
 
     def summary(self) -> dict[str, Any]:
         """Nothing more for the log."""

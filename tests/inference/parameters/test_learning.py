@@ -172,7 +172,7 @@ def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatc
 
     learning = ParameterLearning(
         trays, trays.prior, RenderEye(counts), label, lambda: images, schedule,
-        held=HeldOut(look, torch.rand(30, 2).double().numpy()), settle=lambda _: next(would_keep),
+        held=HeldOut(look, torch.rand(30, 2).double().numpy()), settle=lambda _, last: next(would_keep),
     )  # fmt: skip
     learning.run()
     assert looked == [{"scene.bright"}, {"scene.bright", "floor.turn"}, {"scene.bright"}]
@@ -209,7 +209,8 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
 
     monkeypatch.setattr(ParameterGuide, "suited", seen)
 
-    def settle(learning):
+    def settle(learning, last):
+        assert last
         kept.clear()
         asked.append(learning.phases[learning.phase])
         return {"scene.bright"}

@@ -59,7 +59,7 @@ def judged(
     more: Callable[[], Tensor],
 ) -> Judged:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features.
-    What is read with little skill takes ``more`` of them to tell, see ``of_unclear``."""
+    Which sites are learnt takes ``more`` of them to tell, see ``settled`` and ``of_unclear``."""
     learnt = learning.guide
     if learnt is None:
         return Judged({"kept": "prior"}, {}, {})
@@ -78,9 +78,8 @@ def judged(
 
     apart = compared()
     kept, lost = "learnt" if apart.one < apart.other else "prior", dict[str, float]()
-    careful = kept == "prior" or run.preset.parameters.sure
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
-        well = passed(learning, images, careful) if learning.settled is None else learning.settled
+        well = settled(run, guide, learning, more()) if learning.settled is None else learning.settled
         badly = frozenset[str]()
         if learning.tried.unclear:
             seed_everything(batch_seed(run.record["seed"], 6, 4))
