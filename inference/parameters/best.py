@@ -23,6 +23,13 @@ class HeldOut(NamedTuple):
     look: Callable[[ParameterGuide], Features]
     real: Features
 
+    def looks(self, guide: ParameterGuide, passed: frozenset[str]) -> Features:
+        """Those of a guide's renders in which sites of some names have their prior, ``(N, D)``."""
+        guide.passed = passed
+        looks = self.look(guide)
+        guide.passed = frozenset()
+        return looks
+
 
 class Best:
     """Goes back to the best state where training has made a guide's scenes surely farther from the images.
@@ -40,15 +47,15 @@ class Best:
         """Judge a guide after a training of it; in place.
 
         Args:
-            passed: sites that would keep their prior, as scenes will not have what was learnt of them: else they decide
-                about the others.
+            passed: names of sites that have their prior in the renders that are compared, as they would keep it in the
+                end: what was learnt of them must not decide about the others.
         """
         now = {key: value.clone() for key, value in guide.net.state_dict().items()}
-        looks = self._look(guide, passed)
+        looks = self.held.looks(guide, passed)
         if self.weights:
             guide.net.load_state_dict(self.weights)
             if self.looks is None:  # resumed
-                self.looks = self._look(guide, self.passed)
+                self.looks = self.held.looks(guide, self.passed)
             if farther(looks, self.looks, self.held.real).sure:
                 return
             guide.net.load_state_dict(now)
@@ -63,12 +70,6 @@ class Best:
         """Go on from a ``state``."""
         self.weights, self.passed = of_prefix(tensors, "weights."), frozenset(of_prefix(tensors, "passed."))
 
-    def _look(self, guide: ParameterGuide, passed: frozenset[str]) -> Features:
-        guide.passed = passed
-        looks = self.held.look(guide)
-        guide.passed = frozenset()
-        return looks
-
 
 def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:
     """Names of the sites whose learnt values do not surely bring renders nearer to the images, each tried alone.
@@ -78,8 +79,7 @@ def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:
     names = frozenset(site.name for site in guide.sites)
 
     def look(useful: frozenset[str]) -> Features:
-        guide.passed = names - useful
-        return held.look(guide)
+        return held.looks(guide, names - useful)
 
     prior, away = look(frozenset()), {}
     for name in sorted(names):
@@ -90,5 +90,4 @@ def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:
         apart = farther(look(frozenset(away)), prior, held.real)
         if apart.one >= apart.other:
             away = {min(away, key=away.__getitem__): 0.0}
-    guide.passed = frozenset()
     return names - frozenset(away)
