@@ -165,9 +165,8 @@ class WeightedRows(NamedTuple):
         """Of a scene's site."""
         turns = own.turns[own.nodes.shape[2] :][g : g + 1]
         rows, others = (_placed(values.scene[:, g : g + 1].double(), turns) for values in (own, target))
-        N, L = len(rows), len(others)
-        between = _distances(others, others).sum().item() / max(1, L * (L - 1))
-        chance = max(LEAST, between) * (1 / N + 1 / L)
+        between = float(_within(others))
+        chance = max(LEAST, between) * (1 / len(rows) + 1 / len(others))
         return WeightedRows(_distances(rows, rows), _distances(rows, others).mean(1), between, chance)
 
     def distance(self, weight: Tensor) -> Tensor:
@@ -246,11 +245,12 @@ def _placed(u: Tensor, turns: Tensor) -> Tensor:
 
 def _energy(one: Tensor, other: Tensor) -> Tensor:
     """Of rows ``(R, D)``; no row is paired with itself."""
+    return 2 * _distances(one, other).mean() - _within(one) - _within(other)
 
-    def within(rows: Tensor) -> Tensor:
-        return _distances(rows, rows).sum() / (len(rows) * (len(rows) - 1))
 
-    return 2 * _distances(one, other).mean() - within(one) - within(other)
+def _within(rows: Tensor) -> Tensor:
+    """Mean distance of one row ``(R, D)`` from another; 0 where there is one alone."""
+    return _distances(rows, rows).sum() / max(1, len(rows) * (len(rows) - 1))
 
 
 def _distances(one: Tensor, other: Tensor) -> Tensor:
