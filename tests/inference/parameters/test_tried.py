@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from probscene.inference.features.base import Examples
 from probscene.inference.parameters.reading.reader import LEAST_MASS, Found, blocks
+from probscene.inference.parameters.reading.skill import Skill
 from probscene.inference.parameters.reading.training import MIN_VISIBLE, Valued
 from probscene.inference.parameters.reading.tried import NEAR_ENOUGH, TriedReader
 from probscene.inference.parameters.sites import Site
@@ -63,6 +64,16 @@ def test_the_least_mass_makes_the_fewest_mistakes_up_to_chance(seed, number):
     fewest = min(map(mistakes, LEAST_MASS))
     wanted = min(least for least in LEAST_MASS if mistakes(least) <= fewest + fewest**0.5)
     assert float(reader.least) == np.float32(wanted)
+
+
+def test_sites_that_are_read_with_an_error_are_refined(smeared):
+    """Of nodes and of scenes; not what is read sharply, cannot be read or was not read often enough."""
+    of_nodes = tuple(Site(name, ("cell",)) for name in ("sharp", "poor", "never", "turn"))
+    tried = TriedReader(smeared, SimpleNamespace(), of_nodes, (Site("sun", ()), Site("cloud", ())))
+    tried.skill = Skill(torch.zeros(6, dtype=torch.int64), torch.tensor([0.95, 0.1, 0.5, 0.6, 0.5, 0.95]))
+    tried.readings_of = torch.tensor([100, 100, 3, 100, 100, 100])
+    assert tried.good.tolist() == [True, False, False, True, True, True]
+    assert tried.noisy.tolist() == [False, True, True, False]
 
 
 def test_a_sun_behind_clouds_is_lost(smeared):
