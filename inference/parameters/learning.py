@@ -62,7 +62,7 @@ class ParameterLearning:
         schedule: how long.
         seed: of everything random.
         held: judges the guide after each of its trainings, which is undone where it made its scenes surely farther.
-        settle: names sites that would keep their prior where ``held`` judges, and then, for good, before unclear ones.
+        settle: names sites that would keep their prior: when ``held`` judges; with True, for good, before unclear ones.
 
     Attributes:
         unit, total, done: see ``Training``; steps of all trainings.
