@@ -115,7 +115,10 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
                 for site, means in where.items()
             }
 
+    drawn = []
+
     def renders(run, model, guide, number):
+        drawn.append((model, number))
         return torch.randn(number, 4) + {"prior": 1.0, "learnt": learnt}[model]
 
     monkeypatch.setattr(judged, "_renders", renders)
@@ -123,4 +126,8 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
     preset = SimpleNamespace(parameters=SimpleNamespace(sure=sure))
     run = SimpleNamespace(record={"seed": 0}, preset=preset, model="prior")
     torch.manual_seed(0)
-    assert judged.settled(run, None, Learning(), torch.randn(150, 4)) == kept
+    target = torch.randn(150, 4)
+    settle = judged.settling(run, None, lambda last: target[: 150 if last else 140])
+    assert [settle(Learning(), last) for last in (False, False, True)] == [kept] * 3
+    others = [("learnt", 140), ("learnt", 140), ("learnt", 150)]
+    assert sorted(drawn) == sorted([*others, ("prior", 140), ("prior", 150)])  # the prior's do not change

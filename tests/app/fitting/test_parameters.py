@@ -239,6 +239,24 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
 
 
+def test_more_images_tell_which_sites_are_learnt_than_judge_a_training(call, discs, target, tmp_path, monkeypatch):
+    anything_is_read(monkeypatch)
+    monkeypatch.setattr(parameters, "JUDGED", 5)
+    monkeypatch.setattr(parameters, "DOUBTFUL", 7)
+    looked_at = []
+
+    def passed(learning, images, careful):
+        looked_at.append({name: len(some) for name, some in images.items()})
+        return frozenset()
+
+    monkeypatch.setattr(judged, "passed", passed)
+    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
+    assert done.code == 0, done.err
+    *trainings, last = looked_at
+    assert trainings and all(each == dict.fromkeys(("target", "prior", "learnt"), 5) for each in trainings)
+    assert last == dict.fromkeys(("target", "prior", "learnt"), 7)
+
+
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
 def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)

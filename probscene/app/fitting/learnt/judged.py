@@ -4,6 +4,7 @@ Axis letters: L images, C H W.
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -59,7 +60,7 @@ def judged(
     more: Callable[[], Tensor],
 ) -> Judged:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features.
-    Which sites are learnt takes ``more`` of them to tell, see ``settled`` and ``of_unclear``."""
+    Which sites are learnt takes ``more`` of them to tell, see ``settling`` and ``of_unclear``."""
     learnt = learning.guide
     if learnt is None:
         return Judged({"kept": "prior"}, {}, {})
@@ -79,7 +80,7 @@ def judged(
     apart = compared()
     kept, lost = "learnt" if apart.one < apart.other else "prior", dict[str, float]()
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
-        well = settled(run, guide, learning, more()) if learning.settled is None else learning.settled
+        well = frozenset(learning.settle(learning, True) if learning.settled is None else learning.settled)
         badly = frozenset[str]()
         if learning.tried.unclear:
             seed_everything(batch_seed(run.record["seed"], 6, 4))
@@ -111,18 +112,37 @@ def judged(
     return Judged(distances, lost, sites)
 
 
-def settled(run: "RunFolder", guide: Guide, learning: ParameterLearning, held: Tensor) -> frozenset[str]:
-    """Sites that keep their prior, of those that are read well, as ``judged`` will have it: before the others are
-    learnt, which is done from renders that look like the target."""
-    assert learning.guide is not None
-    images, models = {"target": held}, {"prior": run.model, "learnt": learning.guide.suited(run.model)}
-    images |= {name: _compared(run, model, guide, len(held), name) for name, model in models.items()}
-    if run.preset.parameters.sure:
-        return passed(learning, images, True)
+def settling(
+    run: "RunFolder", guide: Guide, held: Callable[[bool], Tensor]
+) -> Callable[[ParameterLearning, bool], frozenset[str]]:
+    """What names sites that keep their prior, of those that are read well, as ``judged`` will have it: after each
+    training of the guide, and for good before the others are learnt, which is done from renders that look like the
+    target.
+
+    Args:
+        held: images by which it is told, ``(L, C, H, W)`` uint8; with True for good.
+    """
+    sure = run.preset.parameters.sure
+
+    @cache
+    def constant(last: bool) -> tuple[dict[str, Tensor], dict[str, Features]]:
+        """Images of the target and of the prior, which stay as they are, and their looks where these are asked."""
+        images = {"target": held(last)}
+        images["prior"] = _compared(run, run.model, guide, len(images["target"]), "prior")
+        return images, {} if sure else {name: look(some) for name, some in images.items()}
+
+    def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
+        assert learning.guide is not None
+        images, looks = constant(last)
+        learnt = _compared(run, learning.guide.suited(run.model), guide, len(images["target"]), "learnt")
+        careful = sure
+        if not sure:
+            apart = farther(look(learnt), looks["prior"], looks["target"])
+            careful = apart.one >= apart.other
+        return passed(learning, images | {"learnt": learnt}, careful)
+
     look = _embed()
-    prior, learnt, real = (look(images[name]) for name in ("prior", "learnt", "target"))
-    apart = farther(learnt, prior, real)
-    return passed(learning, images, apart.one >= apart.other)
+    return settled
 
 
 def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool) -> frozenset[str]:

@@ -29,7 +29,7 @@ from ..observer import Observer
 from ..parts import inner
 from ..preset import LIKELIHOOD, META_SIM
 from ..storage import Keeper
-from .judged import held_out, judged, settled
+from .judged import held_out, judged, settling
 from .wholes import WholeLearning, meta_sim_learning, sites_record, tilting_learning
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def learn_parameters(
                 run.preset.parameters,
                 batch_seed(run.record["seed"], 5),
                 held_out(run, guide, _some(target, held, JUDGED)),
-                lambda learning, last: settled(run, guide, learning, _some(target, held, DOUBTFUL if last else JUDGED)),
+                settling(run, guide, lambda last: _some(target, held, DOUBTFUL if last else JUDGED)),
             )
         elif method == META_SIM:
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
