@@ -1,12 +1,13 @@
 """Is one sample farther from the real one than another, beyond chance?
 
-Axis letters: N, P generated, L real, D features, R resamples.
+Axis letters: N, P generated, L real, D features, R resamples, I and J images.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial.distance import cdist
 
 from .two_sample import Features
@@ -49,21 +50,34 @@ def farther(
     ]
     one, other, real = (x[rows] for x, rows in zip((one, other, real), chosen, strict=True))
     of = [np.unique(x[rows], return_inverse=True)[1] for x, rows in zip(of, chosen, strict=True)]
-    kernels = [(cdist(x, real), cdist(x, x)) for x in (one, other)]
-    within = cdist(real, real)
-    whole = [np.ones(len(x)) / len(x) for x in (one, other, real)]
+    rows = [_of_images(image) for image in of]
+    samples = (one, other, real)
+    kernels = [
+        (_summed(samples[i], real, rows[i], rows[2]), _summed(samples[i], samples[i], rows[i], rows[i])) for i in (0, 1)
+    ]
+    within = _summed(real, real, rows[2], rows[2])
+    whole = [np.ones(part.shape[0]) / part.shape[1] for part in rows]
     found = [_energy(*kernels[i], within, whole[i], whole[2]) for i in (0, 1)]
-    drawn = [_resampled(rng, image) for image in of]
+    drawn = [_resampled(rng, part.sum(1)) for part in rows]
     resampled, others = (_energy(*kernels[i], within, drawn[i], drawn[2]) for i in (0, 1))
     distance, of_other = (float(np.sqrt(max(0.0, value))) for value in found)
     return Farther(distance, of_other, float((resampled > others).mean()))
 
 
-def _resampled(rng: np.random.Generator, image: NDArray[np.integer]) -> NDArray[np.floating]:
-    """Weights of rows ``(R, N)``, each as often as its image is drawn."""
-    number = int(image.max()) + 1
-    weight = rng.multinomial(number, np.full(number, 1 / number), RESAMPLES)[:, image]
-    return weight / weight.sum(1, keepdims=True)
+def _of_images(image: NDArray[np.integer]) -> csr_array:
+    """``(I, N)`` 1 where a row is of an image."""
+    return csr_array((np.ones(len(image)), (image, np.arange(len(image)))))
+
+
+def _summed(one: Features, other: Features, of_one: csr_array, of_other: csr_array) -> NDArray[np.floating]:
+    """Distances between rows, summed over those of two images: a resample takes all of an image or none."""
+    return of_one @ (of_other @ cdist(other, one)).T
+
+
+def _resampled(rng: np.random.Generator, rows: NDArray[np.floating]) -> NDArray[np.floating]:
+    """What a row of each image weighs, ``(R, I)``, where images with so many ``rows (I,)`` are drawn again."""
+    weight = rng.multinomial(len(rows), np.full(len(rows), 1 / len(rows)), RESAMPLES)
+    return weight / (weight @ rows)[:, None]
 
 
 def _energy(
@@ -73,6 +87,6 @@ def _energy(
     weight: NDArray[np.floating],
     of_real: NDArray[np.floating],
 ) -> NDArray[np.floating]:
-    """Squared, of samples of weights ``(..., N)`` and ``(..., L)``; a pair of an image and its copy is left out of
-    neither side, so that both compared distances are off by the same."""
+    """Squared, where a row of each image weighs ``(..., I)`` and ``(..., J)``; a pair of a row and its copy is left out
+    of neither side, so that both compared distances are off by the same."""
     return ((2 * weight @ across - of_real @ within) * of_real).sum(-1) - (weight @ theirs * weight).sum(-1)

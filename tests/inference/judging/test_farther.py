@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
-from probscene.inference.judging.farther import farther
+from probscene.inference.judging.farther import RESAMPLES, farther
 from probscene.inference.judging.two_sample import energy_distance
 
 
@@ -32,3 +33,23 @@ def test_whole_images_are_resampled():
     single, together = farther(one, other, real), farther(*copies, images=(image,) * 3)
     assert together.one == pytest.approx(single.one) and abs(together.share - single.share) < 0.1
     assert farther(*copies).share > together.share
+
+
+def test_a_share_is_that_of_resamples_row_by_row():
+    """Against a twin that looks at one resample after the other; images have any number of rows, in any order."""
+    rng = np.random.default_rng(4)
+    images = tuple(rng.integers(0, number, rows) for number, rows in ((20, 60), (12, 30), (15, 90)))
+    of = [np.unique(image, return_inverse=True)[1] for image in images]
+    one, other, real = (rng.normal(mean, 1, (len(of[i]), 2)) for i, mean in enumerate((0.35, 0.3, 0.0)))
+
+    def squared(x, y, a, b):
+        a, b = a / a.sum(), b / b.sum()
+        return 2 * a @ cdist(x, y) @ b - a @ cdist(x, x) @ a - b @ cdist(y, y) @ b
+
+    draws, larger = np.random.default_rng(0), 0
+    times = [draws.multinomial(n, np.full(n, 1 / n), RESAMPLES) for n in (image.max() + 1 for image in of)]
+    for i in range(RESAMPLES):
+        a, b, c = (each[i][image] for each, image in zip(times, of, strict=True))
+        larger += squared(one, real, a, c) > squared(other, real, b, c)
+    found = farther(one, other, real, images=images)
+    assert 0.1 < found.share < 0.9 and found.share == pytest.approx(larger / RESAMPLES, abs=1e-9)
