@@ -239,7 +239,10 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
 
 
-def test_more_images_tell_which_sites_are_learnt_than_judge_a_training(call, discs, target, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("sure", "in_the_end"), [(True, 7), (False, 5)])
+def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
+    sure, in_the_end, call, discs, target, tmp_path, monkeypatch
+):
     anything_is_read(monkeypatch)
     monkeypatch.setattr(parameters, "JUDGED", 5)
     monkeypatch.setattr(parameters, "DOUBTFUL", 7)
@@ -250,11 +253,12 @@ def test_more_images_tell_which_sites_are_learnt_than_judge_a_training(call, dis
         return frozenset()
 
     monkeypatch.setattr(judged, "passed", passed)
-    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.settings, *LEARN)
+    settings = (*discs.settings, *LEARN, "--set", f"parameters.sure={str(sure).lower()}")
+    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *settings)
     assert done.code == 0, done.err
     *trainings, last = looked_at
     assert trainings and all(each == dict.fromkeys(("target", "prior", "learnt"), 5) for each in trainings)
-    assert last == dict.fromkeys(("target", "prior", "learnt"), 7)
+    assert last == dict.fromkeys(("target", "prior", "learnt"), in_the_end)
 
 
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])

@@ -120,20 +120,20 @@ def settling(
     target.
 
     Args:
-        held: images by which it is told, ``(L, C, H, W)`` uint8; with True for good.
+        held: images by which it is told, ``(L, C, H, W)`` uint8; with True many, for good and where one has to be sure.
     """
     sure = run.preset.parameters.sure
 
     @cache
-    def constant(last: bool) -> tuple[dict[str, Tensor], dict[str, Features]]:
+    def constant(many: bool) -> tuple[dict[str, Tensor], dict[str, Features]]:
         """Images of the target and of the prior, which stay as they are, and their looks where these are asked."""
-        images = {"target": held(last)}
+        images = {"target": held(many)}
         images["prior"] = _compared(run, run.model, guide, len(images["target"]), "prior")
         return images, {} if sure else {name: look(some) for name, some in images.items()}
 
     def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
         assert learning.guide is not None
-        images, looks = constant(last)
+        images, looks = constant(last and sure)
         learnt = _compared(run, learning.guide.suited(run.model), guide, len(images["target"]), "learnt")
         careful = sure
         if not sure:

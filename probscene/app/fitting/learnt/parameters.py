@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 NAME = "parameters"  # of the file with the record, and before the names of tensors beside a guide's
 READER = "reader"  # of the file with what finds objects, until structure was learnt again
 HELD = 5  # one image of the target in so many is not learnt from, and judges
-JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and where it is told site by site what is learnt
+JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and where these are too few to tell which sites are learnt
 
 
 def learn_parameters(
@@ -82,7 +82,7 @@ def learn_parameters(
                 run.preset.parameters,
                 batch_seed(run.record["seed"], 5),
                 held_out(run, guide, _some(target, held, JUDGED)),
-                settling(run, guide, lambda last: _some(target, held, DOUBTFUL if last else JUDGED)),
+                settling(run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED)),
             )
         elif method == META_SIM:
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
