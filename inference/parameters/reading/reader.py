@@ -129,6 +129,7 @@ class Reader(nn.Module):
         parent, values = self.at(seen, image, rows, columns)
         here = torch.stack([columns, rows], -1) + 0.5
         scale = self.eye.cell
+        overall = self.overall(entered) if self.scene_sites else seen.new_zeros(len(seen), 0, 2 + HARMONICS)
         return Found(
             n + first,
             inside,
@@ -136,7 +137,7 @@ class Reader(nn.Module):
             scale * (share * here).sum(1),
             scale * (share * (here + parent)).sum(1),
             (share.unsqueeze(-1) * values).sum(1),
-            self.overall(entered)[:, : self.scene_sites],
+            overall,
         )
 
 
