@@ -61,17 +61,17 @@ class Mates(nn.Module):
 
     def _ties(self, together: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Of the ways of some sites, ``(N, M, W, 4)`` and ``(N, M, W)``."""
-        known = ~u.isnan()
-        one, other = u.unsqueeze(2), u.unsqueeze(1)
-        alike = torch.cat([(one > 0.5) == (other > 0.5), (one - other).abs() < CLOSE], -1)
-        alike = alike & together.unsqueeze(-1) & (known.unsqueeze(2) & known.unsqueeze(1)).repeat(1, 1, 1, 2)
-        M = u.shape[1]
-        earlier = alike & torch.ones(M, M, dtype=torch.bool).tril(-1).unsqueeze(-1)
-        number, known = alike.sum(2).clamp(min=1), known.repeat(1, 1, 2)
-        part = (earlier.sum(2) + 0.5) / number
+        v, M = u.transpose(1, 2).contiguous(), u.shape[1]  # sums along the last axis are much faster
+        known, half = ~v.isnan(), v > 0.5
+        both = together.unsqueeze(1) & known.unsqueeze(2) & known.unsqueeze(3)
+        close = (v.unsqueeze(3) - v.unsqueeze(2)).abs() < CLOSE
+        alike = torch.cat([(half.unsqueeze(3) == half.unsqueeze(2)) & both, close & both], 1)
+        earlier = alike & torch.ones(M, M, dtype=torch.bool).tril(-1)
+        number, known = alike.sum(3).clamp(min=1), known.repeat(1, 2, 1)
+        part = (earlier.sum(3) + 0.5) / number
         place = torch.stack([2 * part - 1, part.logit() / LOGITS, 1 / number, known.to(part.dtype)], -1)
-        last = torch.arange(M).view(1, 1, M, 1).where(earlier, -1).amax(2)
-        return (place * known.unsqueeze(-1)).to(u.dtype), last
+        last = (earlier * torch.arange(1, M + 1, dtype=torch.int16)).amax(3).long() - 1
+        return (place * known.unsqueeze(-1)).transpose(1, 2).to(u.dtype), last.transpose(1, 2)
 
     def forward(self, place: Tensor, last: Tensor, u: Tensor) -> Tensor:
         """``(N, M', H)`` of some of the nodes.
