@@ -96,15 +96,27 @@ def test_of_many_sites_none_is_learnt_by_chance():
 
 
 @pytest.mark.parametrize(
-    ("sure", "learnt", "kept"), [(False, 0.1, {"w"}), (False, 3.0, {"y", "w"}), (True, 0.1, {"y", "w"})]
+    ("sure", "learnt", "needed", "kept"),
+    [
+        (False, 0.1, "", {"w"}),
+        (False, 3.0, "", {"y", "w"}),
+        (False, 3.0, "w", {"y"}),
+        (True, 0.1, "", {"y", "w"}),
+        (True, 0.1, "w", {"y", "w"}),
+    ],
 )
-def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt, kept, monkeypatch):
+def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt, needed, kept, monkeypatch):
     """Renders look as the target where ``learnt`` is 0. Of ``x`` they are nearer than the prior's, which look 1 off, of
-    ``w`` farther, of ``y`` as near; only who has to be sure, or whose renders look farther, lets ``y`` go."""
+    ``w`` farther, of ``y`` as near; only who has to be sure, or whose renders look farther, lets ``y`` go. Without what
+    is ``needed`` they look farther, which keeps it where one has not to be sure."""
+
+    def looks(guide, without):
+        return torch.randn(140, 4).numpy() + (2.0 if needed and needed in without else 0.0)
 
     class Learning:
         tried = SimpleNamespace(unclear=frozenset("u"))
         guide = SimpleNamespace(suited=lambda model: "learnt")
+        best = SimpleNamespace(held=SimpleNamespace(looks=looks, real=torch.randn(140, 4).numpy()))
 
         def site_rows(self, images):
             assert set(images) == {"prior", "learnt", "target"}
