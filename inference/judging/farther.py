@@ -50,15 +50,15 @@ def farther(
     ]
     one, other, real = (x[rows] for x, rows in zip((one, other, real), chosen, strict=True))
     of = [np.unique(x[rows], return_inverse=True)[1] for x, rows in zip(of, chosen, strict=True)]
-    rows = [_of_images(image) for image in of]
+    rows, number = [_of_images(image) for image in of], [np.bincount(image) for image in of]
     samples = (one, other, real)
     kernels = [
         (_summed(samples[i], real, rows[i], rows[2]), _summed(samples[i], samples[i], rows[i], rows[i])) for i in (0, 1)
     ]
     within = _summed(real, real, rows[2], rows[2])
-    whole = [np.ones(part.shape[0]) / part.shape[1] for part in rows]
+    whole = [np.ones(len(each)) / each.sum() for each in number]
     found = [_energy(*kernels[i], within, whole[i], whole[2]) for i in (0, 1)]
-    drawn = [_resampled(rng, part.sum(1)) for part in rows]
+    drawn = [_resampled(rng, each) for each in number]
     resampled, others = (_energy(*kernels[i], within, drawn[i], drawn[2]) for i in (0, 1))
     distance, of_other = (float(np.sqrt(max(0.0, value))) for value in found)
     return Farther(distance, of_other, float((resampled > others).mean()))
@@ -74,7 +74,7 @@ def _summed(one: Features, other: Features, of_one: csr_array, of_other: csr_arr
     return of_one @ (of_other @ cdist(other, one)).T
 
 
-def _resampled(rng: np.random.Generator, rows: NDArray[np.floating]) -> NDArray[np.floating]:
+def _resampled(rng: np.random.Generator, rows: NDArray[np.integer]) -> NDArray[np.floating]:
     """What a row of each image weighs, ``(R, I)``, where images with so many ``rows (I,)`` are drawn again."""
     weight = rng.multinomial(len(rows), np.full(len(rows), 1 / len(rows)), RESAMPLES)
     return weight / (weight @ rows)[:, None]

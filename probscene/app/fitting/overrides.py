@@ -16,8 +16,16 @@ CHOICES = {
     "learn": (STRUCTURE, BOTH),
     "parameter_method": (LIKELIHOOD, TILTING, META_SIM),
 }
-LEAST = dict.fromkeys(("batches_again", "rounds", "energy_steps", "weighted_scenes", "directions", "reuse"), 0)
-LEAST |= dict.fromkeys(("num_scenes", "scenes"), 2)
+LEAST = {
+    "num_scenes": 2,
+    "scenes": 2,
+    "batches_again": 0,
+    "rounds": 0,
+    "energy_steps": 0,
+    "weighted_scenes": 0,
+    "directions": 0,
+    "reuse": 0,
+}
 FIRST = {"objective": Preset.with_objective, "guide": Preset.with_guide, "features": Preset.with_features}
 ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "pretrain_rate", "difference")
 
