@@ -39,8 +39,9 @@ class Judged(NamedTuple):
         distances: ``kept``, ``"learnt"`` or ``"prior"``, and the energy distances of renders with learnt parameters
             and with the prior's from the images. The guide passes sites of which what is read in its renders is surely
             farther from what is read in the images; where renders are no nearer, or the schedule says so, all of which
-            it is not surely nearer; and where they are surely farther all the same, all but those that bring them
-            nearer alone. With the others it is kept, unless its renders are surely farther then.
+            it is not surely nearer. Unless the schedule says so, none is passed without which renders are surely
+            farther. Where they are surely farther all the same, all are passed but those that bring them nearer alone.
+            With the others the guide is kept, unless its renders are surely farther then.
         lost: by learnt site that cannot be read in scenes like the target's and keeps its prior therefore, the share of
             its variance that is read there.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
