@@ -13,6 +13,7 @@ References:
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from ..steps import StepTraining
 from .graph import Graph
-from .net import ParameterNet
+from .net import Chosen, Given, ParameterNet
 from .reading.reader import cut_draw
 from .sites import NEAR
 
@@ -100,41 +101,65 @@ def _drawn(mean: Tensor, sd: Tensor, turns: Tensor) -> Tensor:
 @torch.no_grad()
 def posterior_draws(net: ParameterNet, values: Values, candidates: int = CANDIDATES) -> Values:
     """u drawn from what was read and from the guide together, site by site."""
-    drawn = values.drawn()
-    others = [values.drawn() for _ in range(candidates)]
-    graph = Graph.of(values.kind, values.parent)
-    scene, nodes = drawn.scene.clone(), drawn.nodes.clone()
-    for g in range(net.scene_sites):
-        some = torch.stack([other.scene[:, g] for other in others], -1)
-        mixture = net.scene_mixture(graph, scene, g)
-        scene[:, g] = _taken(some, mixture.log_prob(some.nan_to_num(0.5).T.unsqueeze(-1)).squeeze(-1).T)
-    for s in range(net.node_sites):
-        some = torch.stack([other.nodes[..., s] for other in others], -1)
-        mixture = net.node_mixture(graph, scene, nodes, s)
-        density = torch.stack([mixture.log_prob(one.nan_to_num(0.5)) for one in some.unbind(-1)], -1)
-        nodes[..., s] = _taken(some, density)
-    return drawn._replace(scene=scene, nodes=nodes)
-
-
-def _taken(candidates: Tensor, log_weight: Tensor) -> Tensor:
-    """One of the last axis's, by weight."""
-    which = torch.distributions.Categorical(logits=log_weight).sample()
-    return candidates.gather(-1, which.unsqueeze(-1)).squeeze(-1)
+    return taken(net, values.drawn(), [values.drawn() for _ in range(candidates)])[0]
 
 
 def log_density(net: ParameterNet, values: Values) -> Tensor:
     """``(L, S + G)`` nats of the u of each site, summed over the nodes that have it, as much as each counts."""
-    graph = Graph.of(values.kind, values.parent)
-    weight, parts = 1.0 if values.weight is None else values.weight, []
+    return taken(net, values, [])[1]
+
+
+def taken(net: ParameterNet, values: Values, others: Sequence[Values]) -> tuple[Values, Tensor]:
+    """Values of which each u is that of one of the others, in proportion to the guide's density given the sites
+    before, and their ``log_density``; the values themselves where there are no others."""
+    graph, scene, nodes = Graph.of(values.kind, values.parent), values.scene.clone(), values.nodes.clone()
+    for g in range(net.scene_sites if others else 0):
+        some = torch.stack([other.scene[:, g] for other in others])
+        with torch.no_grad():
+            density = net.scene_mixture(graph, scene, g).log_prob(some.nan_to_num(0.5).unsqueeze(-1)).squeeze(-1)
+        scene[:, g] = _one_of(some, density)
+    weight, parts, sites = values.weight, [], _Sites(net, graph)
     for s in range(net.node_sites):
-        u = values.nodes[..., s]
-        found = weight * net.node_mixture(graph, values.scene, values.nodes, s).log_prob(u.nan_to_num(0.5))
-        parts.append(found.where(~u.isnan(), 0.0).sum(1))
+        given = sites.given(scene, nodes, s)
+        if others:
+            some = torch.stack([other.nodes[..., s] for other in others])
+            with torch.no_grad():
+                at = given.some.taken(some.movedim(0, -1)).movedim(-1, 0).nan_to_num(0.5)
+                density = net.chosen_mixture(given, nodes, s).log_prob(at)
+                density = given.some.put(density.movedim(0, -1)).movedim(-1, 0)
+            nodes[..., s] = _one_of(some, density)
+        at = given.some.taken(nodes[..., s : s + 1]).squeeze(-1).nan_to_num(0.5)
+        found = given.some.put(net.chosen_mixture(given, nodes, s).log_prob(at).unsqueeze(-1)).squeeze(-1)
+        parts.append((found if weight is None else weight * found).sum(1))
     for g in range(net.scene_sites):
-        u = values.scene[:, g]
-        found = net.scene_mixture(graph, values.scene, g).log_prob(u.nan_to_num(0.5)[:, None]).squeeze(1)
+        u = scene[:, g]
+        found = net.scene_mixture(graph, scene, g).log_prob(u.nan_to_num(0.5)[:, None]).squeeze(1)
         parts.append(found.where(~u.isnan(), 0.0))
-    return torch.stack(parts, 1)
+    return values._replace(scene=scene, nodes=nodes), torch.stack(parts, 1)
+
+
+def _one_of(candidates: Tensor, log_weight: Tensor) -> Tensor:
+    """One of the first axis's, by weight."""
+    which = torch.distributions.Categorical(logits=log_weight.movedim(0, -1)).sample()
+    return candidates.gather(0, which.unsqueeze(0)).squeeze(0)
+
+
+class _Sites:
+    """The sites of nodes in their order; who is alike whom in a site is found once for sites of the same nodes."""
+
+    def __init__(self, net: ParameterNet, graph: Graph):
+        self.net, self.graph = net, graph
+        self.some: Chosen | None = None
+
+    def given(self, scene: Tensor, nodes: Tensor, s: int) -> Given:
+        """What the mixtures of site ``s`` depend on."""
+        some = Chosen.of(~nodes[..., s].isnan())
+        if self.some is None or not torch.equal(self.some.has, some.has):
+            self.some, self.siblings, self.ties, self.next = some, some.siblings(self.graph), None, 0
+        own = some.taken(nodes.where(torch.arange(nodes.shape[2]) < s, torch.nan))
+        self.ties = self.net.mates.ties(self.siblings, own, self.ties, self.next)
+        self.next = s
+        return self.net.given(self.graph, scene, nodes, s, some, self.ties)
 
 
 class MaximumLikelihood(StepTraining):
@@ -166,8 +191,8 @@ class MaximumLikelihood(StepTraining):
     def loss(self) -> Tensor:
         """See ``StepTraining``."""
         some = self.values.of(torch.randperm(len(self.values.kind))[: self._number()])
-        drawn = some.drawn() if self.done < ALONE * self.total else posterior_draws(self.net, some)
-        return -log_density(self.net, drawn).sum(1).mean()
+        candidates = 0 if self.done < ALONE * self.total else CANDIDATES
+        return -taken(self.net, some.drawn(), [some.drawn() for _ in range(candidates)])[1].sum(1).mean()
 
     def _number(self) -> int:
         """Images a step: fewer where each has many values."""

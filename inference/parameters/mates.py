@@ -41,16 +41,22 @@ class Mates(nn.Module):
         super().__init__()
         self.read = nn.Linear(2 * max(1, sites) * FEATURES, hidden)
 
-    def ties(self, together: Tensor, own: Tensor) -> Ties:
+    def ties(self, together: Tensor, own: Tensor, before: Ties | None = None, first: int = 0) -> Ties:
         """Of nodes of which some sites are known.
 
         Args:
             together: ``(N, M, M)`` bool, who is whose sibling, itself included.
             own: ``(N, M, S)`` u, NaN where they are not known.
+            before: of these nodes in the sites before number ``first``; nobody's where None.
+            first: the first site that is looked at.
         """
         ways, (N, M, S) = 2 * max(1, own.shape[2]), own.shape
-        place, last = own.new_zeros(N, M, ways, 4), torch.full((N, M, ways), -1)
+        if before is None:
+            place, last = own.new_zeros(N, M, ways, 4), torch.full((N, M, ways), -1)
+        else:
+            place, last = before.place.unflatten(2, (ways, 4)).clone(), before.last.clone()
         sites = (~own.isnan()).any(1).any(0).nonzero().flatten()  # of the others nothing is known
+        sites = sites[sites >= first]
         at_once = max(1, PAIRS // max(1, M**2 * max(1, len(sites))))
         parts = zip(together.split(at_once), own[..., sites].split(at_once), strict=True)
         columns = torch.cat([sites, sites + S])

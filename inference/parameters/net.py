@@ -81,14 +81,21 @@ class ParameterNet(nn.Module):
             scene: ``(N, G)`` u, NaN where they are not known.
             values: ``(N, M, S)`` u, NaN where there are none; those of later sites are not looked at.
         """
-        some = Chosen.of(~values[..., s].isnan())
-        given = self._given(graph, scene, values, s, some)
-        u = some.taken(values[..., s : s + 1]).where(some.there.unsqueeze(-1), torch.nan)
+        given = self.given(graph, scene, values, s, Chosen.of(~values[..., s].isnan()))
+        return LogisticMixture.of(given.some.put(self._raw_of(given, values, s)))
+
+    def chosen_mixture(self, given: "Given", values: Tensor, s: int) -> LogisticMixture:
+        """``node_mixture`` of the chosen nodes alone, ``(N, R)``."""
+        return LogisticMixture.of(self._raw_of(given, values, s))
+
+    def _raw_of(self, given: "Given", values: Tensor, s: int) -> Tensor:
+        """``(N, R, 3 K)``, from what is given and the values of site ``s`` of the nodes before each."""
+        u = given.some.taken(values[..., s : s + 1]).where(given.some.there.unsqueeze(-1), torch.nan)
         place = given.place + self.mates(given.ties.place, given.ties.last, u[..., 0])
         for number, index in enumerate((given.parent, given.before)):
             place = place + self._of_one(self.of_values, number + 1, gathered(u, index), s)
         states, _ = self.cell(F.silu(given.entering + self._of_one(self.read, 0, u, s)))
-        return LogisticMixture.of(some.put(self._raw(place, F.pad(states, (0, 0, 1, 0))[:, :-1], s)))
+        return self._raw(place, F.pad(states, (0, 0, 1, 0))[:, :-1], s)
 
     def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
         """u of the nodes' site number ``s``, ``(N, M)``, at the quantiles ``v (N, M)``, one node after the other.
@@ -98,7 +105,7 @@ class ParameterNet(nn.Module):
             has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
         """
         some = Chosen.of(has)
-        given = self._given(graph, scene, values, s, some)
+        given = self.given(graph, scene, values, s, some)
         u = v.new_full((*some.index.shape, 1), torch.nan)  # parents and siblings before come earlier
         at, memory = v.gather(1, some.index), v.new_zeros(len(v), self.cell.hidden_size)
         w: Any = self.cell  # torch names its weights as it makes them
@@ -134,8 +141,17 @@ class ParameterNet(nn.Module):
             torch.stack(nodes, 2).where(~values.isnan(), torch.nan) if nodes else values,
         )
 
-    def _given(self, graph: Graph, scene: Tensor, values: Tensor, s: int, some: "Chosen") -> "Given":
-        """What some nodes' mixtures depend on, without the values of site ``s`` itself."""
+    def given(
+        self, graph: Graph, scene: Tensor, values: Tensor, s: int, some: "Chosen", ties: Ties | None = None
+    ) -> "Given":
+        """What some nodes' mixtures depend on, without the values of site ``s`` itself.
+
+        Args:
+            graph, scene, values: as of ``node_mixture``.
+            s: number of the site.
+            some: the nodes.
+            ties: theirs in the sites before, as ``ties`` finds them where None.
+        """
         known = values.where(torch.arange(self.node_sites) < s, torch.nan)
         own, kind = some.taken(known), graph.kind.gather(1, some.index)
         nodes = (graph.parent.gather(1, some.index), graph.before.gather(1, some.index))
@@ -143,14 +159,13 @@ class ParameterNet(nn.Module):
         share = some.taken(graph.together) / graph.number.gather(1, some.index).clamp(min=1).unsqueeze(-1)
         place = self.of_values(around) + self.of_siblings(share.to(own.dtype) @ code(known))
         start = self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s]
-        together = some.taken(graph.together).gather(2, some.index.unsqueeze(1).expand(-1, some.index.shape[1], -1))
-        together = together & (some.there.unsqueeze(1) & some.there.unsqueeze(2))
         return Given(
+            some,
             some.taken(self._place(graph, scene, s)) + place,
             self.read(torch.cat([start, code(own)], -1)),
             some.number(nodes[0]),
             some.number(nodes[1]),
-            self.mates.ties(together, own),
+            self.mates.ties(some.siblings(graph), own) if ties is None else ties,
         )
 
     def _of_one(self, layer: nn.Linear, part: int, u: Tensor, s: int) -> Tensor:
@@ -214,6 +229,11 @@ class Chosen(NamedTuple):
         place = (self.has.cumsum(1) - 1).where(self.has, -1).gather(1, node.clamp(min=0))
         return place.where((node >= 0) & self.there, -1)
 
+    def siblings(self, graph: Graph) -> Tensor:
+        """``(N, R, R)`` bool, who is whose sibling among them, itself included."""
+        together = self.taken(graph.together).gather(2, self.index.unsqueeze(1).expand(-1, self.index.shape[1], -1))
+        return together & (self.there.unsqueeze(1) & self.there.unsqueeze(2))
+
     def put(self, part: Tensor) -> Tensor:
         """``(N, M, D)`` of ``(N, R, D)``; 0 for the others."""
         place = (self.has.cumsum(1) - 1).clamp(min=0).unsqueeze(-1).expand(-1, -1, part.shape[2])
@@ -224,12 +244,14 @@ class Given(NamedTuple):
     """Of the nodes that have a site.
 
     Attributes:
+        some: which nodes they are.
         place: ``(N, R, H)`` of the mixture.
         entering: ``(N, R, H)`` of the GRU.
         parent, before: ``(N, R)`` int64 which of them; -1 for none.
         ties: see ``Mates``.
     """
 
+    some: "Chosen"
     place: Tensor
     entering: Tensor
     parent: Tensor
