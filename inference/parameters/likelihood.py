@@ -101,33 +101,33 @@ def _drawn(mean: Tensor, sd: Tensor, turns: Tensor) -> Tensor:
 @torch.no_grad()
 def posterior_draws(net: ParameterNet, values: Values, candidates: int = CANDIDATES) -> Values:
     """u drawn from what was read and from the guide together, site by site."""
-    return taken(net, values.drawn(), [values.drawn() for _ in range(candidates)])[0]
+    return draws_and_density(net, values.drawn(), [values.drawn() for _ in range(candidates)])[0]
 
 
 def log_density(net: ParameterNet, values: Values) -> Tensor:
     """``(L, S + G)`` nats of the u of each site, summed over the nodes that have it, as much as each counts."""
-    return taken(net, values, [])[1]
+    return draws_and_density(net, values, [])[1]
 
 
-def taken(net: ParameterNet, values: Values, others: Sequence[Values]) -> tuple[Values, Tensor]:
+def draws_and_density(net: ParameterNet, values: Values, others: Sequence[Values]) -> tuple[Values, Tensor]:
     """Values of which each u is that of one of the others, in proportion to the guide's density given the sites
     before, and their ``log_density``; the values themselves where there are no others."""
     graph, scene, nodes = Graph.of(values.kind, values.parent), values.scene.clone(), values.nodes.clone()
     for g in range(net.scene_sites if others else 0):
-        some = torch.stack([other.scene[:, g] for other in others])
+        some = torch.stack([other.scene[:, g] for other in others], -1)
         with torch.no_grad():
-            density = net.scene_mixture(graph, scene, g).log_prob(some.nan_to_num(0.5).unsqueeze(-1)).squeeze(-1)
+            mixture = net.scene_mixture(graph, scene, g)
+            density = mixture.log_prob(some.nan_to_num(0.5).T.unsqueeze(-1)).squeeze(-1).T
         scene[:, g] = _one_of(some, density)
     weight, parts, sites = values.weight, [], _Sites(net, graph)
     for s in range(net.node_sites):
         given = sites.given(scene, nodes, s)
         if others:
-            some = torch.stack([other.nodes[..., s] for other in others])
+            some = torch.stack([other.nodes[..., s] for other in others], -1)
+            at = given.some.taken(some).nan_to_num(0.5).movedim(-1, 0)
             with torch.no_grad():
-                at = given.some.taken(some.movedim(0, -1)).movedim(-1, 0).nan_to_num(0.5)
-                density = net.chosen_mixture(given, nodes, s).log_prob(at)
-                density = given.some.put(density.movedim(0, -1)).movedim(-1, 0)
-            nodes[..., s] = _one_of(some, density)
+                density = net.chosen_mixture(given, nodes, s).log_prob(at).movedim(0, -1)
+            nodes[..., s] = _one_of(some, given.some.put(density))
         at = given.some.taken(nodes[..., s : s + 1]).squeeze(-1).nan_to_num(0.5)
         found = given.some.put(net.chosen_mixture(given, nodes, s).log_prob(at).unsqueeze(-1)).squeeze(-1)
         parts.append((found if weight is None else weight * found).sum(1))
@@ -139,9 +139,9 @@ def taken(net: ParameterNet, values: Values, others: Sequence[Values]) -> tuple[
 
 
 def _one_of(candidates: Tensor, log_weight: Tensor) -> Tensor:
-    """One of the first axis's, by weight."""
-    which = torch.distributions.Categorical(logits=log_weight.movedim(0, -1)).sample()
-    return candidates.gather(0, which.unsqueeze(0)).squeeze(0)
+    """One of the last axis's, by weight."""
+    which = torch.distributions.Categorical(logits=log_weight).sample()
+    return candidates.gather(-1, which.unsqueeze(-1)).squeeze(-1)
 
 
 class _Sites:
@@ -191,8 +191,9 @@ class MaximumLikelihood(StepTraining):
     def loss(self) -> Tensor:
         """See ``StepTraining``."""
         some = self.values.of(torch.randperm(len(self.values.kind))[: self._number()])
-        candidates = 0 if self.done < ALONE * self.total else CANDIDATES
-        return -taken(self.net, some.drawn(), [some.drawn() for _ in range(candidates)])[1].sum(1).mean()
+        drawn, candidates = some.drawn(), 0 if self.done < ALONE * self.total else CANDIDATES
+        others = [some.drawn() for _ in range(candidates)]
+        return -draws_and_density(self.net, drawn, others)[1].sum(1).mean()
 
     def _number(self) -> int:
         """Images a step: fewer where each has many values."""

@@ -204,3 +204,12 @@ def test_ties_of_many_scenes_are_those_of_each(monkeypatch):
     monkeypatch.setattr(module, "PAIRS", 1)
     for one, other in zip(whole, mates.ties(together, own), strict=True):
         assert torch.equal(one, other)
+
+
+def test_ties_of_later_sites_are_added_to_those_before():
+    torch.manual_seed(0)
+    mates, own = Mates(3, 8), torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
+    together = Graph.of(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).together
+    before = mates.ties(together, own.where(torch.arange(3) < 1, torch.nan))
+    for one, other in zip(mates.ties(together, own), mates.ties(together, own, before, 1), strict=True):
+        assert torch.equal(one, other)

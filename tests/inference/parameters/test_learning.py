@@ -5,6 +5,7 @@ from functools import partial
 import pytest
 import torch
 from scipy.stats import kstest
+from torch.distributions import Categorical
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
@@ -58,6 +59,42 @@ def test_the_error_of_readings_is_taken_out():
     MaximumLikelihood(net, values, steps=300, images=100, learning_rate=1e-2).run()
     spread = posterior_draws(net, values, 16).nodes.std(0).mean()
     assert float(values.drawn().nodes.std(0).mean()) > 0.13 and float(spread) < 0.085
+
+
+def test_density_and_draws_are_those_of_one_site_after_the_other():
+    """Sites of some nodes each; a slow twin asks for each mixture anew, of all nodes and one candidate at a time."""
+    torch.manual_seed(0)
+    net, kind = ParameterNet(2, 5, 1, hidden=8), torch.randint(0, 2, (30, 6)).sort(1).values
+    for part in net.parameters():
+        torch.nn.init.normal_(part, 0, 0.4)
+    has = torch.stack([kind == 0, kind == 0, kind == 1, kind >= 0, kind >= 0], -1)
+    mean = torch.rand(30, 6, 5).where(has, torch.nan)
+    sds = torch.full((30, 6, 5), 0.2), torch.full((30, 1), 0.2)
+    values = Values(kind, torch.full_like(kind, -1), mean, sds[0], torch.rand(30, 1), sds[1], torch.zeros(6) > 0)
+    graph = Graph.of(kind, values.parent)
+
+    def taken(candidates, log_weight):
+        return candidates.gather(-1, Categorical(logits=log_weight).sample().unsqueeze(-1)).squeeze(-1)
+
+    torch.manual_seed(1)
+    drawn, others = values.drawn(), [values.drawn() for _ in range(4)]
+    scene, nodes, density = drawn.scene.clone(), drawn.nodes.clone(), []
+    with torch.no_grad():
+        each = [other.scene[:, 0] for other in others]
+        of_scene = net.scene_mixture(graph, scene, 0)
+        scene[:, 0] = taken(torch.stack(each, -1), torch.cat([of_scene.log_prob(u[:, None]) for u in each], -1))
+        for s in range(5):
+            each, mixture = [other.nodes[..., s] for other in others], net.node_mixture(graph, scene, nodes, s)
+            nodes[..., s] = taken(
+                torch.stack(each, -1), torch.stack([mixture.log_prob(u.nan_to_num(0.5)) for u in each], -1)
+            )
+            found = net.node_mixture(graph, scene, nodes, s).log_prob(nodes[..., s].nan_to_num(0.5))
+            density.append(found.where(has[..., s], 0.0).sum(1))
+        density.append(of_scene.log_prob(scene)[:, 0])
+        torch.manual_seed(1)
+        again = posterior_draws(net, values, 4)
+        assert torch.equal(again.scene, scene) and torch.equal(again.nodes.nan_to_num(-1), nodes.nan_to_num(-1))
+        assert torch.allclose(log_density(net, again), torch.stack(density, 1), atol=1e-4)
 
 
 def test_a_node_that_counts_double_is_as_good_as_two():
@@ -197,9 +234,7 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
     def begun():
         torch.manual_seed(0)
         counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
-        return ParameterLearning(
-            trays, trays.prior, RenderEye(counts), label, lambda: images, schedule, settle=settle
-        )
+        return ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule, settle=settle)
 
     asked, kept, suited = [], [], ParameterGuide.suited
 
