@@ -33,8 +33,8 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
             }
 
     images = dict.fromkeys(("learnt", "prior", "target"), torch.zeros(0))
-    assert judged.passed(Learning(), images, careful=True) == {"y", "z", "w"}
-    assert judged.passed(Learning(), images, careful=False) == {"w"}
+    assert judged.passed(Learning(), Learning().site_rows(images), careful=True) == {"y", "z", "w"}
+    assert judged.passed(Learning(), Learning().site_rows(images), careful=False) == {"w"}
 
 
 class Renders:
@@ -92,7 +92,7 @@ def test_of_many_sites_none_is_learnt_by_chance():
             return nothing | {"x": {name: rows(float(name == "prior"), 120) for name in images}}
 
     images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert judged.passed(Learning(), images, careful=True) == {f"n{i}" for i in range(40)}
+    assert judged.passed(Learning(), Learning().site_rows(images), careful=True) == {f"n{i}" for i in range(40)}
 
 
 @pytest.mark.parametrize(

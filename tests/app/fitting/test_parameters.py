@@ -246,13 +246,14 @@ def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
     anything_is_read(monkeypatch)
     monkeypatch.setattr(parameters, "JUDGED", 5)
     monkeypatch.setattr(parameters, "DOUBTFUL", 7)
-    looked_at = []
+    looked_at, site_rows = [], parameters.ParameterLearning.site_rows
 
-    def passed(learning, images, careful):
+    def noted(learning, images):
         looked_at.append({name: len(some) for name, some in images.items()})
-        return frozenset()
+        return site_rows(learning, images)
 
-    monkeypatch.setattr(judged, "passed", passed)
+    monkeypatch.setattr(parameters.ParameterLearning, "site_rows", noted)
+    monkeypatch.setattr(judged, "passed", lambda *_: frozenset())
     settings = (*discs.settings, *LEARN, "--set", f"parameters.sure={str(sure).lower()}")
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *settings)
     assert done.code == 0, done.err

@@ -126,20 +126,26 @@ def settling(
     sure = run.preset.parameters.sure
 
     @cache
-    def constant(many: bool) -> tuple[dict[str, Tensor], dict[str, Features]]:
-        """Images of the target and of the prior, which stay as they are, and their looks where these are asked."""
+    def constant(many: bool) -> dict[str, Tensor]:
+        """Images of the target and of the prior, which stay as they are."""
         images = {"target": held(many)}
-        images["prior"] = _compared(run, run.model, guide, len(images["target"]), "prior")
-        return images, {} if sure else {name: look(some) for name, some in images.items()}
+        return images | {"prior": _compared(run, run.model, guide, len(images["target"]), "prior")}
+
+    @cache
+    def constant_looks() -> dict[str, Features]:
+        return {name: look(some) for name, some in constant(False).items()}
 
     def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
         assert learning.guide is not None
-        images, looks = constant(last and sure)
+        images = constant(last and sure)
         learnt = _compared(run, learning.guide.suited(run.model), guide, len(images["target"]), "learnt")
-        if sure:
-            return passed(learning, images | {"learnt": learnt}, True)
+        read = learning.site_rows(images | {"learnt": learnt})
+        named = passed(learning, read, True)
+        if sure or not named:  # what is passed where one is not careful is a part of it
+            return named
+        looks = constant_looks()
         apart = farther(look(learnt), looks["prior"], looks["target"])
-        return needless(learning, passed(learning, images | {"learnt": learnt}, apart.one >= apart.other))
+        return needless(learning, named if apart.one >= apart.other else passed(learning, read, False))
 
     look = _embed()
     return settled
@@ -157,12 +163,18 @@ def needless(learning: ParameterLearning, names: frozenset[str]) -> frozenset[st
     return frozenset(name for name, found in without.items() if not farther(found, looks, held.real).sure)
 
 
-def passed(learning: ParameterLearning, images: dict[str, Tensor], careful: bool) -> frozenset[str]:
+def passed(
+    learning: ParameterLearning, read: dict[str, dict[str, tuple[Tensor, Tensor]]], careful: bool
+) -> frozenset[str]:
     """Sites that keep their prior, of those that are read well, by what is read in learnt renders, in the prior's and
-    in the target: those of which learnt renders are surely farther from the target; where one is careful, those of
+    in the target: those of which learnt renders are surely farther from the target; where one is careful, all of
     which they are not surely nearer, as there is nothing to be learnt of them, or it was not. They keep to the chance
-    of a mistake together that one comparison has: with thirty of them, three would be nearer by chance."""
-    clear = {name: of for name, of in learning.site_rows(images).items() if name not in learning.tried.unclear}
+    of a mistake together that one comparison has: with thirty of them, three would be nearer by chance.
+
+    Args:
+        read: of ``"learnt"``, ``"prior"`` and ``"target"``, see ``ParameterLearning.site_rows``.
+    """
+    clear = {name: of for name, of in read.items() if name not in learning.tried.unclear}
     chance = (1 - SURE) / max(1, len(clear))
 
     def passes(of: dict[str, tuple[Tensor, Tensor]]) -> bool:
