@@ -150,7 +150,7 @@ class ParameterNet(nn.Module):
             graph, scene, values: as of ``node_mixture``.
             s: number of the site.
             some: the nodes.
-            ties: theirs in the sites before, as ``ties`` finds them where None.
+            ties: see ``Mates``; found here where None.
         """
         known = values.where(torch.arange(self.node_sites) < s, torch.nan)
         own, kind = some.taken(known), graph.kind.gather(1, some.index)
