@@ -13,9 +13,9 @@ KEPT, USUAL = 1 << 30, 32 << 20  # bytes; the latter is what glibc comes to by i
 def freed_memory_kept() -> Iterator[None]:
     """Memory that is freed inside stays with the process, and is given back afterwards.
 
-    A step of training frees maps of tens of megabytes and asks for as many. glibc gives each of them back to the
-    system, which clears every page anew: a third of the time of a convolution. Nothing changes where the C library is
-    another one.
+    What a network computes of a batch of images takes tens of megabytes, again and again. glibc gives blocks of that
+    size back to the system at once, which then clears every page anew. Nothing changes where the C library is another
+    one.
     """
     settings = _settings()
     if settings is None:
