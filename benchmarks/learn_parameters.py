@@ -35,6 +35,7 @@ from probscene.app.fitting.preset import LIKELIHOOD
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.storage import timing
 from probscene.app.loading import renderer_for
+from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.judging.image_metrics import Figure, kid
@@ -134,6 +135,7 @@ def main():
     parser.add_argument("--parameters", nargs="+", default=[LIKELIHOOD], help="ways of learning them")
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
     args = parser.parse_args()
+    keep_freed_memory()
     args.mnist = needed_mnist(args.mnist)
     rows = []
     for target in args.targets:

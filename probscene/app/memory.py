@@ -15,5 +15,5 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):  # no glibc
         return
-    for option, size in ((MAP, 2**25), (TRIM, 2**29), (PAD, 2**25)):
+    for option, size in ((MAP, 2**25), (MAP, 2**30), (TRIM, 2**29), (PAD, 2**25)):  # an old glibc takes 2**25 at most
         mallopt(option, size)

@@ -15,7 +15,6 @@ from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.image_array import ImageArray
 from probscene.inference.features.base import Features
 from probscene.inference.training import batch_seed
-from probscene.memory import freed_memory_kept
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 from probscene.threads import default_threads
@@ -205,8 +204,7 @@ def carry_out(
     """
     before = timing(run)
     try:
-        with freed_memory_kept():
-            fit(run, show, target, cache, use_cache, show.say, run.few, cluster)
+        fit(run, show, target, cache, use_cache, show.say, run.few, cluster)
     finally:
         spent = {stage: before.get(stage, 0.0) + show.seconds.get(stage, 0.0) for stage in STAGES}
         write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
