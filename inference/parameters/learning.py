@@ -207,7 +207,7 @@ class ParameterLearning:
             own, scenes, rate = partial(self._own, made), schedule.energy_scenes, schedule.energy_rate
             return EnergyDistance(guide.net, values, own, self.tried.noisy, steps, scenes, rate, seed)
         rate = schedule.rate if first else 0.6 * schedule.rate
-        return MaximumLikelihood(guide.net, values, steps, learning_rate=rate, seed=seed)
+        return MaximumLikelihood(guide.net, values, steps, schedule.step_images, rate, seed)
 
     @property
     def _idle(self) -> bool:

@@ -16,6 +16,7 @@ class ParameterSchedule:
         reader_steps: of the reader's first training, on renders of the prior.
         scene_renders: from which sites of scenes are learnt to be read then; for models that have such sites.
         steps: of maximum likelihood on what is read first.
+        step_images: of the target that each step of it looks at, at most.
         rounds: of training the reader further on the guide's own renders, reading again and learning again.
         round_reader_steps, round_scene_renders, round_steps: of each.
         energy_steps, energy_scenes: of the energy distance then, and renders a step.
@@ -31,6 +32,7 @@ class ParameterSchedule:
     reader_steps: int = 600
     scene_renders: int = 4096
     steps: int = 500
+    step_images: int = 200
     rounds: int = 2
     round_reader_steps: int = 250
     round_scene_renders: int = 1536
