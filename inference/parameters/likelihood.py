@@ -98,20 +98,18 @@ def _drawn(mean: Tensor, sd: Tensor, turns: Tensor) -> Tensor:
     return torch.where(turns, circle, line).clamp(NEAR, 1 - NEAR)
 
 
-@torch.no_grad()
-def posterior_draws(net: ParameterNet, values: Values, candidates: int = CANDIDATES) -> Values:
-    """u drawn from what was read and from the guide together, site by site."""
-    return draws_and_density(net, values.drawn(), [values.drawn() for _ in range(candidates)])[0]
-
-
 def log_density(net: ParameterNet, values: Values) -> Tensor:
     """``(L, S + G)`` nats of the u of each site, summed over the nodes that have it, as much as each counts."""
     return draws_and_density(net, values, [])[1]
 
 
 def draws_and_density(net: ParameterNet, values: Values, others: Sequence[Values]) -> tuple[Values, Tensor]:
-    """Values of which each u is that of one of the others, in proportion to the guide's density given the sites
-    before, and their ``log_density``; the values themselves where there are no others."""
+    """u drawn from what was read and from the guide together, site by site, and its ``log_density (L, S + G)``.
+
+    Args:
+        values: u drawn from what was read alone; they are the draws where there are no others.
+        others: more such draws, of which each u is one, in proportion to the guide's density given the sites before.
+    """
     graph, scene, nodes = Graph.of(values.kind, values.parent), values.scene.clone(), values.nodes.clone()
     for g in range(net.scene_sites if others else 0):
         some = torch.stack([other.scene[:, g] for other in others], -1)

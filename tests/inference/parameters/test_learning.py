@@ -13,7 +13,7 @@ from probscene.inference.parameters.best import HeldOut
 from probscene.inference.parameters.graph import Graph
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
-from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, log_density, posterior_draws
+from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, draws_and_density, log_density
 from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.reading import missing, reader
 from probscene.inference.parameters.reading.eyes import RenderEye
@@ -31,6 +31,11 @@ def rows(number=300, sd=0.01, noise=0.0, seed=0):
     both = torch.stack([even, torch.full((number, 3), 0.4)], -1) + noise * torch.randn(number, 3, 2)
     none = torch.zeros(number, 0)
     return Values(kind, parent, both, torch.full_like(both, sd), none, none, torch.zeros(2, dtype=torch.bool))
+
+
+@torch.no_grad()
+def posterior_draws(net, values, candidates):
+    return draws_and_density(net, values.drawn(), [values.drawn() for _ in range(candidates)])[0]
 
 
 def test_what_was_read_is_learnt():
