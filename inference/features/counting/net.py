@@ -117,11 +117,7 @@ class CountNet(nn.Module):
         If there are groups, three more channels: the logit that a cell shows a group, how many cells away that group's
         middle is, and how many that of the group of the object that the cell holds.
         """
-        if self.channels > 1:
-            return self.body(x.contiguous(memory_format=torch.channels_last))
-        first = self.body[0]
-        assert isinstance(first, nn.Conv2d)
-        return self.body[1:](_halve(x, first.weight))
+        return layers(self.body, x)
 
     def enter(self, images: Tensor) -> Tensor:
         """Reduced images with a clear border, padded to whole cells."""
@@ -182,6 +178,15 @@ def toward_whole(counts: Tensor) -> Tensor:
     whose errors are far below one half. It makes others worse, as readings near a whole number become alike.
     """
     return counts - torch.sin(2 * math.pi * counts) / (2 * math.pi)
+
+
+def layers(body: nn.Sequential, x: Tensor) -> Tensor:
+    """What a body, or its first layers, make of reduced images ``x (N, C, 8h, 8w)``."""
+    if x.shape[1] > 1:
+        return body(x.contiguous(memory_format=torch.channels_last))
+    first = body[0]
+    assert isinstance(first, nn.Conv2d)
+    return body[1:](_halve(x, first.weight))
 
 
 def _halve(x: Tensor, weight: Tensor) -> Tensor:

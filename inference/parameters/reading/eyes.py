@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ...features.base import FeatureNet, enter
 from ...features.counting.batches import images_a_step
-from ...features.counting.net import CountNet, conv
+from ...features.counting.net import CountNet, conv, layers
 
 if TYPE_CHECKING:
     from ...features.photographs.heads import PretrainedCountNet
@@ -78,7 +78,7 @@ class RenderEye(Eye):
 
     def forward(self, x: Tensor) -> Tensor:
         """See ``Eye``."""
-        fine = self.fine(x.contiguous(memory_format=torch.channels_last))
+        fine = layers(self.fine, x)
         coarse = F.interpolate(self.down(self.coarse(fine)), scale_factor=2, mode="nearest")
         return self.both(self.side(fine) + coarse)
 

@@ -44,6 +44,17 @@ def test_what_is_found_does_not_depend_on_the_other_images(kind):
     assert torch.allclose(alone.overall[0], together.overall[3], atol=1e-4)
 
 
+@pytest.mark.parametrize("training", [False, True])
+def test_grey_images_are_seen_by_the_layers_themselves(training):
+    torch.manual_seed(0)
+    net = CountNet(CLASSES, 1, (96, 128), width=(4, 8, 8))
+    eye = RenderEye(net).train(training)
+    x = eye.enter(torch.randint(0, 256, (3, 1, 96, 128), dtype=torch.uint8))
+    fine = eye.fine(x)
+    coarse = torch.nn.functional.interpolate(eye.down(eye.coarse(fine)), scale_factor=2)
+    assert torch.allclose(eye(x), eye.both(eye.side(fine) + coarse), atol=1e-4)
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 def test_colours_are_those_of_each_cell(channels):
     images = torch.randint(0, 256, (2, channels, 24, 32), dtype=torch.uint8)
