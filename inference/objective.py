@@ -182,7 +182,7 @@ class ScoreFunction:
     ) -> tuple[Derivation, Tensor, Tensor, float]:
         """Scenes of the guide, their features and costs, and the mean number of failed attempts."""
         derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps)
-        features = self.observe(run_program(model, derivation, failures=failures))
+        features = self.observe(run_program(model, derivation, failures=failures, density=False))
         cost = self.divergence(features, real)
         if self.prior is not None and self.prior_kl_weight:
             away = guide.log_prob(derivation) - self.prior.log_prob(derivation)

@@ -3,11 +3,13 @@
 Axis letters: N scenes, M nodes.
 """
 
+import random
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
 import pyro
 import torch
 from pyro import poutine
@@ -32,7 +34,7 @@ class Scenes:
         derivation: their structures T.
         parameters: alpha, the values of the program's other sites, each ``(N, M)``, ``(N, 1)`` or with an event tail.
         site_mask: where each parameter exists, the mask of its site, ``(N, M)`` or ``(N, 1)`` bool.
-        log_prob: ``(N,)`` log q(alpha | T).
+        log_prob: ``(N,)`` log q(alpha | T); NaN where it was not asked for.
         drawing: what to render.
         failures: ``(N,)`` failed attempts at a complete derivation; zeros if the derivations were given.
     """
@@ -56,16 +58,19 @@ class Scenes:
         )
 
 
-def sample(model: SceneModel, policy: Policy, num_scenes: int) -> Scenes:
+def sample(model: SceneModel, policy: Policy, num_scenes: int, density: bool = True) -> Scenes:
     """Scenes with complete structures from ``policy`` and parameters from the model's program, or from that of
     ``policy.suits``.
+
+    Args:
+        density: whether their ``log_prob`` is asked for; of learnt parameters it takes as long as drawing them.
 
     Raises:
         SamplingError: the policy hardly ever ends within the model's ``max_steps``.
         ModelError: see ``run_program``.
     """
     derivation, failures = derive_complete(model.grammar, policy, num_scenes, model.max_steps)
-    return run_program(model if policy.suits is None else policy.suits(model), derivation, failures=failures)
+    return run_program(model if policy.suits is None else policy.suits(model), derivation, None, failures, density)
 
 
 def run_program(
@@ -73,6 +78,7 @@ def run_program(
     derivation: Derivation,
     parameters: dict[str, Tensor] | None = None,
     failures: Tensor | None = None,
+    density: bool = True,
 ) -> Scenes:
     """Run a model's program on given derivations, and on given parameters where there are any.
 
@@ -81,6 +87,7 @@ def run_program(
     Args:
         model: a scene model, or a Pyro program that is called with the number of scenes.
         derivation: complete derivations.
+        density: see ``sample``.
 
     Raises:
         ModelError: a derivation that is not complete; the program raises an error, which is told with the line that it
@@ -107,7 +114,7 @@ def run_program(
         )
     check_nodes(name, drawing, derivation.trimmed())
     values, site_mask = {}, {}
-    log_prob = torch.zeros(N)
+    log_prob = torch.zeros(N) if density else torch.full((N,), torch.nan)
     for key, site in cast(dict[str, Any], trace.nodes).items():
         if site["type"] != "sample" or key in sites or site_is_subsample(site):
             continue
@@ -117,10 +124,11 @@ def run_program(
                 f"Expected site {key!r} of model {name!r} inside the scenes plate, shape ({N}, nodes), "
                 f"actual {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
             )
-        logp = _site_log_prob(name, key, site)
-        mask = torch.ones(logp.shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(logp.shape)
+        shape = site["fn"].batch_shape
+        mask = torch.ones(shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(shape)
         values[key], site_mask[key] = value, mask
-        log_prob = log_prob + logp.where(mask, 0.0).sum(-1)
+        if density:
+            log_prob = log_prob + _site_log_prob(name, key, site).where(mask, 0.0).sum(-1)
     return Scenes(
         derivation,
         values,
@@ -170,5 +178,11 @@ def log_prob(policy: Policy, scenes: Scenes) -> Tensor:
 
 
 def seed_everything(seed: int) -> None:
-    """Seed torch, numpy and ``random`` through Pyro."""
-    pyro.set_rng_seed(seed)
+    """Seed torch, numpy and ``random``, as ``pyro.set_rng_seed`` does."""
+    if torch.cuda.is_available():
+        pyro.set_rng_seed(seed)
+        return
+    # Without CUDA torch.manual_seed takes down the whole stack each time, for when there is one.
+    torch.default_generator.manual_seed(seed)
+    random.seed(seed)
+    np.random.seed(seed)

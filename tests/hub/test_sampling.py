@@ -1,8 +1,10 @@
 """log q(T, alpha) of a small program, against scipy."""
 
 import importlib
+import random
 from dataclasses import replace
 
+import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
@@ -89,6 +91,28 @@ def test_the_same_parameters_make_the_same_scenes(seed):
     fresh = run_program(MODEL, scenes.derivation, {"plate.x": scenes.parameters["plate.x"]})
     assert torch.equal(fresh.drawing.layers[0].x, scenes.drawing.layers[0].x)
     assert not torch.equal(fresh.parameters["light"], scenes.parameters["light"])
+
+
+@given(st.integers(0, 2**31))
+def test_without_a_density_the_scenes_are_the_same(seed):
+    seed_everything(seed)
+    scenes = sample(MODEL, PRIOR, 5)
+    seed_everything(seed)
+    same = sample(MODEL, PRIOR, 5, density=False)
+    assert same.log_prob.shape == (5,) and same.log_prob.isnan().all()
+    for name, value in scenes.parameters.items():
+        assert torch.equal(same.parameters[name], value) and torch.equal(same.site_mask[name], scenes.site_mask[name])
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_seed_is_that_of_pyro(seed):
+    def drawn():
+        return torch.rand(2).tolist(), np.random.rand(2).tolist(), random.random()
+
+    pyro.set_rng_seed(seed)
+    expected = drawn()
+    seed_everything(seed)
+    assert drawn() == expected
 
 
 def test_parameters_count_where_their_nodes_are():

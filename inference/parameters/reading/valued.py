@@ -44,7 +44,7 @@ class ValuedRenders:
         if arranged:
             names = frozenset(site.name for site in self.node_sites)
             model = within(model, Arranged(model.grammar, names, arranged))
-        return self.of(sample(model, policy, num))
+        return self.of(sample(model, policy, num, density=False))
 
     def of(self, scenes: Scenes) -> Valued:
         """Of scenes of the model, whatever drew their parameters.

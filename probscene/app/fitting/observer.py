@@ -152,7 +152,7 @@ class Observer:
             again = (best < 1).nonzero().flatten()  # nothing is clearer than what is whole
             if not len(again):
                 break
-            batch = self.render(run_program(self.model, derivation[again]).drawing)
+            batch = self.render(run_program(self.model, derivation[again], density=False).drawing)
             least = self._least_visible(batch)
             better = least > best[again]
             image[again[better]], best[again[better]] = batch.image[better], least[better]

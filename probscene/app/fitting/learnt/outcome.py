@@ -62,7 +62,7 @@ def conclude(
         draws = 1 if policy.suits else run.preset.draws_per_structure
         observe, parts, counts = observer.observe(net, draws), [], []
         for first in range(0, number, RENDERED_AT_ONCE):
-            scenes = sample(run.model, policy, min(RENDERED_AT_ONCE, number - first))
+            scenes = sample(run.model, policy, min(RENDERED_AT_ONCE, number - first), density=False)
             parts.append(observe(scenes))
             counts.append(scenes.derivation.counts(len(run.model.grammar.kinds)))
             progress("outcome", i * number + first + len(parts[-1]), 2 * number, "")
