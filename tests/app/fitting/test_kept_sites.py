@@ -112,13 +112,14 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
 
     torch.manual_seed(0)
     real = torch.randn(140, 4).numpy()
+    ways = torch.randn(140, 4).numpy()
 
     def looks(guide, without):
-        return real + 2.0 * (needed in without)
+        return real + learnt * ways + 2.0 * (needed in without)
 
     class Learning:
         tried = SimpleNamespace(unclear=frozenset("u"))
-        guide = SimpleNamespace(suited=lambda model: "learnt")
+        guide = SimpleNamespace(suited=lambda model: "learnt", net=torch.nn.Linear(2, 2))
         best = SimpleNamespace(held=SimpleNamespace(looks=looks, real=real))
 
         def site_rows(self, images):
@@ -143,7 +144,12 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
     torch.manual_seed(0)
     target = torch.randn(150, 4)
     settle = judged.settling(run, None, lambda many: target[: 150 if many else 140])
-    assert [settle(Learning(), last) for last in (False, False, True)] == [kept] * 3
-    looked_at = [140, 140, 150 if sure else 140]
+    learning, found = Learning(), []
+    for last in (False, False, True):
+        found.append(settle(learning, last))
+        found.append(settle(learning, False))  # nothing is drawn anew for a guide that has not changed
+        learning.guide.net.weight.data += 1
+    assert found == [kept] * 6
+    looked_at = [140, 140, *([150] if sure else []), 140]
     assert [number for model, number in drawn if model == "learnt"] == looked_at
     assert [number for model, number in drawn if model == "prior"] == [*dict.fromkeys(looked_at)]  # which do not change

@@ -123,7 +123,8 @@ def settling(
     Args:
         held: images by which it is told, ``(L, C, H, W)`` uint8; with True many, for good and where one has to be sure.
     """
-    sure = run.preset.parameters.sure
+    sure, look = run.preset.parameters.sure, _embed()
+    known: tuple[dict[str, Tensor], frozenset[str]] = {}, frozenset()
 
     @cache
     def constant(many: bool) -> dict[str, Tensor]:
@@ -132,35 +133,43 @@ def settling(
         return images | {"prior": _compared(run, run.model, guide, len(images["target"]), "prior")}
 
     @cache
-    def constant_looks() -> dict[str, Features]:
-        return {name: look(some) for name, some in constant(False).items()}
+    def of_prior() -> Features:
+        return look(constant(False)["prior"])
 
-    def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
-        assert learning.guide is not None
-        images = constant(last and sure)
+    def named(learning: ParameterLearning, many: bool) -> frozenset[str]:
+        assert learning.guide is not None and learning.best is not None
+        images = constant(many)
         learnt = _compared(run, learning.guide.suited(run.model), guide, len(images["target"]), "learnt")
         read = learning.site_rows(images | {"learnt": learnt})
-        named = passed(learning, read, True)
-        if sure or not named:  # what is passed where one is not careful is a part of it
-            return named
-        looks = constant_looks()
-        apart = farther(look(learnt), looks["prior"], looks["target"])
-        return needless(learning, named if apart.one >= apart.other else passed(learning, read, False))
+        names = passed(learning, read, True)
+        if sure or not names:  # what is passed where one is not careful is a part of it
+            return names
+        judge = learning.best.held
+        looks = judge.looks(learning.guide, frozenset())
+        apart = farther(looks, of_prior(), judge.real)
+        if apart.one < apart.other:
+            names = passed(learning, read, False)
+        return needless(learning.guide, judge, looks, names)
 
-    look = _embed()
+    def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
+        nonlocal known
+        assert learning.guide is not None
+        now = learning.guide.net.state_dict()
+        if last and sure:
+            return named(learning, True)
+        if not (known[0] and all(torch.equal(weight, now[key]) for key, weight in known[0].items())):
+            known = {key: weight.clone() for key, weight in now.items()}, named(learning, False)
+        return known[1]
+
     return settled
 
 
-def needless(learning: ParameterLearning, names: frozenset[str]) -> frozenset[str]:
-    """Of some sites those without which renders are not surely farther from held-out images: what is read of an object
-    and of its sibling before hardly shows that a row is even, which whole images do."""
-    assert learning.best is not None and learning.guide is not None
-    if not names:
-        return names
-    held, learnt = learning.best.held, learning.guide
-    looks = held.looks(learnt, frozenset())
-    without = {name: held.looks(learnt, frozenset((name,))) for name in sorted(names)}
-    return frozenset(name for name, found in without.items() if not farther(found, looks, held.real).sure)
+def needless(guide: ParameterGuide, judge: HeldOut, looks: Features, names: frozenset[str]) -> frozenset[str]:
+    """Of some sites those without which renders are not surely farther from held-out images than with all, which have
+    ``looks``: what is read of an object and of its sibling before hardly shows that a row is even, which whole images
+    do."""
+    without = {name: judge.looks(guide, frozenset((name,))) for name in sorted(names)}
+    return frozenset(name for name, found in without.items() if not farther(found, looks, judge.real).sure)
 
 
 def passed(
@@ -252,9 +261,8 @@ def _embed() -> Callable[[Tensor], Features]:
 
 def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> Tensor:
     observer = Observer(model, run.record["threads"])
-    starts = range(0, number, RENDERED_AT_ONCE)
-    parts = [observer.labelled(sample(model, guide, min(RENDERED_AT_ONCE, number - i))).image for i in starts]
-    return torch.cat(parts)
+    sizes = [min(RENDERED_AT_ONCE, number - i) for i in range(0, number, RENDERED_AT_ONCE)]
+    return torch.cat([observer.labelled(sample(model, guide, size, density=False)).image for size in sizes])
 
 
 def _quantiles(u: Tensor) -> list[float]:

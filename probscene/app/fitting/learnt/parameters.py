@@ -5,6 +5,7 @@ that one digest is of both. Axis letters: L images, C H W.
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -78,7 +79,7 @@ def learn_parameters(
                 guide,
                 eye,
                 observer.labelled,
-                lambda: _some(target, ~held, run.preset.parameters.images),
+                cache(lambda: _some(target, ~held, run.preset.parameters.images)),
                 run.preset.parameters,
                 batch_seed(run.record["seed"], 5),
                 held_out(run, guide, _some(target, held, JUDGED)),
