@@ -10,7 +10,7 @@ from probscene.inference.parameters.schedule import ParameterSchedule
 
 from .preset import BOTH, TRAINED, Preset
 
-QUICK = Preset(learn=BOTH, parameters=ParameterSchedule(rounds=3))
+QUICK = Preset(learn=BOTH, parameters=ParameterSchedule(step_images=80, rounds=3))
 DEFAULT = replace(
     QUICK,
     count=CountSchedule(steps=12000),
