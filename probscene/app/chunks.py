@@ -34,13 +34,13 @@ def chunk_randomness(seed: int, chunk: int) -> Iterator[None]:
 
 
 def draw_chunk(model: SceneModel, policy: Policy, seed: int, chunk: int) -> Scenes:
-    """The scenes of a chunk, all 64, the same whatever else the process does.
+    """The scenes of a chunk, all 64, without their ``log_prob``; the same whatever else the process does.
 
     Raises:
         SamplingError, ModelError: see ``sample``.
     """
     with threads(1), chunk_randomness(seed, chunk):
-        return sample(model, policy, CHUNK)
+        return sample(model, policy, CHUNK, density=False)
 
 
 def as_written(model: SceneModel, image: Tensor) -> Tensor:

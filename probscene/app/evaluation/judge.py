@@ -191,7 +191,7 @@ def _features(run: RunFolder, policy: Policy, net: FeatureNet, draws_per_structu
     observe, parts = view.observe(net, draws_per_structure), []
     for chunk in range(-(-num // CHUNK)):
         with threads(1), chunk_randomness(seed, chunk):
-            parts.append(observe(sample(run.model, policy, CHUNK)))
+            parts.append(observe(sample(run.model, policy, CHUNK, density=False)))
     return torch.cat(parts)[:num]
 
 
