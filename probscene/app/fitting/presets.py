@@ -15,7 +15,7 @@ DEFAULT = replace(
     QUICK,
     count=CountSchedule(steps=12000),
     batches=120,
-    parameters=ParameterSchedule(reader_steps=800, step_images=80, rounds=3, round_steps=500),
+    parameters=replace(QUICK.parameters, reader_steps=800, round_steps=500),
 )
 # Streets have ten counts, some of which spread over tens, and a network is farther off the more there is: in counts, a
 # kernel of one width is too wide for a pedestrian or too narrow for a wood.
