@@ -154,9 +154,9 @@ def settling(
     def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
         nonlocal known
         assert learning.guide is not None
-        now = learning.guide.net.state_dict()
         if last and sure:
             return named(learning, True)
+        now = learning.guide.net.state_dict()
         if not (known[0] and all(torch.equal(weight, now[key]) for key, weight in known[0].items())):
             known = {key: weight.clone() for key, weight in now.items()}, named(learning, False)
         return known[1]
