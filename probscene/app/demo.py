@@ -34,6 +34,7 @@ from .labelling.counts import write_counts
 from .loading import load_model
 from .pictures import pixels, side_by_side, write_picture
 from .progress import Display
+from .targets import open_images
 from .views import report, tables, verdict_text
 from .views.preview import scenes
 from .walls.warn import tell
@@ -76,7 +77,7 @@ def demo(
             tell(run, show)
         generate(run, num, out / "dataset", seed, progress=show.stage("generating"))
         if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
-            _judge(run, opened or session.open_images(target, loaded, False, show), out, show)
+            _judge(run, opened or open_images(target, loaded, False, show), out, show)
     console = Console(highlight=False)
     measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))
     for table in tables.distances({"truth": measured["distances"]["truth"]}):

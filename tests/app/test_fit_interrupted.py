@@ -78,7 +78,7 @@ def test_interrupted_before_the_run_exists_the_same_command_is_named(call, discs
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("probscene.app.fitting.session.ImageFolder", interrupt)
+    monkeypatch.setattr("probscene.app.targets.ImageFolder", interrupt)
     words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run"]
     result = call(*words)
     assert result.code == 1 and not (tmp_path / "run").exists()

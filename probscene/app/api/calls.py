@@ -20,12 +20,11 @@ from ..evaluation.compare import Comparison
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.labels import Labels, read_labels
 from ..evaluation.visible import Visible
-from ..fitting import session
 from ..fitting.fit import open_target
 from ..fitting.run import RunFolder, is_run
-from ..fitting.session import Target
 from ..loading import load_model, renderer_for
 from ..progress import Display
+from ..targets import Target, open_images
 from ..trial import trial as trying
 from ..trial.results import Results
 from ..views import comparison as comparison_picture
@@ -282,7 +281,7 @@ def display(progress: bool) -> Display:
 
 def _images(run: RunFolder, target: Target | None, show: Display) -> Images:
     if target is not None:
-        return session.open_images(target, run.model, run.record["skip_bad"], show)
+        return open_images(target, run.model, run.record["skip_bad"], show)
     return open_target(run, show)
 
 

@@ -20,8 +20,8 @@ from ..fitting.overrides import override
 from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
 from ..fitting.preset import BOTH, FOR_PHOTOGRAPHS, FOR_RENDERS, STRUCTURE, Preset
 from ..fitting.presets import preset as preset_of
-from ..fitting.session import Target
 from ..loading import load_model
+from ..targets import Target
 from ..walls.warn import tell
 from ..workers.cluster import connected
 from .calls import display

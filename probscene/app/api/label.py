@@ -12,14 +12,13 @@ from probscene.model import SceneModel
 
 from ..arguments import checked_seed, positive
 from ..evaluation.estimate import class_counts
-from ..fitting import session
 from ..fitting.run import RunFolder, is_run
-from ..fitting.session import Target
 from ..labelling.choosing import propose
 from ..labelling.few import FewLabels, read_few
 from ..labelling.sheet import Sheet, check_empty, write_sheet
 from ..loading import load_model
 from ..progress import Display, Progress
+from ..targets import Target, open_images
 from .calls import display
 
 CONSIDERED = 2000  # images at most that are looked at, evenly spread over all
@@ -60,7 +59,7 @@ def label(
     check_empty(out)
     run, model = _source(source, None if assets is None else Path(assets))
     with display(progress) as show:
-        images = session.open_images(target, model, skip_bad, show)
+        images = open_images(target, model, skip_bad, show)
         few = None if labels is None else read_few(Path(labels), model, images, least=1)
         rows = _proposed(run, model, images, number, few, seed, show)
     if not rows:

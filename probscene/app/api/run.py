@@ -20,8 +20,8 @@ from ..evaluation.labels import Labels
 from ..files import make_folder
 from ..fitting.parts import GuideMaker, Parts, as_divergence, as_features, as_guide_maker
 from ..fitting.run import RunFolder
-from ..fitting.session import Target
 from ..fitting.storage import check_free
+from ..targets import Target
 from . import calls
 
 

@@ -85,9 +85,9 @@ def evaluate(
     from ..evaluation.evaluate import evaluate
     from ..evaluation.labels import read_labels
     from ..files import make_folder, write_json
-    from ..fitting import session
     from ..fitting.run import RunFolder
     from ..progress import Display
+    from ..targets import open_images
     from ..views import tables, verdict_text
 
     opened = RunFolder.at(run)
@@ -96,7 +96,7 @@ def evaluate(
     if json is not None:
         make_folder(json.parent)
     with Display() as show:
-        images = session.open_images(target, opened.model, opened.record["skip_bad"], show)
+        images = open_images(target, opened.model, opened.record["skip_bad"], show)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
         found = evaluate(opened, images, truth, show, num, features=features or (), images=most, visible=visible)
         judged = verdict.judge(opened, images, show, scenes, found) if scenes else None

@@ -276,7 +276,12 @@ class RunFolder(Storage):
 
     def _unchanged(self, file: Path, digest: str | None, what: str) -> None:
         if digest is not None and (not file.is_file() or file_digest(file) != digest):
-            kept = f"A copy is in {self.path / 'model.py'}: put it back, or fit again." if what == "model" else ""
+            kept = (
+                f"A copy is in {self.path / 'model.py'}: put it back, or fit again. Where the file only lies elsewhere "
+                f"by now, probscene fit FILE --out {self.path} --resume tells the run so."
+                if what == "model"
+                else ""
+            )
             raise RunError(
                 f"Expected the {what} file {file} as it was when {self.path} was fitted, actual a missing or changed "
                 f"file. {kept or 'Put it back, or fit again.'}"

@@ -5,14 +5,12 @@
 
 import dataclasses
 import os
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import probscene
-from probscene.dataset import ImageFolder, Images
+from probscene.dataset import Images
 from probscene.errors import ModelError, ProbsceneError, RunError
-from probscene.image_array import ImageArray
 from probscene.inference.features.base import Features
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
@@ -23,9 +21,10 @@ from ..checking.generator_check import cost
 from ..checking.model_check import QUICK, check_model
 from ..files import write_json
 from ..labelling.few import FewLabels, labels_record, read_few
-from ..loading import lasting_reference, load_model
+from ..loading import lasting_reference, load_model, split_reference
 from ..modules import file_digest
 from ..progress import Display
+from ..targets import Target, lasting_target, open_images, say_notes
 from ..workers.cluster import Cluster
 from .fit import check_target, fit, open_target
 from .parts import Parts, in_memory, is_file_part, part_file
@@ -37,9 +36,6 @@ from .storage import TIMING, check_free, timing
 
 BEFORE = ("reading", "likeness", "features", "readings", "target", "pretraining")
 STAGES = (*BEFORE, "structure", "parameters", "structure-again", "outcome")
-
-Target = Path | str | Sequence[Path | str] | Any
-"""A folder, a list of files, an array or a dataset of images, see ``open_images``."""
 
 
 def checked_model(model: str | SceneModel, assets: Path | None = None) -> SceneModel:
@@ -97,7 +93,8 @@ def begin(
     files = {part_file(word) for word in (preset.features, preset.objective, preset.guide) if is_file_part(word)}
     record = {
         "version": probscene.__version__,
-        "target": _lasting_target(target),
+        "target": lasting_target(target),
+        "target_sha256": images.fingerprint,
         "skip_bad": skip_bad,
         "seed": seed,
         "threads": threads or default_threads(),
@@ -113,7 +110,7 @@ def begin(
         record["labels"] = labels_record(labels)
         check_takes_labels(run.features)
         few = read_few(labels, loaded, images)
-        _say_notes(few, show)
+        say_notes(few, show)
     seed_everything(batch_seed(seed, 0))
     net = run.build_network()
     if is_file_part(preset.guide) or (parts is not None and parts.guide is not None):
@@ -140,10 +137,11 @@ def resume(
 
     Args:
         model, target, preset, assets, settings: what the run must have been begun with, where it is not None; the
-            settings are ``seed``, ``skip_bad`` and ``threads``. A model and images in memory are taken as they are.
+            settings are ``seed``, ``skip_bad`` and ``threads``. A model and images in memory are taken as they are;
+            files may lie elsewhere by now, and the run then knows them by their new place.
         parts: what the user brought as objects.
         make: the class of the run.
-        labels: those that it was begun with, where they are not None.
+        labels: those that it was begun with, where they are not None; they, too, may lie elsewhere.
         photographs: another preset that it may have been begun with, see ``begin``.
 
     Raises:
@@ -151,37 +149,46 @@ def resume(
         DataError: see ``ImageFolder`` and ``read_few``.
     """
     run = make.at(out, model if isinstance(model, SceneModel) else None, parts)
+    before = dict(run.record)
+    images = _follow(run, model, target, labels, show)
     given = {
         "model": in_memory(model.name) if isinstance(model, SceneModel) else model and lasting_reference(model),
-        "target": None if target is None else _lasting_target(target) or "images in memory",
+        "target": None if target is None else lasting_target(target) or "images in memory",
         "assets_folder": None if assets is None else os.path.abspath(assets),
         "labels": None if labels is None else str(Path(labels).resolve()),
         **settings,
     }
     given = {key: value for key, value in given.items() if value is not None}
     begun = {**run.record, "labels": run.record.get("labels", {}).get("path")}
-    before = {key: begun.get(key) for key in given}
-    if "target" in before:
-        before["target"] = before["target"] or "images in memory"
+    known = {key: begun.get(key) for key in given}
+    if "target" in known:
+        known["target"] = known["target"] or "images in memory"
     if photographs is not None and preset is not None and run.preset.features == photographs.features:
         preset = photographs
     if preset is not None:  # field by field, so that the message names the one that differs
         unread = run.preset.unread()  # another version may have other defaults of these
         given |= {key: value for key, value in dataclasses.asdict(preset).items() if key not in unread}
-        before |= dataclasses.asdict(run.preset)
+        known |= dataclasses.asdict(run.preset)
     for key, value in given.items():
-        if value != before[key]:
+        if value != known[key]:
             raise RunError(
-                f"Expected the {key} that the run in {out} was begun with ({before[key]}), actual {value}; leave it "
+                f"Expected the {key} that the run in {out} was begun with ({known[key]}), actual {value}; leave it "
                 "out with --resume, or begin another run."
             )
+    if run.record != before:
+        write_json(run.path / "run.json", run.record)
     if run.is_finished:
         return run, None
-    if run.record["target"] is None and target is not None:
+    if images is None and run.record["target"] is None and target is not None:
         images = open_images(target, run.model, run.record["skip_bad"], show)
-    else:
+    elif images is None:
+        if isinstance(place := run.record["target"], str) and not Path(place).exists():
+            raise RunError(
+                f"Expected the images of the run in {out} in {place}, actual nothing there; where they lie elsewhere "
+                "by now, name that folder with --target."
+            )
         images = open_target(run, show)
-        _say_notes(images, show)
+        say_notes(images, show)
     run.few = _same_labels(run, images)
     return run, images
 
@@ -227,30 +234,6 @@ def _suited(
     return photographs
 
 
-def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display) -> Images:
-    """Images as a model reads them; what a person should know about them is said.
-
-    Args:
-        target: a folder, a list of files, or images in memory, see ``ImageArray``; images that are open already.
-
-    Raises:
-        DataError: see ``ImageFolder`` and ``ImageArray``.
-    """
-    if isinstance(target, Images):
-        return target
-    if _is_folder(target) or _is_list_of_files(target):
-        images: Images = ImageFolder(target, model.canvas, model.channels, skip_bad, show.stage("reading"))
-    else:
-        images = ImageArray(target, model.canvas, model.channels)
-    _say_notes(images, show)
-    return images
-
-
-def _say_notes(about: Images | FewLabels, show: Display) -> None:
-    for note in about.notes:
-        show.say(f"Note: {note}")
-
-
 def check_takes_labels(features: Features) -> None:
     """See that features can make use of labels.
 
@@ -265,6 +248,34 @@ def check_takes_labels(features: Features) -> None:
         )
 
 
+def _follow(
+    run: RunFolder, model: str | SceneModel | None, target: Target | None, labels: Path | None, show: Display
+) -> Images | None:
+    """Let a run's record name the model's file, the images and the labels where they lie now, if what is given has the
+    same bytes as what the run was begun with.
+
+    Returns:
+        The images, where they had to be opened for that.
+    """
+    record = run.record
+    if isinstance(model, str) and lasting_reference(model) != record["model"]:
+        (file, names), (_, begun) = split_reference(model), split_reference(record["model"])
+        if names != begun or not Path(file).is_file() or file_digest(Path(file)) != record["model_sha256"]:
+            return None
+        record["model"] = lasting_reference(model)
+    if labels is not None and "labels" in record:
+        found = labels_record(labels)
+        if found["sha256"] == record["labels"]["sha256"]:
+            record["labels"] = found
+    place = None if target is None else lasting_target(target)
+    if target is None or place is None or place == record["target"] or "target_sha256" not in record:
+        return None
+    images = open_images(target, run.model, record["skip_bad"], show)
+    if images.fingerprint == record["target_sha256"]:
+        record["target"] = place
+    return images
+
+
 def _same_labels(run: RunFolder, images: Images) -> FewLabels | None:
     """The labels that a run was begun with."""
     kept = run.record.get("labels")
@@ -277,20 +288,3 @@ def _same_labels(run: RunFolder, images: Images) -> FewLabels | None:
             "back, or begin a new run."
         )
     return read_few(path, run.model, images)
-
-
-def _is_folder(target: Target) -> TypeGuard[Path]:
-    return isinstance(target, str | os.PathLike)
-
-
-def _is_list_of_files(target: Target) -> TypeGuard[list[Path]]:
-    return isinstance(target, list | tuple) and all(isinstance(file, str | os.PathLike) for file in target)
-
-
-def _lasting_target(target: Target) -> str | list[str] | None:
-    """What a run records of its target: paths that mean the same from every folder; None for images in memory."""
-    if isinstance(target, ImageFolder):
-        target = target.paths if target.listed else target.path
-    if _is_folder(target):
-        return str(Path(target).resolve())
-    return [str(Path(file).resolve()) for file in target] if _is_list_of_files(target) else None

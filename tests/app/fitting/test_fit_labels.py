@@ -92,7 +92,11 @@ def test_a_run_goes_on_with_the_labels_it_was_begun_with(call, discs, target, pa
         (out / f"{name}.safetensors").unlink()
     assert call("fit", "--resume", "--out", out).code == 0
     assert RunFolder.at(out).guide_hash() == learnt
+    elsewhere = few.rename(tmp_path / "elsewhere.csv")
+    assert call("fit", "--resume", "--out", out, "--labels", elsewhere).code == 0
+    assert json.loads((out / "run.json").read_text())["labels"]["path"] == str(elsewhere)
     (out / "guide.safetensors").unlink()
+    few = elsewhere
     few.write_text(few.read_text() + "\n")
     done = call("fit", "--resume", "--out", out)
     assert done.code == 2 and "the labels in" in done.err and "begin a new run" in done.err

@@ -1,0 +1,57 @@
+"""The images that a fit learns from: a folder, a list of files, or images in memory."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeGuard
+
+from probscene.dataset import ImageFolder, Images
+from probscene.image_array import ImageArray
+from probscene.model import SceneModel
+
+from .labelling.few import FewLabels
+from .progress import Display
+
+Target = Path | str | Sequence[Path | str] | Any
+"""A folder, a list of files, an array or a dataset of images, see ``open_images``."""
+
+
+def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display) -> Images:
+    """Images as a model reads them; what a person should know about them is said.
+
+    Args:
+        target: a folder, a list of files, or images in memory, see ``ImageArray``; images that are open already.
+
+    Raises:
+        DataError: see ``ImageFolder`` and ``ImageArray``.
+    """
+    if isinstance(target, Images):
+        return target
+    if _is_folder(target) or _is_list_of_files(target):
+        images: Images = ImageFolder(target, model.canvas, model.channels, skip_bad, show.stage("reading"))
+    else:
+        images = ImageArray(target, model.canvas, model.channels)
+    say_notes(images, show)
+    return images
+
+
+def say_notes(about: Images | FewLabels, show: Display) -> None:
+    for note in about.notes:
+        show.say(f"Note: {note}")
+
+
+def _is_folder(target: Target) -> TypeGuard[Path]:
+    return isinstance(target, str | os.PathLike)
+
+
+def _is_list_of_files(target: Target) -> TypeGuard[list[Path]]:
+    return isinstance(target, list | tuple) and all(isinstance(file, str | os.PathLike) for file in target)
+
+
+def lasting_target(target: Target) -> str | list[str] | None:
+    """What a run records of its target: paths that mean the same from every folder; None for images in memory."""
+    if isinstance(target, ImageFolder):
+        target = target.paths if target.listed else target.path
+    if _is_folder(target):
+        return str(Path(target).resolve())
+    return [str(Path(file).resolve()) for file in target] if _is_list_of_files(target) else None
