@@ -1,12 +1,12 @@
 """What a few labelled images are worth to a fit: its structures, against the labels of images that had none.
 
     python benchmarks/learn_labelled.py MODEL IMAGES LABELS [--number 10] [--among PATTERN] [--classes car ...]
-        [--preset street] [--seeds 0 1 2] [--min-height 25]
+        [--preset street] [--learn structure,parameters] [--seeds 0 1 2] [--min-height 25]
 
 Each seed draws ``--number`` of the images at random, fits with their counts, and is judged by the labels of all others.
 With ``--among`` the labelled images are drawn from those whose name matches, such as those of one place; the fit then
 has these few and all that do not match, by which it is judged. With ``--number 0`` no image has a label. LABELS is a
-CSV of counts, COCO's JSON, or KITTI's ``label_2``, of all images. Structure alone is learnt.
+CSV of counts, COCO's JSON, or KITTI's ``label_2``, of all images. Structure alone is learnt unless said otherwise.
 
 Printed for each class are total variation and Wasserstein-1 from the labels, of the prior, the start, what was learnt,
 the histogram of the labelled few alone, and the floor: as many labels drawn anew, the mean of 200 times. FOLDER holds
@@ -29,6 +29,7 @@ from probscene.app.evaluation.labels import Labels, read_labels
 from probscene.app.evaluation.sources import FITTED
 from probscene.app.evaluation.structure_counts import StructureCounts
 from probscene.app.files import make_folder, write_json
+from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import PRESETS
 from probscene.app.labelling.counts import write_counts
 from probscene.app.loading import load_model
@@ -71,6 +72,7 @@ def main():
     parser.add_argument("--among", default="*", help="a pattern of the names that they are drawn from")
     parser.add_argument("--classes", nargs="+", help="all that are labelled where not given")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="quick")
+    parser.add_argument("--learn", choices=(STRUCTURE, BOTH), default=STRUCTURE)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--min-height", type=float, default=0.0, help="of boxes that are counted, pixels")
     args = parser.parse_args()
@@ -91,7 +93,7 @@ def main():
         start = time.monotonic()
         run = fit(
             args.model, seen, args.preset, seed,
-            features=COUNTS, learn="structure", labels=out if args.number else None,
+            features=COUNTS, learn=args.learn, labels=out if args.number else None,
             out=args.out / f"run-{seed}", resume=True, cache=False,
         )  # fmt: skip
         judged = ImageFolder([folder.paths[i] for i in rest], model.canvas, model.channels)
