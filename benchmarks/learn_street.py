@@ -5,16 +5,16 @@
 
 Fits see the images alone. ``LABELS`` is KITTI's ``label_2``, or a CSV of counts, of the same images. Cars of scenes are
 counted as the labels count them, of 2,000 rendered scenes (``probscene evaluate``). Printed for each seed: total
-variation and Wasserstein-1 of the number of cars from the labels', FID and KID in EfficientNet's features, each for the
-prior, the start and what was learnt, and as ``read`` how what is read of cars goes with the labels: in all frames, and,
-of KITTI's, in those of which regions marked DontCare, whose objects have no labels, cover less than 1 % and in the
-others; as ``structures`` how many objects of each class their scenes have, seen or not. FOLDER holds the runs,
-``results.json`` and a histogram, ``cars.png``. Where parameters are learnt, too, the same distances of learnt
-structures with the prior's parameters follow as ``structure``, and of frames and of images of each source what a
-photographer would say: how bright they are, their contrast, saturation and noise, and the row of the horizon, each the
-mean with the interval of 95 % of bootstraps over images; and KID and FID of 500 images of each source, drawn with one
-seed. ``--all`` names a CSV with a column ``Car_ge25px``, the cars of 25 pixels and more in all of KITTI's label files:
-how far each source, and the labels of the frames, are from these follows as ``all``.
+variation and Wasserstein-1 of the number of cars from the labels', each for the prior, the start and what was learnt;
+as ``read`` how what is read of cars goes with the labels: in all frames, and, of KITTI's, in those of which regions
+marked DontCare, whose objects have no labels, cover less than 1 % and in the others; as ``structures`` how many objects
+of each class their scenes have, seen or not. Of 500 images of each source, drawn with one seed, follow as ``apart`` KID
+and FID from all frames in EfficientNet's features, and as ``looks``, with the frames', what a photographer would say:
+how bright they are, their contrast, saturation and noise, and the row of the horizon, each the mean with the interval
+of 95 % of bootstraps over images. Where parameters are learnt, too, so do these of learnt structures with the prior's
+parameters, as ``structure``. ``--all`` names a CSV with a column ``Car_ge25px``, the cars of 25 pixels and more in all
+of KITTI's label files: how far each source, and the labels of the frames, are from these follows as ``all``. FOLDER
+holds the runs, ``results.json`` and a histogram, ``cars.png``.
 """
 
 import argparse
@@ -55,7 +55,7 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import MaxNLocator
 
 DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
-MARKED, SCENES = 0.01, 2000  # of a frame; for means of structures
+MARKED, SCENES = 0.01, 2000  # of a frame; of which objects are counted
 
 
 def cars(found: Evaluation) -> dict[str, np.ndarray]:
@@ -65,7 +65,7 @@ def cars(found: Evaluation) -> dict[str, np.ndarray]:
 
 
 def row(found: Evaluation) -> dict:
-    """How far prior, start and learnt are from the labels and from the images."""
+    """How far prior, start and learnt are from the labels."""
     each = cars(found)
     out = {"truth": {"mean": round(float(np.dot(np.arange(len(each["truth"])), each["truth"])), 2)}}
     for name in (name for name in each if name in FITTED):
@@ -74,8 +74,6 @@ def row(found: Evaluation) -> dict:
             "total_variation": round(float(total_variation(each[name], each["truth"])), 3),
             "wasserstein": round(float(wasserstein(each[name], each["truth"])), 3),
         }
-        for distances in found.images.values():
-            out[name] |= {figure.name: round(float(figure.value), 4) for figure in distances[name]}
     return out
 
 
@@ -152,9 +150,11 @@ def said(images: Tensor) -> dict[str, list[float]]:
 def looks(run: RunFolder, frames: ImageFolder, num: int) -> dict:
     """What is said of frames and of each source's images, and how far these are from the frames."""
     real = frames.some(len(frames))
-    structure = copy(run.guide)
-    structure.suits = None
-    policies = {**before(run.model), "structure": structure, LEARNT: run.guide}
+    policies = before(run.model)
+    if run.parameters:
+        policies["structure"] = copy(run.guide)
+        policies["structure"].suits = None
+    policies[LEARNT] = run.guide
     drawn_of = {name: drawn(run, policy, 1)[1][:num] for name, policy in policies.items()}
     look = EfficientNetLite()
     of_frames, apart = look.embed(real), {}
@@ -205,13 +205,14 @@ def main():
         seconds = round(time.monotonic() - start, 1)
         target = ImageFolder(args.images, run.model.canvas, run.model.channels)
         truth = read_labels(args.labels, run.model, target, False, args.min_height)
-        found = evaluate(run, target, truth, lambda *_: None, num=2000, features=["efficientnet"])
+        found = evaluate(run, target, truth, lambda *_: None, num=SCENES)
         rows.append({"seed": seed, "seconds": seconds, **row(found)})
         rows[-1] |= {"read": reading(run, target, args.labels, truth), "structures": structures(run)}
         if args.all is not None:
             rows[-1] |= {"all": from_all(found, args.all)}
         if run.parameters:
-            rows[-1] |= {"kept": run.parameters["kept"], **looks(run, target, DRAWN)}
+            rows[-1] |= {"kept": run.parameters["kept"]}
+        rows[-1] |= looks(run, target, DRAWN)
         histograms.append(cars(found))
         print(json.dumps(rows[-1]), flush=True)
         write_json(args.out / "results.json", rows)
