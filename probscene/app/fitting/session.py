@@ -150,7 +150,7 @@ def resume(
     """
     run = make.at(out, model if isinstance(model, SceneModel) else None, parts)
     before = dict(run.record)
-    images = _follow(run, model, target, labels, show)
+    images = _relocate(run, model, target, labels, show)
     given = {
         "model": in_memory(model.name) if isinstance(model, SceneModel) else model and lasting_reference(model),
         "target": None if target is None else lasting_target(target) or "images in memory",
@@ -248,7 +248,7 @@ def check_takes_labels(features: Features) -> None:
         )
 
 
-def _follow(
+def _relocate(
     run: RunFolder, model: str | SceneModel | None, target: Target | None, labels: Path | None, show: Display
 ) -> Images | None:
     """Let a run's record name the model's file, the images and the labels where they lie now, if what is given has the
