@@ -36,6 +36,7 @@ def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display
 
 
 def say_notes(about: Images | FewLabels, show: Display) -> None:
+    """Say what a person should know about images or labels."""
     for note in about.notes:
         show.say(f"Note: {note}")
 

@@ -82,6 +82,7 @@ def fit(
         labels: of a few of the images, for features that take them: a ``counts.csv``, COCO's ``.json`` or KITTI's
             folder ``label_2``.
         resume: go on with the run in ``out`` where there is one; the other arguments are those that it was begun with.
+            Model, target and labels may lie elsewhere by now, if they are the same bytes.
         progress: show it, on stderr.
         cluster: the address of a Ray cluster whose nodes render scenes and read them while structure is learnt, see
             ``Cluster``. They have to see the run's folder by the same path.
