@@ -118,7 +118,7 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
         return real + learnt * ways + 2.0 * (needed in without)
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset("u"))
+        tried = SimpleNamespace(unclear=frozenset("u"), state=lambda: {"reader": read_by})
         guide = SimpleNamespace(suited=lambda model: "learnt", net=torch.nn.Linear(2, 2))
         best = SimpleNamespace(held=SimpleNamespace(looks=looks, real=real))
 
@@ -131,7 +131,7 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
                 for site, means in where.items()
             }
 
-    drawn = []
+    drawn, read_by = [], torch.zeros(2)
 
     def renders(run, model, guide, number):
         drawn.append((model, number))
@@ -145,11 +145,37 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
     target = torch.randn(150, 4)
     settle = judged.settling(run, None, lambda many: target[: 150 if many else 140])
     learning, found = Learning(), []
+    first = learning.guide.net.weight.data
     for last in (False, False, True):
         found.append(settle(learning, last))
         found.append(settle(learning, False))  # nothing is drawn anew for a guide that has not changed
-        learning.guide.net.weight.data += 1
-    assert found == [kept] * 6
-    looked_at = [140, 140, *([150] if sure else []), 140]
+        learning.guide.net.weight.data = learning.guide.net.weight.data + 1
+    learning.guide.net.weight.data = first
+    found.append(settle(learning, False))  # nor for one that is gone back to
+    read_by += 1
+    found.append(settle(learning, False))
+    assert found == [kept] * 8
+    looked_at = [140, 140, *([150] if sure else []), 140, 140]
     assert [number for model, number in drawn if model == "learnt"] == looked_at
     assert [number for model, number in drawn if model == "prior"] == [*dict.fromkeys(looked_at)]  # which do not change
+
+
+def test_what_a_guide_looks_like_is_drawn_once_until_its_weights_change(monkeypatch):
+    drawn = []
+
+    def renders(run, model, guide, number):
+        drawn.append(model)
+        return torch.rand(number, 2)
+
+    monkeypatch.setattr(judged, "_renders", renders)
+    monkeypatch.setattr(judged, "_embed", lambda: lambda images: images.double().numpy())
+    held = judged.held_out(SimpleNamespace(record={"seed": 0}, model=None), None, torch.zeros(5, 2))
+    guide = SimpleNamespace(net=torch.nn.Linear(2, 2), passed=frozenset())
+    guide.suited = lambda model: (float(guide.net.weight.data.sum()), guide.passed)
+    sets = [frozenset(), frozenset("a"), frozenset(), frozenset("a")]
+    looks = [held.looks(guide, passed) for passed in sets]
+    assert [passed for _, passed in drawn] == sets[:2]
+    assert all((looks[i] == looks[i + 2]).all() for i in (0, 1))
+    guide.net.weight.data += 1
+    held.looks(guide, frozenset())
+    assert len(drawn) == 3 and drawn[2] != drawn[0]

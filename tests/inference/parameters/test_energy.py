@@ -21,6 +21,7 @@ from probscene.inference.parameters.net import ParameterNet
 from probscene.sampling import seed_everything
 
 SITES = 2
+ALL = (True,) * (SITES + 1)
 
 
 def values_of(nodes, scene, turns=(False,) * (SITES + 1)):
@@ -86,7 +87,7 @@ def test_the_gradient_is_that_of_finite_differences(seed):
     expected = float(found(away) - found(-away)) / (2 * away)
     read = values_of(nodes, scene)
     own = OwnReadings(read.kind, read.parent, nodes, scene, read, torch.arange(3).expand(30, 3))
-    moved = moving(net, own)
+    moved = moving(net, own, ALL)
     assert torch.equal(moved.nodes, nodes) and torch.equal(moved.scene, scene)
     energy_distance(moved, target).backward()
     slope = sum(
@@ -119,12 +120,28 @@ def test_objects_that_were_not_drawn_do_not_move():
     graph, scene, nodes = (x if isinstance(x, Graph) else x.detach() for x in drawn(net, 10))
     read = values_of(nodes, scene)
     which = torch.tensor([0, -1, 2]).expand(10, 3)
-    found = moving(net, OwnReadings(graph.kind, graph.parent, nodes, scene, read, which))
+    found = moving(net, OwnReadings(graph.kind, graph.parent, nodes, scene, read, which), ALL)
     moves = torch.autograd.grad(
         found.nodes[:, 1].sum() + 0 * found.nodes.sum(), list(net.parameters()), allow_unused=True
     )
     assert all(gradient is None or not gradient.any() for gradient in moves)
     assert torch.equal(found.nodes, nodes)
+
+
+@pytest.mark.parametrize("chosen", range(SITES + 1))
+def test_a_site_moves_as_it_would_with_the_others_or_not_at_all(chosen):
+    net = random_net()
+    graph, scene, nodes = (x if isinstance(x, Graph) else x.detach() for x in drawn(net, 10))
+
+    def slopes(which):
+        of_scene, of_nodes = net.moving(graph, scene, nodes, which)
+        assert torch.equal(of_scene, scene) and torch.equal(of_nodes, nodes)
+        moved = torch.cat([of_nodes.flatten(0, 1), of_scene.repeat_interleave(3, 0)], 1)[:, chosen].sum()
+        return torch.autograd.grad(moved, list(net.parameters()), allow_unused=True, materialize_grads=True)
+
+    alone, others = (slopes([(site == chosen) == moves for site in range(SITES + 1)]) for moves in (True, False))
+    assert all(torch.equal(one, all_) for one, all_ in zip(alone, slopes(ALL), strict=True))
+    assert any(one.any() for one in alone) and not any(one.any() for one in others)
 
 
 def test_errors_of_the_reader_are_taken_out():

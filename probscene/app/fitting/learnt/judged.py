@@ -3,6 +3,7 @@
 Axis letters: L images, C H W.
 """
 
+import hashlib
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -124,7 +125,7 @@ def settling(
         held: images by which it is told, ``(L, C, H, W)`` uint8; with True many, for good and where one has to be sure.
     """
     sure, look = run.preset.parameters.sure, _embed()
-    known: tuple[dict[str, Tensor], frozenset[str]] = {}, frozenset()
+    known: dict[bytes, frozenset[str]] = {}
 
     @cache
     def constant(many: bool) -> dict[str, Tensor]:
@@ -152,14 +153,13 @@ def settling(
         return needless(learning.guide, judge, looks, names)
 
     def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
-        nonlocal known
         assert learning.guide is not None
         if last and sure:
             return named(learning, True)
-        now = learning.guide.net.state_dict()
-        if not (known[0] and all(torch.equal(weight, now[key]) for key, weight in known[0].items())):
-            known = {key: weight.clone() for key, weight in now.items()}, named(learning, False)
-        return known[1]
+        now = _digest(learning.guide.net.state_dict(), learning.tried.state())
+        if now not in known:
+            known[now] = named(learning, False)
+        return known[now]
 
     return settled
 
@@ -242,14 +242,30 @@ def _compared(run: "RunFolder", model: SceneModel, guide: Guide, number: int, na
 
 
 def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
-    """What judges guides while they are trained, by the same images and features."""
+    """What judges guides while they are trained, by the same images and features. It remembers the latest weights'."""
     embed = _embed()
+    of, known = b"", dict[frozenset[str], Features]()
 
     def look(learnt: ParameterGuide) -> Features:
-        seed_everything(batch_seed(run.record["seed"], 6, 3))
-        return embed(_renders(run, learnt.suited(run.model), guide, len(held)))
+        nonlocal of, known
+        now = _digest(learnt.net.state_dict())
+        if now != of:
+            of, known = now, {}
+        if learnt.passed not in known:
+            seed_everything(batch_seed(run.record["seed"], 6, 3))
+            known[learnt.passed] = embed(_renders(run, learnt.suited(run.model), guide, len(held)))
+        return known[learnt.passed]
 
     return HeldOut(look, embed(held))
+
+
+def _digest(*states: dict[str, Tensor]) -> bytes:
+    """Of networks' states: other tensors have another one."""
+    digest = hashlib.sha256()
+    for state in states:
+        for name, tensor in state.items():
+            digest.update(name.encode() + tensor.numpy().tobytes())
+    return digest.digest()
 
 
 def _embed() -> Callable[[Tensor], Features]:
