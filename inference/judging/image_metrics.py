@@ -33,7 +33,8 @@ class Figure(NamedTuple):
         features: whose features it was taken in.
         value: the figure; KID may fall below 0, as an unbiased estimate of 0 does.
         low, high: the 95 % interval, the bootstrap's spread around the figure.
-        images: how many a side; of the smaller one.
+        images: how many real ones.
+        generated: how many generated ones, or whatever is on the other side.
         note: what to bear in mind, or nothing.
     """
 
@@ -43,6 +44,7 @@ class Figure(NamedTuple):
     low: float
     high: float
     images: int
+    generated: int
     note: str = ""
 
 
@@ -69,7 +71,7 @@ def fid(real: Tensor, generated: Tensor, features: str, size: int = 50, seed: in
     drawn = [frechet(real[a > 0], generated[b > 0], a[a > 0], b[b > 0]).item() for a, b in zip(*weight, strict=True)]
     few = min(L, N) <= D
     note = f"FID of {min(L, N)} images in {D} dimensions: covariances of deficient rank, the figure is far too high"
-    return Figure("FID", features, *around(metric.compute().item(), drawn, 0.0), min(L, N), note if few else "")
+    return Figure("FID", features, *around(metric.compute().item(), drawn, 0.0), L, N, note if few else "")
 
 
 def kid(real: Tensor, generated: Tensor, features: str, subset: int = SUBSET, size: int = 200, seed: int = 0) -> Figure:
@@ -93,7 +95,9 @@ def kid(real: Tensor, generated: Tensor, features: str, subset: int = SUBSET, si
         metric.update(generated, real=False)
         value = metric.compute()[0].item()
     note = f"KID of {fewest} images, fewer than the {subset} of KID's subsets" if fewest < subset else ""
-    return Figure("KID", features, *around(value, _kid_drawn(real, generated, size, seed)), fewest, note)
+    return Figure(
+        "KID", features, *around(value, _kid_drawn(real, generated, size, seed)), len(real), len(generated), note
+    )
 
 
 def frechet(x: Tensor, y: Tensor, of_x: Tensor, of_y: Tensor) -> Tensor:

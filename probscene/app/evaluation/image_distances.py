@@ -1,10 +1,13 @@
 """KID and FID of a run's scenes to the target's images, beside the floor: two halves of the target.
 
-FID depends on the number of images, so every figure here is of as many on either side: no more than half of the
-target, and than were asked for. Generated images are compared with one half, and that half with the other. Where all
-images are asked for, as many generated ones are compared with all of them, and the floor is what the halves tell of as
-many: KID has no bias and stays, FID of two samples of one distribution falls as one over their number [1]. Axis
-letters: L images, m images a side.
+FID depends on the number of images, so all its figures are of as many on either side: no more than half of the target,
+and than were asked for. Generated images are compared with one half, and that half with the other. Where all images
+are asked for, as many generated ones are compared with all of them, and the floor is what the halves tell of as many:
+FID of two samples of one distribution falls as one over their number [1].
+
+KID has no bias. It takes all of the target's images and, as each takes some chance away, up to four times as many
+generated ones, no more on either side than were asked for. Its floor is that of the halves. Axis letters: L images, m
+images a side.
 
 References:
     [1] Chong, Forsyth, *Effectively Unbiased FID and Inception Score*, 2020.
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from probscene.inference.judging.image_metrics import Figure
 
 IMAGES = 1000
+MORE = 4  # generated images for each one of the target; of further ones KID's interval hardly gets narrower
 Distances = dict[str, tuple[Any, ...]]
 """By ``prior``, ``start`` where it is another policy, ``learnt`` and ``floor``: the ``Figure`` of KID and of FID."""
 
@@ -42,7 +46,7 @@ def image_distances(
 
     Args:
         choices: networks, see ``seen.network``.
-        num: m at most; all images where None.
+        num: images a side, at most; all of the target's where None.
 
     Raises:
         ProbsceneError: fewer than 2 images asked for, a network that there is not; see ``features_of``.
@@ -57,11 +61,13 @@ def image_distances(
     from probscene.inference.judging.image_metrics import fid, kid  # torchmetrics takes seconds to import
 
     nets = [network(choice, run) for choice in choices]
-    half = len(target) // 2
-    m = len(target) if num is None else min(num, half)
-    order = torch.randperm(len(target), generator=torch.Generator().manual_seed(seed))
+    L, half = len(target), len(target) // 2
+    m = L if num is None else min(num, half)
+    most = max(L, IMAGES) if num is None else num
+    generated = max(m, min(most, MORE * L))
+    order = torch.randperm(L, generator=torch.Generator().manual_seed(seed))
     policies = {**before(run.model), LEARNT: run.guide}
-    done, total = 0, len(nets) * (len(target) + len(policies) * m)
+    done, total = 0, len(nets) * (L + len(policies) * generated)
 
     def each(images):
         nonlocal done
@@ -71,9 +77,9 @@ def image_distances(
     found = {}
     for name, net in nets:
         real = features_in(run, target, net, each)[order]
-        sides = {source: features_of(run, policy, m, net, seed, each) for source, policy in policies.items()}
+        sides = {source: features_of(run, policy, generated, net, seed, each) for source, policy in policies.items()}
         found[name] = {
-            source: tuple(distance(real[:m], side, name, seed=seed) for distance in (kid, fid))
+            source: (kid(real[:most], side, name, seed=seed), fid(real[:m], side[:m], name, seed=seed))
             for source, side in sides.items()
         }
         h = min(m, half)
@@ -92,4 +98,4 @@ def as_of(figure: "Figure", images: int) -> "Figure":
     share = figure.images / images
     value, low, high = (share * number for number in (figure.value, figure.low, figure.high))
     note = f"estimated from {figure.images} images a side"
-    return figure._replace(value=value, low=low, high=high, images=images, note=note)
+    return figure._replace(value=value, low=low, high=high, images=images, generated=images, note=note)

@@ -27,7 +27,7 @@ LEGEND = "TV: total variation, 0 to 1. W-1: Wasserstein-1, in objects."
 ALL_OBJECTS, SHARES = "all objects", "class shares"
 WIDEST, ROOMY = 1000, 140  # characters; and so many that distances have room for their intervals
 WORDS = {"truth": "the truth", "estimate": "what the feature network sees *"}
-FLOOR = "The floor is what two halves of the target are apart; every figure of KID and FID is of as many images a side."
+FLOOR = "The floor is what two halves of the target are apart. FID depends on the number of images, KID does not."
 
 
 def show(evaluation: Evaluation, console: Console) -> None:
@@ -221,15 +221,20 @@ def images(evaluation: Evaluation) -> list[Table]:
     for name, each in evaluation.images.items():
         table = _table(f"Distance of images in the features of {name}", "", list(each))
         for figures in zip(*each.values(), strict=True):
-            title = f"{figures[0].name}, {figures[0].images} images a side"
-            table.add_row(title, *(_short(figure, figures[0].images) for figure in figures))
+            title = f"{figures[0].name}, {_images(figures[0])}"
+            table.add_row(title, *(_short(figure, figures[0]) for figure in figures))
         tables.append(table)
     return tables
 
 
-def _short(figure: Any, images: int) -> str:
-    of = "" if figure.images == images else f" ({figure.images} images)"
+def _short(figure: Any, first: Any) -> str:
+    of = "" if figure.images == first.images else f" ({_images(figure)})"
     return f"{figure.value:.4g} ± {(figure.high - figure.low) / 2:.2g}{of}"
+
+
+def _images(figure: Any) -> str:
+    same = figure.images == figure.generated
+    return f"{figure.images} images a side" if same else f"{figure.images} real, {figure.generated} generated images"
 
 
 def _figure(found: Interval | float | None, digits: int, spread: bool = True) -> str:

@@ -1,4 +1,4 @@
-"""FID and KID of a run: of as many images on either side, against one half of the target, and that half's other."""
+"""FID and KID of a run, FID of as many images on either side, KID of all there are; beside halves' of the target."""
 
 import json
 import math
@@ -39,19 +39,20 @@ def test_figures_are_those_of_the_features(run, images):
     for source, side in sides.items():
         for figure, distance in zip(found["run"][source], (kid, fid), strict=True):
             expected = distance(real[:15], side, "run", seed=2)
-            assert figure.value == pytest.approx(expected.value, rel=1e-3) and figure.images == 15
+            assert figure.value == pytest.approx(expected.value, rel=1e-3)
+            assert figure.images == figure.generated == 15
             assert figure[:2] == expected[:2] and figure.low <= figure.value <= figure.high
 
 
 def test_all_images_where_asked(run, images):
-    """As many generated ones beside them; the floor is of the halves, and FID's an estimate for all."""
+    """As many generated ones beside them, for KID more; the floor is of the halves, and FID's an estimate for all."""
     found = image_distances(run, images, ["run"], lambda *_: None, None, seed=2)["run"]
     net = own_net(run)
     real = features_in(run, images, net)[torch.randperm(40, generator=torch.Generator().manual_seed(2))]
-    learnt = features_of(run, run.guide, 40, net, 2)
-    for figure, distance in zip(found["learnt"], (kid, fid), strict=True):
-        assert figure.value == pytest.approx(distance(real, learnt, "run", seed=2).value, rel=1e-3)
-        assert figure.images == 40
+    learnt = features_of(run, run.guide, 160, net, 2)
+    for figure, distance, number in zip(found["learnt"], (kid, fid), (160, 40), strict=True):
+        assert figure.value == pytest.approx(distance(real, learnt[:number], "run", seed=2).value, rel=1e-3)
+        assert (figure.images, figure.generated) == (40, number)
     floor, biased = found["floor"]
     halves = [distance(real[:20], real[20:], "run", seed=2) for distance in (kid, fid)]
     assert floor.value == pytest.approx(halves[0].value, rel=1e-3, abs=1e-6) and floor.images == 20
@@ -66,9 +67,16 @@ def test_fid_of_two_samples_of_one_distribution_falls_as_one_over_their_number()
     assert sum(as_of(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
 
 
-def test_no_more_than_half_of_the_target(run, images):
-    found = image_distances(run, images, ["run"], lambda *_: None, 1000)
-    assert {figure.images for each in found["run"].values() for figure in each} == {20}
+@pytest.mark.parametrize(
+    ("num", "real", "generated", "a_side"), [(1000, 40, 160, 20), (100, 40, 100, 20), (30, 30, 30, 20)]
+)
+def test_fid_takes_no_more_than_half_of_the_target_and_kid_all_that_is_asked_for(
+    run, images, num, real, generated, a_side
+):
+    found = image_distances(run, images, ["run"], lambda *_: None, num)["run"]
+    numbers = {s: [(figure.images, figure.generated) for figure in each] for s, each in found.items()}
+    assert numbers.pop("floor") == [(20, 20), (a_side, a_side)]
+    assert list(numbers.values()) == 2 * [[(real, generated), (a_side, a_side)]]
 
 
 def test_faults_come_before_any_work(run, images, target, tmp_path):

@@ -47,7 +47,7 @@ def test_fid_agrees_with_scipys_matrix_root(dimensions, seed, shift, scale):
     assert frechet(x, y, torch.ones(40).double(), torch.ones(30).double()).item() == pytest.approx(
         found.value, abs=1e-6
     )
-    assert found[:2] == ("FID", "net") and found.images == 30 and found.note == ""
+    assert found[:2] == ("FID", "net") and (found.images, found.generated) == (40, 30) and found.note == ""
 
 
 def test_fid_of_fewer_images_than_dimensions_is_the_same_either_way_and_says_so():
