@@ -47,6 +47,13 @@ class Figure(NamedTuple):
     generated: int
     note: str = ""
 
+    @property
+    def of_images(self) -> str:
+        """How many images it is of, in words."""
+        if self.images == self.generated:
+            return f"{self.images} images a side"
+        return f"{self.images} real, {self.generated} generated images"
+
 
 def fid(real: Tensor, generated: Tensor, features: str, size: int = 50, seed: int = 0) -> Figure:
     """Fréchet distance between Gaussians with the features' means and covariances [1].

@@ -221,20 +221,15 @@ def images(evaluation: Evaluation) -> list[Table]:
     for name, each in evaluation.images.items():
         table = _table(f"Distance of images in the features of {name}", "", list(each))
         for figures in zip(*each.values(), strict=True):
-            title = f"{figures[0].name}, {_images(figures[0])}"
+            title = f"{figures[0].name}, {figures[0].of_images}"
             table.add_row(title, *(_short(figure, figures[0]) for figure in figures))
         tables.append(table)
     return tables
 
 
 def _short(figure: Any, first: Any) -> str:
-    of = "" if figure.images == first.images else f" ({_images(figure)})"
+    of = "" if figure.images == first.images else f" ({figure.of_images})"
     return f"{figure.value:.4g} ± {(figure.high - figure.low) / 2:.2g}{of}"
-
-
-def _images(figure: Any) -> str:
-    same = figure.images == figure.generated
-    return f"{figure.images} images a side" if same else f"{figure.images} real, {figure.generated} generated images"
 
 
 def _figure(found: Interval | float | None, digits: int, spread: bool = True) -> str:

@@ -77,6 +77,8 @@ def test_fid_takes_no_more_than_half_of_the_target_and_kid_all_that_is_asked_for
     numbers = {s: [(figure.images, figure.generated) for figure in each] for s, each in found.items()}
     assert numbers.pop("floor") == [(20, 20), (a_side, a_side)]
     assert list(numbers.values()) == 2 * [[(real, generated), (a_side, a_side)]]
+    said = f"{real} images a side" if real == generated else f"{real} real, {generated} generated images"
+    assert [figure.of_images for figure in found["prior"]] == [said, f"{a_side} images a side"]
 
 
 def test_faults_come_before_any_work(run, images, target, tmp_path):

@@ -72,15 +72,18 @@ def test_p_values_of_one_distribution_are_uniform():
     assert scipy.stats.kstest(found, "uniform").pvalue > 1e-3
 
 
-@settings(max_examples=5)
-@given(st.integers(0, 2**16))
-def test_samples_of_one_distribution_are_at_the_floor(seed):
-    a, b = normal(seed, 400), normal(seed + 1, 600)
-    joint, single = apart(a, b), marginals(a, b)
-    assert joint.close and 0.7 < joint.ratio < 1.3 and 0.05 < joint.rank
-    assert joint.low <= joint.floor <= joint.high and joint.judged == 250
-    assert single.largest.close and single.each[single.worst] == pytest.approx(single.largest.distance)
-    assert single.worst == single.each.argmax() and single.largest.distance < 2
+def test_samples_of_one_distribution_are_at_the_floor():
+    """But for one in twenty, which chance sets apart."""
+    close = []
+    for seed in range(20):
+        a, b = normal(seed, 400), normal(1000 + seed, 600)
+        joint, single = apart(a, b), marginals(a, b)
+        assert 0.6 < joint.ratio < 1.6 and joint.low <= joint.floor <= joint.high and joint.judged == 250
+        assert joint.close == (joint.rank > 0.05)
+        assert single.each[single.worst] == pytest.approx(single.largest.distance)
+        assert single.worst == single.each.argmax() and single.largest.distance < 2
+        close.append((joint.close, single.largest.close))
+    assert np.sum(close, 0).min() >= 16
 
 
 def test_the_farther_the_features_the_less_they_are_taken_for_real():
