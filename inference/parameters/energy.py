@@ -83,10 +83,10 @@ class EnergyDistance(StepTraining):
         learning_rate: float = 2e-3,
         seed: int = 0,
     ):
-        self.which = noisy.tolist()
-        heads = [head for head, chosen in zip((*net.out, *net.scene_out), self.which, strict=True) if chosen]
-        trained = nn.ModuleList(heads)
-        super().__init__(trained, torch.optim.Adam(trained.parameters(), lr=learning_rate), steps, seed)
+        self.trained = noisy.tolist()
+        chosen = zip((*net.out, *net.scene_out), self.trained, strict=True)
+        heads = nn.ModuleList(head for head, is_trained in chosen if is_trained)
+        super().__init__(heads, torch.optim.Adam(heads.parameters(), lr=learning_rate), steps, seed)
         self.net, self.values, self.draw, self.scenes = net, values, draw, scenes
 
     def loss(self) -> Tensor:
@@ -94,7 +94,7 @@ class EnergyDistance(StepTraining):
         target = self.values.of(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
         own = self.draw(self.scenes)
         with _only(self.net, self.module):
-            found = energy_distance(moving(self.net, own, self.which), target)
+            found = energy_distance(moving(self.net, own, self.trained), target)
         return found + 0 * sum(weight.sum() for weight in self.module.parameters())  # where nothing can be compared
 
 
@@ -190,9 +190,9 @@ def _only(net: nn.Module, part: nn.Module) -> Iterator[None]:
             weight.requires_grad_(had)
 
 
-def moving(net: ParameterNet, own: OwnReadings, which: Sequence[bool]) -> Values:
-    """What is read, moving with what was drawn of some sites: of nodes, and then of scenes."""
-    scene, nodes = net.moving(Graph.of(own.kind, own.parent), own.scene, own.nodes, which)
+def moving(net: ParameterNet, own: OwnReadings, trained: Sequence[bool]) -> Values:
+    """What is read, moving with what was drawn of the sites that are trained, see ``ParameterNet.moving``."""
+    scene, nodes = net.moving(Graph.of(own.kind, own.parent), own.scene, own.nodes, trained)
     moved = (nodes - own.nodes).nan_to_num(0.0)
     moved = gathered(moved, own.which).nan_to_num(0.0)
     of_scene = (scene - own.scene).nan_to_num(0.0)

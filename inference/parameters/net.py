@@ -121,23 +121,23 @@ class ParameterNet(nn.Module):
             memory = torch.gru_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
         return some.put(u)[..., 0].where(has, v)
 
-    def moving(self, graph: Graph, scene: Tensor, values: Tensor, which: Sequence[bool]) -> tuple[Tensor, Tensor]:
+    def moving(self, graph: Graph, scene: Tensor, values: Tensor, trained: Sequence[bool]) -> tuple[Tensor, Tensor]:
         """``scene (N, G)`` and ``values (N, M, S)`` of a sample; those of some sites each with the gradient that it has
         as a quantile of the mixture that it was drawn from, what comes before it held [1].
 
         Args:
-            which: of the sites of nodes and then of scenes; the others have no gradient.
+            trained: ``S + G``, which of the sites of nodes and then of scenes; the others have no gradient.
 
         References:
             [1] Figurnov, Mohamed, Mnih, *Implicit reparameterization gradients*, NeurIPS 2018.
         """
         scenes = [
             self.scene_mixture(graph, scene, g).through(u[:, None].nan_to_num(0.5))[:, 0] if moves else u
-            for g, (u, moves) in enumerate(zip(scene.unbind(1), which[self.node_sites :], strict=True))
+            for g, (u, moves) in enumerate(zip(scene.unbind(1), trained[self.node_sites :], strict=True))
         ]
         nodes = [
             self.node_mixture(graph, scene, values, s).through(u.nan_to_num(0.5)) if moves else u
-            for s, (u, moves) in enumerate(zip(values.unbind(2), which[: self.node_sites], strict=True))
+            for s, (u, moves) in enumerate(zip(values.unbind(2), trained[: self.node_sites], strict=True))
         ]
         return (
             torch.stack(scenes, 1).where(~scene.isnan(), torch.nan) if scenes else scene,

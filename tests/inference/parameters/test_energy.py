@@ -133,8 +133,8 @@ def test_a_site_moves_as_it_would_with_the_others_or_not_at_all(chosen):
     net = random_net()
     graph, scene, nodes = (x if isinstance(x, Graph) else x.detach() for x in drawn(net, 10))
 
-    def slopes(which):
-        of_scene, of_nodes = net.moving(graph, scene, nodes, which)
+    def slopes(trained):
+        of_scene, of_nodes = net.moving(graph, scene, nodes, trained)
         assert torch.equal(of_scene, scene) and torch.equal(of_nodes, nodes)
         moved = torch.cat([of_nodes.flatten(0, 1), of_scene.repeat_interleave(3, 0)], 1)[:, chosen].sum()
         return torch.autograd.grad(moved, list(net.parameters()), allow_unused=True, materialize_grads=True)
