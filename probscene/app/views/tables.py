@@ -222,13 +222,13 @@ def images(evaluation: Evaluation) -> list[Table]:
         table = _table(f"Distance of images in the features of {name}", "", list(each))
         for figures in zip(*each.values(), strict=True):
             title = f"{figures[0].name}, {figures[0].of_images}"
-            table.add_row(title, *(_short(figure, figures[0]) for figure in figures))
+            table.add_row(title, *(_short(figure, figures[0].of_images) for figure in figures))
         tables.append(table)
     return tables
 
 
-def _short(figure: Any, first: Any) -> str:
-    of = "" if figure.images == first.images else f" ({figure.of_images})"
+def _short(figure: Any, of_images: str) -> str:
+    of = "" if figure.of_images == of_images else f" ({figure.of_images})"
     return f"{figure.value:.4g} ± {(figure.high - figure.low) / 2:.2g}{of}"
 
 
