@@ -8,6 +8,7 @@ steps, M nodes, K rules, R nonterminals and J objects of one rule.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ class Derivation:
                 )
             return rule
 
-        return expand(grammar, choose, len(given), given.shape[1])
+        return expand(grammar, of_tensors(choose), len(given), given.shape[1])
 
     @staticmethod
     def merged(grammar: Grammar, parts: "list[tuple[Tensor, Derivation]]") -> "Derivation":
@@ -151,64 +152,113 @@ class Derivation:
         return padded[:, :num_kinds]
 
 
-def expand(grammar: Grammar, choose: Callable[..., Tensor], N: int, max_steps: int) -> Derivation:
-    """Run the stack machine; ``choose(t, frontier, previous_rule)`` gives the rules ``(N,)``, whatever where finished.
+Arrays = tuple[np.ndarray, ...]  # of a frontier, in its order
+Chooser = Callable[[int, Arrays, np.ndarray], np.ndarray]  # rules ``(N,)`` of the step, frontier and rules before it
+
+
+def of_tensors(choose: Callable[[int, Frontier, Tensor], Tensor]) -> Chooser:
+    """A chooser that is given tensors and gives one."""
+
+    def choose_arrays(t: int, frontier: Arrays, previous: np.ndarray) -> np.ndarray:
+        return choose(t, Frontier(*map(torch.from_numpy, frontier)), torch.from_numpy(previous)).numpy()
+
+    return choose_arrays
+
+
+def expand(grammar: Grammar, choose: Chooser, N: int, max_steps: int) -> Derivation:
+    """Run the stack machine; what is chosen for a finished scene is ignored.
 
     It counts in numpy, whose calls cost a fraction of torch's where scenes are a few hundred.
+
+    Raises:
+        GrammarError: so many steps that a stack's entry does not fit into 63 bits.
     """
-    V, R = len(grammar.nonterminals), grammar.children.shape[1]
+    fields, R = Fields.of(grammar, max_steps), grammar.children.shape[1]
     deepest = 2 + (max_steps + 1) * max(1, R - 1)
-    # A stack entry is (symbol, repeat, parent_repeat, owner node); entry 0 is the finished scene and is never popped.
-    # Scenes lie side by side, so that the next entry is N further.
-    stack = np.zeros((4, (deepest + R) * N), np.int64)
-    stack[0, :N], stack[3] = V, -1
-    table, above = _productions(grammar, N), N * np.arange(R)[:, None]
+    # Entry 0 is the finished scene and is never popped. Scenes lie side by side: the next entry is N further.
+    stack = np.zeros((deepest + R) * N, np.int64)
+    stack[:N] = end = len(grammar.nonterminals)
+    table, above = _productions(grammar, N, fields), N * np.arange(R)[:, None]
     top, nodes = np.arange(N) + N, np.zeros(N, np.int64)
-    previous, history = torch.full((N,), -1), []
+    rule, history = np.full(N, -1), []
     for t in range(max_steps):
-        entry = stack.take(top, 1)
-        symbol, repeat, parent_repeat, owner = entry
-        going_on = symbol < V
+        entry = stack.take(top)
+        frontier = fields.frontier(entry)
+        going_on = frontier[0] < end
         number = np.count_nonzero(going_on)
         if not number:
             break
-        frontier = Frontier(*map(torch.from_numpy, (symbol, repeat, parent_repeat)))
-        rule = np.where(going_on, choose(t, frontier, previous).numpy(), -1)
-        previous = torch.from_numpy(rule)
-        history.append((rule, nodes, owner, symbol, repeat, parent_repeat))
+        rule = np.where(going_on, choose(t, frontier, rule), -1)
+        history.append((rule, nodes, entry))
         each = table.take(rule, 1)  # of -1 the last
-        children, same, inside, below = each[:-2].reshape(4, R, N)
+        pushed, kept, taken = each[:-2].reshape(3, R, N)
         # Writing the padding too is harmless: what lies above the new top is overwritten before it is popped.
-        at = top + above
-        stack[0][at] = children
-        stack[1][at] = (repeat + 1) * same
-        stack[2][at] = parent_repeat + (repeat - parent_repeat) * inside
-        stack[3][at] = np.where(below < 0, owner, nodes + below)
+        stack[top + above] = pushed + (entry & kept) + (fields.below(frontier[1], nodes) & taken)
         if np.count_nonzero(rule >= 0) < number:  # given rules that end too early
             left = going_on & (rule < 0)
-            stack[:, top[left]] = entry[:, left]
+            stack[top[left]] = entry[left]
         top = top + each[-2]
         nodes = nodes + each[-1]
     if not history:
-        history.append((np.full(N, -1), nodes, nodes, np.full(N, V), nodes, nodes))
-    columns = np.ascontiguousarray(np.array(history).transpose(1, 2, 0))  # (6, N, T)
-    rules, base, owner, symbol, repeat, parent_repeat = torch.from_numpy(columns).unbind()
+        history.append((np.full(N, -1), nodes, np.full(N, end)))
+    rules, base, entries = np.ascontiguousarray(np.array(history).transpose(1, 2, 0))  # (N, T)
+    expanded = Frontier(*map(torch.from_numpy, fields.frontier(entries)))
+    rules, base, owner = map(torch.from_numpy, (rules, base, fields.owner(entries)))
     kind, parent = _scene_graph(grammar, rules, base, owner, torch.from_numpy(nodes))
-    return Derivation(rules, torch.from_numpy(top < N), kind, parent, Frontier(symbol, repeat, parent_repeat))
+    return Derivation(rules, torch.from_numpy(top < N), kind, parent, expanded)
+
+
+class Fields(NamedTuple):
+    """Where the bits of a stack's entry are: a frontier, and 1 + the node that hangs above, 0 for none. The finished
+    scene is its symbol alone.
+
+    Attributes:
+        repeat, parent_repeat, node: the first bit of each; that of ``symbol`` is 0.
+    """
+
+    repeat: int
+    parent_repeat: int
+    node: int
+
+    @staticmethod
+    def of(grammar: Grammar, max_steps: int) -> "Fields":
+        """As few bits as numbers need that so many steps can come to."""
+        repeat = len(grammar.nonterminals).bit_length()
+        parent_repeat = repeat + max_steps.bit_length()
+        node = parent_repeat + max_steps.bit_length()
+        if node + (1 + max_steps * grammar.objects.shape[1]).bit_length() > 63:
+            raise GrammarError(f"Expected a max_steps of some thousands at most, actual {max_steps}; lower it.")
+        return Fields(repeat, parent_repeat, node)
+
+    def frontier(self, entry: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Symbol, repeat and parent_repeat, as entries are."""
+        return tuple(entry >> low & (1 << high - low) - 1 for low, high in pairwise((0, *self)))
+
+    def owner(self, entry: np.ndarray) -> np.ndarray:
+        """The node that hangs above, -1 for none."""
+        return (entry >> self.node) - 1
+
+    def below(self, repeat: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """What is inside a list that has repeated so often, and hangs below the first of a rule's objects where there
+        were so many nodes."""
+        return (repeat << self.parent_repeat) + (1 + nodes << self.node)
 
 
 @lru_cache(64)
-def _productions(grammar: Grammar, N: int) -> np.ndarray:
-    """``(4 R + 2, K + 1)`` of each rule, and last of none, which pushes the finished scene: R symbols to push, whether
-    each is its parent's nonterminal, whether it is inside that as in a list, and the rule's object that it hangs below;
-    how far the top of the stack moves; how many objects there are."""
-    children, below = grammar.children.T, grammar.child_owner.T
+def _productions(grammar: Grammar, N: int, fields: Fields) -> np.ndarray:
+    """``(3 R + 2, K + 1)`` of each rule, and last of none, which pushes the finished scene: what is added to each of R
+    entries to push, which bits it has of the entry that is popped, and which of ``Fields.below``; how far the top of
+    the stack moves; how many objects there are."""
+    children, owner = grammar.children.T, grammar.child_owner.T
     same = children == grammar.lhs
-    inside = ~same & grammar.recursive[grammar.lhs]
+    inside, hangs = ~same & grammar.recursive[grammar.lhs], owner >= 0
+    of_repeat, of_parent, of_node = ((1 << high) - (1 << low) for low, high in pairwise((*fields, 63)))
+    pushed = children + (same.long() << fields.repeat) + (owner.clamp(min=0) << fields.node)
+    kept = same * of_repeat + ~inside * of_parent + ~hangs * of_node
+    taken = inside * of_parent + hangs * of_node
     numbers = torch.stack([N * (grammar.num_children - 1), grammar.num_objects])
-    table = pad(torch.cat([children, same.long(), inside.long(), below, numbers]), (0, 1))
-    R = len(children)
-    table[:R, -1], table[3 * R : 4 * R, -1] = len(grammar.nonterminals), -1
+    table = pad(torch.cat([pushed, kept, taken, numbers]), (0, 1))
+    table[: len(children), -1] = len(grammar.nonterminals)
     return table.numpy()
 
 

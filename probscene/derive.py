@@ -16,7 +16,7 @@ from pyro.poutine.messenger import Messenger
 from pyro.poutine.runtime import _PYRO_STACK, effectful
 from torch import Tensor
 
-from .derivation import Derivation, Frontier, expand
+from .derivation import Chooser, Derivation, Frontier, expand, of_tensors
 from .errors import ModelError, SamplingError
 from .grammar import Grammar
 from .policy import Policy, masked
@@ -26,7 +26,7 @@ RULE = "rule"  # of sites, before _0
 
 
 @effectful(type="derive")
-def _derived(grammar: Grammar, choose: Callable[..., Tensor], num_scenes: int, max_steps: int) -> Derivation:
+def _derived(grammar: Grammar, choose: Chooser, num_scenes: int, max_steps: int) -> Derivation:
     """``expand``, unless a handler has the derivations. Its message has a name, which users' handlers may ask for."""
     return expand(grammar, choose, num_scenes, max_steps)
 
@@ -101,7 +101,7 @@ def derive(
         _check(grammar, f"{name}_{t}", value, frontier)
         return value.squeeze(-1)
 
-    derivation = _effect(grammar, choose, num_scenes, max_steps, name=_message(name))
+    derivation = _effect(grammar, of_tensors(choose), num_scenes, max_steps, name=_message(name))
     for t in range(done, max_steps if static else done):
         nothing = RuleCategorical(logits=torch.zeros(num_scenes, 1, len(grammar.rules)), validate_args=False)
         pyro.sample(f"{name}_{t}", nothing.mask(torch.zeros(num_scenes, 1, dtype=torch.bool)))

@@ -3,18 +3,21 @@
 Axis letters: N scenes, K rules.
 """
 
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from .derivation import Frontier
+from .derivation import Arrays, Frontier, of_tensors
 from .errors import ModelError
 from .grammar import Grammar
 from .policy import Policy, cumulative, masked
 from .structure import StructurePrior
+
+BINS = 64  # of a probability, for each of which it is known where to begin to look
 
 
 class RuleCategorical(dist.Categorical):
@@ -43,11 +46,38 @@ def drawn(cumulative: Tensor) -> Tensor:
     return torch.searchsorted(cumulative, least).squeeze(-1)
 
 
-def looked_up(prior: StructurePrior, frontier: Frontier) -> Tensor:
-    """``drawn`` of a table, ``(N,)``, in numpy, see ``expand``."""
-    rows = prior.cumulative.take(prior.state(*(part.numpy() for part in frontier)), 1)  # (K, N)
-    least = rows[-1] * (1 - torch.rand(rows.shape[1]).numpy())
-    return torch.from_numpy((rows < least).sum(0, dtype=np.uint8 if len(rows) < 256 else None).astype(np.int64))
+class Inverse(NamedTuple):
+    """The inverse of the cumulative distributions of a table's rules, E that have a probability in all its rows.
+
+    Attributes:
+        total: ``(rows,)`` float32 the last of each distribution, about 1.
+        ascending: ``(E,)`` float64 the cumulative probabilities of all rows, each row 2 above the one before.
+        rule: ``(E,)`` int64 of each.
+        first: ``(2 * BINS * rows,)`` how many of them are below each 1 / BINS.
+    """
+
+    total: np.ndarray
+    ascending: np.ndarray
+    rule: np.ndarray
+    first: np.ndarray
+
+    @staticmethod
+    @lru_cache(64)
+    def of(prior: StructurePrior) -> "Inverse":
+        """Of a prior, whose table does not change any more."""
+        shares = cumulative(prior.table.flatten(0, 2)).nan_to_num(1.0)  # a row of no rule: no scene comes to it
+        rows, rules = (shares.diff(dim=1, prepend=torch.zeros(len(shares), 1)) > 0).nonzero(as_tuple=True)
+        ascending = (shares[rows, rules].double() + 2 * rows).numpy()
+        first = ascending.searchsorted(np.arange(2 * BINS * len(shares)) / BINS)
+        return Inverse(shares[:, -1].numpy(), ascending, rules.numpy(), first)
+
+    def drawn(self, row: np.ndarray) -> np.ndarray:
+        """A rule for each of some rows; of one seed those that ``drawn`` gives."""
+        sought = self.total.take(row) * (1 - torch.rand(len(row)).numpy()) + 2.0 * row
+        found = self.first.take((BINS * sought).astype(np.int64))
+        while np.count_nonzero(short := self.ascending.take(found) < sought):
+            found += short
+        return self.rule.take(found)
 
 
 class Choice:
@@ -62,11 +92,14 @@ class Choice:
     def __init__(self, grammar: Grammar, policy: Policy, num_scenes: int):
         self.grammar, self.policy, self.memory = grammar, policy, policy.start(num_scenes)
         self.prior = policy if type(policy) is StructurePrior and policy.support is None else None
+        self.ask = of_tensors(self._decided)
 
-    def __call__(self, t: int, frontier: Frontier, previous: Tensor) -> Tensor:
+    def __call__(self, t: int, frontier: Arrays, previous: np.ndarray) -> np.ndarray:
         """Rules ``(N,)``, whatever where a scene is finished."""
         if self.prior is not None:
-            return looked_up(self.prior, frontier)
+            return Inverse.of(self.prior).drawn(self.prior.state(*frontier))
+        return self.ask(t, frontier, previous)
+
+    def _decided(self, t: int, frontier: Frontier, previous: Tensor) -> Tensor:
         logits, self.memory = self.policy.step(self.memory, frontier, previous)
-        allowed = masked(self.grammar, logits, frontier, self.policy.support)
-        return drawn(cumulative(allowed))
+        return drawn(cumulative(masked(self.grammar, logits, frontier, self.policy.support)))

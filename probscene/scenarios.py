@@ -268,6 +268,6 @@ def _shortest(grammar: Grammar) -> Derivation:
     """One derivation with the fewest rules."""
     lengths = torch.tensor(shortest_lengths(grammar), dtype=torch.float64)
     needed = 1 + (lengths[grammar.children.clamp(min=0)] * (grammar.children >= 0)).sum(1)
-    best = needed.where(grammar.legal[:-1], torch.inf).argmin(1)
+    best = needed.where(grammar.legal[:-1], torch.inf).argmin(1).numpy()
     steps = int(lengths[0])
-    return expand(grammar, lambda t, frontier, previous: best[frontier.symbol], 1, steps)
+    return expand(grammar, lambda t, frontier, previous: best[frontier[0]], 1, steps)

@@ -7,7 +7,6 @@ hazard h(c) = P(n = c) / P(n >= c).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from .branching import Branching
 from .derivation import Frontier
 from .errors import GrammarError
 from .grammar import Grammar
-from .policy import Policy, cumulative
+from .policy import Policy
 
 
 @dataclass(frozen=True)
@@ -190,11 +189,6 @@ class StructurePrior(Policy):
     def logits(self, derivation) -> Tensor:
         """``(N, T, K)`` at once."""
         return self._look_up(derivation.frontier)
-
-    @cached_property
-    def cumulative(self) -> np.ndarray:
-        """``(K, states)`` the cumulative distributions of the rules."""
-        return cumulative(self.table.flatten(0, 2)).T.contiguous().numpy()
 
     def state(self, symbol: np.ndarray, repeat: np.ndarray, parent_repeat: np.ndarray) -> np.ndarray:
         """``(...)`` row of ``table.flatten(0, 2)``, of a frontier."""

@@ -13,7 +13,8 @@ from probscene.derivation import Derivation
 from probscene.derive import derive, derive_complete
 from probscene.errors import GrammarError, ModelError, SamplingError
 from probscene.grammar import Grammar
-from probscene.policy import Policy, rule_log_probs
+from probscene.policy import Policy, cumulative, rule_log_probs
+from probscene.rules import Inverse, drawn
 from probscene.structure import StructurePrior, counts, weights
 
 N, T = 16, 24
@@ -108,6 +109,23 @@ def test_a_seed_draws_the_same_scenes_and_what_comes_after_where_nothing_listens
     assert torch.equal(torch.rand(3), after)
     pyro.set_rng_seed(seed)
     assert same(derive(policy.grammar, policy, N, T), heard)
+
+
+@given(st.from_type(StructurePrior), SEED)
+def test_a_rule_that_is_looked_up_in_a_table_is_the_one_that_its_row_draws(prior, seed):
+    shares = cumulative(prior.table.flatten(0, 2))
+    generator = torch.Generator().manual_seed(seed)
+    known = (~shares[:, 0].isnan()).nonzero()[:, 0]
+    row = known[torch.randint(len(known), (500,), generator=generator)]
+    pyro.set_rng_seed(seed)
+    expected = drawn(shares[row])
+    pyro.set_rng_seed(seed)
+    assert Inverse.of(prior).drawn(row.numpy()).tolist() == expected.tolist()
+
+
+def test_more_steps_than_a_stack_can_count_are_refused():
+    with pytest.raises(GrammarError, match="max_steps of some thousands at most, actual 4194304"):
+        program(StructurePrior(LIST), 1, 1 << 22)
 
 
 @given(ANY_POLICY, SEED)

@@ -175,7 +175,7 @@ def test_siblings_of_groups_that_cannot_be_seen_come_in_any_order():
     """Below two lanes that have no class, cars' order says nothing; below one it is that along the image."""
     for text, any_order in (("Scene -> left(Cars) right(Cars) sun", True), ("Scene -> left(Cars) sun", False)):
         grammar = Grammar(f"{text}\nCars -> car car car")
-        derivation = expand(grammar, lambda t, frontier, previous: frontier.symbol, 20, 4)
+        derivation = expand(grammar, lambda t, frontier, previous: frontier[0], 20, 4)
         seen = Seen.of(grammar, ("car", "sun"), derivation)
         place = torch.rand(20, seen.kind.shape[1], 2, generator=torch.Generator().manual_seed(0))
         group = seen.taken(derivation.parent)
