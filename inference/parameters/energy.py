@@ -14,9 +14,8 @@ guesses what the guide expects. So such sites of scenes are learnt at the end fr
 prior: these are weighted by the guide's density, until the weighted readings are distributed like those in the target.
 Axis letters: N scenes, M nodes, G sites of scenes, L images, R rows, D entries.
 
-References:
+Reference:
     [1] Székely, Rizzo, *Energy statistics: a class of statistics based on distances*, 2013.
-    [2] Morozov, *On the solution of functional equations by the method of regularization*, 1966.
 """
 
 import math
@@ -25,7 +24,6 @@ from contextlib import contextmanager
 from typing import NamedTuple, cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..steps import StepTraining
@@ -35,7 +33,6 @@ from .net import ParameterNet, begin, gathered
 
 ROWS = 400, 1600  # of the guide's and of the target's objects of a kind that are compared in a step, at most
 PLACE, NUMBER = 2.0, 4.0  # what one place among siblings and one object more count, in u
-LEAST = 1e-3  # distance of readings of two images, in u, where all are the same
 
 
 class OwnReadings(NamedTuple):
@@ -101,9 +98,9 @@ class EnergyDistance(StepTraining):
 class WeightedEnergyDistance(StepTraining):
     """Resumable training of the last layers of some sites of scenes, from the prior.
 
-    Its loss is by how much the squared energy distance of each site's weighted readings exceeds what chance makes of as
-    many readings from one distribution. There each ends: what is read of the target has a chance of its own, and a
-    distribution that explains that as well is far from the truth where readings are poor [2].
+    Its loss is the squared energy distance of each site's weighted readings from what is read in the target, each
+    paired with itself as well: few renders that weigh much are farther from any target than many, so that weights stay
+    as even as they can.
 
     Args:
         net: trained in place.
@@ -137,12 +134,12 @@ class WeightedEnergyDistance(StepTraining):
     def loss(self) -> Tensor:
         """See ``StepTraining``."""
         with _only(self.net, self.module):
-            return torch.stack([self._excess(g, rows) for g, rows in self.sites.items()]).sum()
+            return torch.stack([self._distance(g, rows) for g, rows in self.sites.items()]).sum()
 
-    def _excess(self, g: int, rows: "WeightedRows") -> Tensor:
+    def _distance(self, g: int, rows: "WeightedRows") -> Tensor:
         u = self.own.scene[:, g : g + 1]
         log_q = self.net.scene_mixture(self.graph, self.own.scene, g).log_prob(u.nan_to_num(0.5))
-        return F.relu(rows.distance(log_q.where(~u.isnan(), 0.0)[:, 0].double().softmax(0)) / rows.chance - 1)
+        return rows.distance(log_q.where(~u.isnan(), 0.0)[:, 0].double().softmax(0))
 
 
 class WeightedRows(NamedTuple):
@@ -152,29 +149,24 @@ class WeightedRows(NamedTuple):
         own: ``(N, N)`` of one render from another.
         across: ``(N,)`` of each render from the target's images, in the mean.
         target: of one of these images from another, in the mean.
-        chance: by how much a squared energy distance of all renders and these images, each paired with itself as well,
-            is above 0 in the mean where both are of one distribution.
     """
 
     own: Tensor
     across: Tensor
     target: float
-    chance: float
 
     @staticmethod
     def of(own: Values, target: Values, g: int) -> "WeightedRows":
         """Of a scene's site."""
         turns = own.turns[own.nodes.shape[2] :][g : g + 1]
         rows, others = (_placed(values.scene[:, g : g + 1].double(), turns) for values in (own, target))
-        between = float(_within(others))
-        chance = max(LEAST, between) * (1 / len(rows) + 1 / len(others))
-        return WeightedRows(_distances(rows, rows), _distances(rows, others).mean(1), between, chance)
+        return WeightedRows(
+            _distances(rows, rows), _distances(rows, others).mean(1), float(_distances(others, others).mean())
+        )
 
     def distance(self, weight: Tensor) -> Tensor:
-        """Squared energy distance of renders of weight ``(N,)``, 1 in all, from the target, without bias: no render or
-        image is paired with itself. Otherwise few renders that weigh much would be near, whatever the target is."""
-        own = weight @ self.own @ weight / (1 - weight.square().sum()).clamp(min=1e-6)
-        return 2 * weight @ self.across - own - self.target
+        """Squared energy distance of renders of weight ``(N,)``, 1 in all, from the target."""
+        return 2 * weight @ self.across - weight @ self.own @ weight - self.target
 
 
 @contextmanager

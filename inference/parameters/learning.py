@@ -8,9 +8,9 @@
 4. Rounds: the reader is trained further, mostly on the guide's own renders, which look like the target, so that it
    reads the target better; it reads it again, and the guide goes on. This is empirical Bayes.
 5. What is read in the guide's renders is brought to what is read in the target (``energy``).
-6. It is settled which sites keep their prior. The reader learns the scene's sites that it reads with little skill once
-   more, from renders that are like the target but have the prior's values of them; these are weighted until what is
-   read is distributed as in the target.
+6. It is settled which sites keep their prior. The scene's sites that are read with little skill are read anew, by a
+   network of their own; renders that are like the target but have the prior's values of them are weighted until what
+   is read is distributed as in the target.
 
 Axis letters: N scenes, L images, K objects.
 """
@@ -42,9 +42,8 @@ from .schedule import EACH, ENERGY, LIKELIHOOD, OF_GUIDE, READING, SCENES, UNCLE
 from .sites import Site, find_sites
 
 TRIED = 500  # renders that a reader is tried on
-ASSEMBLED = 200  # renders in which it is seen how objects of a scene go together
-MISSED = 400  # renders in which it is seen what is not found
-OWN = 0.65  # of a round's renders are the guide's own
+ASSEMBLED, MISSED = 200, 400  # renders in which it is seen how objects of a scene go together; what is not found
+OWN, ANEW = 0.65, 0.5  # of a round's renders, and of those from which sites are read anew, are the guide's own
 AHEAD = 8  # steps for which they are drawn together
 ARRANGED = 0.5  # of the other renders are arranged
 GROUPS, ANYWHERE = 4, 0.3  # of own renders for sites of scenes; how often such a site has its prior in one
@@ -130,12 +129,10 @@ class ParameterLearning:
     def _run_phase(self, each: Report | None) -> None:
         if self.phases[self.phase] == UNCLEAR and self.settled is None:
             self.settled = frozenset(self.settle(self, True))
-        if self.inner is None:
-            self.inner = self._begun()
-        before = sum(self.lengths[: self.phase])
+        self.inner = self.inner or self._begun()
 
         def heard(training: Training, told: dict[str, float]) -> None:
-            self.done = before + training.done
+            self.done = sum(self.lengths[: self.phase]) + training.done
             if each is not None:
                 each(self, told)
 
@@ -176,8 +173,7 @@ class ParameterLearning:
             if self.best is not None:
                 self.best.restore(of_prefix(tensors, "best."))
         missing, inner = of_prefix(tensors, "missing."), of_prefix(tensors, "inner.")
-        if missing:
-            self.missing = Missing(**missing)
+        self.missing = Missing(**missing) if missing else None
         if inner:
             self.inner = self._begun()
             self.inner.restore(inner)
@@ -192,8 +188,9 @@ class ParameterLearning:
             rate = schedule.reader_rate / (1 if first else 2)
             return ReaderTraining(self.tried.reader, self._drawn, steps, schedule.reader_images, rate, seed)
         if what in (SCENES, UNCLEAR):
-            rate = schedule.scene_rate / (1 if first else 2)
-            return OverallTraining(self.tried.reader.overall, self._entered, EACH * steps, rate, seed)
+            rate = schedule.scene_rate / (1 if first or what == UNCLEAR else 2)
+            overall = self.tried.reader.overall if what == SCENES else self.tried.reading_anew()
+            return OverallTraining(overall, self._entered, EACH * steps, rate, seed)
         guide = self.guide
         assert guide is not None
         if what == LIKELIHOOD and self.missing is None:
@@ -218,9 +215,11 @@ class ParameterLearning:
         return not self._unclear if what in (UNCLEAR, WEIGHTS) else what == ENERGY and not self.tried.noisy.any()
 
     def _entered(self, num: int) -> tuple[Tensor, Tensor]:
-        """Renders for what is read of the whole scene. In some groups of the guide's renders a site has its prior; only
-        of these it is told what it is, as a reader that learnt what the guide draws would guess toward that."""
-        own, last = 0 if self.guide is None else round(OWN * num), self.phases[self.phase] == UNCLEAR
+        """Renders for what is read of the whole scene. In some groups of the guide's a site has its prior; only of
+        these it is told what it is, as a reader that learnt what the guide draws would guess toward that. Unclear sites
+        are read anew from fewer of the guide's, as these are not all like the target."""
+        last = self.phases[self.phase] == UNCLEAR
+        own = 0 if self.guide is None else round((ANEW if last else OWN) * num)
         drawn = [self.renders.draw(num - own, self.model.pretraining_policy, arranged=ARRANGED)]
         for i in range(min(GROUPS, own)):
             anywhere = {site.name for site in self.learnt if site.of_scene and torch.rand(()) < ANYWHERE}
@@ -229,7 +228,8 @@ class ParameterLearning:
             valued = self.own_scenes(kept, (own + i) // min(GROUPS, own))
             drawn.append(valued._replace(overall=valued.overall.where(torch.tensor(told), torch.nan)))
         entered = [self.tried.reader.eye.enter(some.drawn.image) for some in drawn]
-        return torch.cat(entered), torch.cat([some.overall for some in drawn])
+        open_to = torch.tensor([not last or site.name in self._unclear for site in self.scene_sites])
+        return torch.cat(entered), torch.cat([some.overall for some in drawn]).where(open_to, torch.nan)
 
     def _drawn(self, num: int) -> Valued:
         """Renders for a step of the reader. Those of several steps are drawn together, which takes hardly longer: a

@@ -20,8 +20,8 @@ class ParameterSchedule:
         rounds: of training the reader further on the guide's own renders, reading again and learning again.
         round_reader_steps, round_scene_renders, round_steps: of each.
         energy_steps, energy_scenes: of the energy distance then, and renders a step.
-        weighted_scenes: renders that are weighted at the end, where sites of scenes are read with little skill; the
-            reader learns these from ``scene_renders`` once more, and weights take ``round_steps``.
+        weighted_scenes: renders that are weighted at the end, where sites of scenes are read with little skill; these
+            are read anew, from ``scene_renders`` more, and weights take ``round_steps``.
         images: of the target, at most, that are read.
         reader_images: renders a step of the reader; of large images fewer, but at least 4.
         reader_rate, scene_rate, rate, energy_rate: largest learning rates.
@@ -39,7 +39,7 @@ class ParameterSchedule:
     round_steps: int = 300
     energy_steps: int = 40
     energy_scenes: int = 100
-    weighted_scenes: int = 1000
+    weighted_scenes: int = 3000
     images: int = 1000
     reader_images: int = 12
     reader_rate: float = 4e-3

@@ -21,14 +21,15 @@ class Overall(nn.Module):
     Args:
         sites: G.
         each: how many numbers are said of a site.
+        dropped: share of what enters that is left out in training.
     """
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, sites: int, each: int):
+    def __init__(self, sites: int, each: int, dropped: float = DROPPED):
         super().__init__()
-        self.sites, self.each, self.drop = sites, each, nn.Dropout(DROPPED)
+        self.sites, self.each, self.drop = sites, each, nn.Dropout(dropped)
         self.join, self.out = nn.Linear(NUMBERS, HIDDEN), nn.Linear(HIDDEN, sites * each)
         self.register_buffer("mean", torch.zeros(NUMBERS))
         self.register_buffer("deviation", torch.zeros(NUMBERS))

@@ -18,9 +18,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .eyes import WIDTH, Eye
-from .overall import Overall
+from .overall import Overall, looks
 
 HIDDEN = 96
+DROPPED_AGAIN = 0.5  # of what is seen of the whole scene, where a site is read anew
 LEAST_MASS = 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6  # of an object's unit, in four cells; one of these
 MOST = 200  # objects in an image
 LOG_SD = -6.0, 0.5  # of u, least and largest
@@ -60,11 +61,14 @@ class Reader(nn.Module):
         classes, sites, scene_sites: C, S and G.
 
     Attributes:
+        overall, again: what is said of the scenes' sites, and of those that are read anew.
+        anew: ``(G,)`` bool, which are.
         leasts: how much of an object's unit may have to be found.
         least: how much has to be; one of these.
     """
 
     least: Tensor
+    anew: Tensor
 
     def __init__(self, eye: Eye, classes: int, sites: int, scene_sites: int):
         super().__init__()
@@ -73,6 +77,9 @@ class Reader(nn.Module):
         self.hidden = nn.Linear(WIDTH + 2, HIDDEN)
         self.values = nn.Linear(HIDDEN, 2 + sites * (2 + HARMONICS))
         self.overall = Overall(max(1, scene_sites), 2 + HARMONICS)
+        with torch.random.fork_rng(devices=[]):
+            self.again = Overall(max(1, scene_sites), 2 + HARMONICS, DROPPED_AGAIN)
+        self.register_buffer("anew", torch.zeros(max(1, scene_sites), dtype=torch.bool))
         self.leasts = LEAST_MASS
         self.register_buffer("least", torch.tensor(LEAST_MASS[0]))
         with torch.no_grad():  # nearly every cell holds nothing
@@ -129,7 +136,7 @@ class Reader(nn.Module):
         parent, values = self.at(seen, image, rows, columns)
         here = torch.stack([columns, rows], -1) + 0.5
         scale = self.eye.cell
-        overall = self.overall(entered) if self.scene_sites else seen.new_zeros(len(seen), 0, 2 + HARMONICS)
+        overall = self._overall(entered) if self.scene_sites else seen.new_zeros(len(seen), 0, 2 + HARMONICS)
         return Found(
             n + first,
             inside,
@@ -139,6 +146,11 @@ class Reader(nn.Module):
             (share.unsqueeze(-1) * values).sum(1),
             overall,
         )
+
+    def _overall(self, entered: Tensor) -> Tensor:
+        x = looks(entered)
+        said = self.overall.said(x)
+        return self.again.said(x).where(self.anew[:, None], said) if self.anew.any() else said
 
 
 def blocks(mass: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -17,6 +17,7 @@ from ..likelihood import Values
 from ..sites import Site, having
 from .assembly import Assembly, assembly
 from .missing import Missing
+from .overall import Overall
 from .reader import Found, Reader
 from .skill import ENOUGH, LEAST_SD, Skill
 from .training import MIN_VISIBLE, Valued
@@ -121,6 +122,12 @@ class TriedReader:
         assert self.skill is not None
         each = zip((*self.node_sites, *self.scene_sites), self.skill.share.tolist(), strict=True)
         return frozenset(site.name for site, share in each if site in self.good_sites and share < UNCLEAR)
+
+    def reading_anew(self) -> Overall:
+        """The network that unclear sites of scenes are read by from now on."""
+        anew = [site.name in self.unclear for site in self.scene_sites]
+        self.reader.anew.copy_(torch.tensor(anew))
+        return self.reader.again
 
     def lost(self, valued: Valued) -> dict[str, float]:
         """Which of these cannot be read in renders that look like the target, but have the prior's values of them: what

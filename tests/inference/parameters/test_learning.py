@@ -195,6 +195,26 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
     assert int(by_guide.sum()) >= int((~is_told).sum())
 
 
+def test_unclear_sites_of_scenes_are_read_anew_by_a_network_that_is_told_them_alone(trays, monkeypatch):
+    monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
+    monkeypatch.setattr(TriedReader, "unclear", frozenset(["scene.bright"]))
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    schedule = ParameterSchedule(
+        reader_steps=1, scene_renders=200, steps=1, rounds=0, round_steps=1, energy_steps=0, weighted_scenes=4,
+        reader_images=2,
+    )  # fmt: skip
+    counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.randint(256, (30, 3, 64, 64))
+    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, images.byte, schedule)
+    learning.run()
+    anew = torch.tensor([site.name == "scene.bright" for site in learning.scene_sites])
+    found, entered = (see(images.byte()) for see in (learning.tried.reader.find, learning.tried.reader.eye.enter))
+    before, after = (net(entered) for net in (learning.tried.reader.overall, learning.tried.reader.again))
+    assert not torch.equal(before, after)
+    assert torch.equal(found.overall, after.where(anew[:, None], before))
+    learning.phase = learning.phases.index(UNCLEAR)
+    assert torch.equal(~learning._entered(40)[1].isnan(), anew.expand(40, -1))
+
+
 def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatch):
     """Sites that would keep their prior have it there, and so have those that are learnt at the end."""
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
