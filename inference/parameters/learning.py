@@ -41,7 +41,7 @@ from .reading.valued import Label, ValuedRenders, joined
 from .schedule import EACH, ENERGY, LIKELIHOOD, OF_GUIDE, READING, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
 from .sites import Site, find_sites
 
-TRIED = 500  # renders that a reader is tried on
+TRIED = 500  # renders that a reader is tried on, and that are drawn at once at most, as they take memory
 ASSEMBLED, MISSED = 200, 400  # renders in which it is seen how objects of a scene go together; what is not found
 OWN, ANEW = 0.65, 0.5  # of a round's renders, and of those from which sites are read anew, are the guide's own
 AHEAD = 8  # steps for which they are drawn together
@@ -283,10 +283,10 @@ class ParameterLearning:
     def own_scenes(self, kept: Collection[str] = (), num: int = TRIED) -> Valued:
         """The guide's renders, in which sites of some names have their prior, and those that are settled."""
         assert self.guide is not None
-        self.guide.passed = frozenset(kept) | (self.settled or frozenset())
-        valued = self.renders.draw(num, self.structure, self.guide.suited(self.model))
+        self.guide.passed, suited = frozenset(kept) | (self.settled or frozenset()), self.guide.suited(self.model)
+        parts = [self.renders.draw(len(some), self.structure, suited) for some in torch.arange(num).split(TRIED)]
         self.guide.passed = frozenset()
-        return valued
+        return joined(parts)
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int, kept: Collection[str] = ()) -> OwnReadings:
