@@ -44,8 +44,7 @@ from .sites import Site, find_sites
 TRIED = 500  # renders that a reader is tried on, and that are drawn at once at most, as they take memory
 ASSEMBLED, MISSED = 200, 400  # renders in which it is seen how objects of a scene go together; what is not found
 OWN, ANEW = 0.65, 0.5  # of a round's renders, and of those from which sites are read anew, are the guide's own
-AHEAD = 8  # steps for which they are drawn together
-ARRANGED = 0.5  # of the other renders are arranged
+AHEAD, ARRANGED = 8, 0.5  # steps for which they are drawn together; of the other renders are arranged
 GROUPS, ANYWHERE = 4, 0.3  # of own renders for sites of scenes; how often such a site has its prior in one
 
 
@@ -283,10 +282,11 @@ class ParameterLearning:
     def own_scenes(self, kept: Collection[str] = (), num: int = TRIED) -> Valued:
         """The guide's renders, in which sites of some names have their prior, and those that are settled."""
         assert self.guide is not None
-        self.guide.passed, suited = frozenset(kept) | (self.settled or frozenset()), self.guide.suited(self.model)
-        parts = [self.renders.draw(len(some), self.structure, suited) for some in torch.arange(num).split(TRIED)]
+        self.guide.passed = frozenset(kept) | (self.settled or frozenset())
+        sizes, suited = [len(some) for some in torch.arange(num).split(TRIED)], self.guide.suited(self.model)
+        valued = joined([self.renders.draw(size, self.structure, suited) for size in sizes])
         self.guide.passed = frozenset()
-        return joined(parts)
+        return valued
 
     @torch.no_grad()
     def _own(self, made: Assembly, num: int, kept: Collection[str] = ()) -> OwnReadings:
