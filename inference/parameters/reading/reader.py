@@ -61,7 +61,8 @@ class Reader(nn.Module):
         classes, sites, scene_sites: C, S and G.
 
     Attributes:
-        overall, again: what is said of the scenes' sites, and of those that are read anew.
+        overall: what is said of the scenes' sites.
+        again: what is said of those of them that are read anew.
         anew: ``(G,)`` bool, which are.
         leasts: how much of an object's unit may have to be found.
         least: how much has to be; one of these.
