@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ..run import RunFolder
 
 QUANTILES = np.linspace(0, 1, 21)
+LEAST_MOVED = 0.1  # of u; readings of little skill are off by as much in renders that merely resemble the target
 
 
 class Judged(NamedTuple):
@@ -43,14 +44,13 @@ class Judged(NamedTuple):
             it is not surely nearer. Unless the schedule says so, none is passed without which renders are surely
             farther. Where they are surely farther all the same, all are passed but those that bring them nearer alone.
             With the others the guide is kept, unless its renders are surely farther then.
-        lost: by learnt site that cannot be read in scenes like the target's and keeps its prior therefore, the share of
-            its variance that is read there.
+        because: by learnt site that keeps its prior whatever else is learnt, why; see ``of_unclear``.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
 
     distances: dict[str, Any]
-    lost: dict[str, float]
+    because: dict[str, str]
     sites: dict[str, dict[str, Any]]
 
 
@@ -80,18 +80,18 @@ def judged(
         return farther(drawn("learnt", learnt.suited(run.model)), of_prior, real)
 
     apart = compared()
-    kept, lost = "learnt" if apart.one < apart.other else "prior", dict[str, float]()
+    kept, because = "learnt" if apart.one < apart.other else "prior", dict[str, str]()
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         well = frozenset(learning.settle(learning, True) if learning.settled is None else learning.settled)
         badly = frozenset[str]()
         if learning.tried.unclear:
             seed_everything(batch_seed(run.record["seed"], 6, 4))
-            badly, lost = of_unclear(learning, more(), well)
+            badly, because = of_unclear(learning, more(), well)
         learnt.passed = well | badly
         if learnt.passed:
             apart = compared()
         if apart.sure and judge is not None:
-            learnt.passed = useless(learnt, judge) | lost.keys()
+            learnt.passed = useless(learnt, judge) | because.keys()
             apart = compared()
         kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
         if kept == "prior":
@@ -111,7 +111,7 @@ def judged(
             name: _distance(readings[name][site.name], readings["target"][site.name]) for name in ("prior", "learnt")
         }
         sites[site.name] = each | {"distance": away | {"floor": _distance(*(half[site.name] for half in halves))}}
-    return Judged(distances, lost, sites)
+    return Judged(distances, because, sites)
 
 
 def settling(
@@ -197,9 +197,10 @@ def passed(
 @torch.no_grad()
 def of_unclear(
     learning: ParameterLearning, images: Tensor, kept: frozenset[str]
-) -> tuple[frozenset[str], dict[str, float]]:
-    """Sites that keep their prior, of those that are read with little skill; and, of those among them that cannot be
-    read in scenes like the target's, the share of their variance that is read there.
+) -> tuple[frozenset[str], dict[str, str]]:
+    """Sites that keep their prior, of those that are read with little skill; and why, of those among them that have no
+    chance: they cannot be read in scenes like the target's, or are sites of scenes and differ by less than
+    ``LEAST_MOVED`` (Wasserstein-1) from their prior.
 
     What is read of such a site is mostly what other sites make of it. So renders with it are compared with renders that
     have the same but its prior; and first it is seen which have a chance at all, as those that are learnt wrongly would
@@ -212,16 +213,24 @@ def of_unclear(
     unclear = learning.tried.unclear
     without = learning.own_scenes(kept | unclear)
     lost = learning.tried.lost(without)
-    renders = {"without": without.drawn.image, "learnt": learning.own_scenes(kept).drawn.image}
+    because = {
+        s: f"in renders that look like the target {of:.0%} of its variance can be read" for s, of in lost.items()
+    }
+    learnt = learning.own_scenes(kept)
+    for site, *u in zip(learning.scene_sites, without.overall.unbind(1), learnt.overall.unbind(1), strict=True):
+        moved = _distance(*(some[~some.isnan()] for some in u)) or 0.0
+        if site.name in unclear - lost.keys() and moved < LEAST_MOVED:
+            because[site.name] = f"it would be {moved:.2f} of u from its prior, no farther than it may be misread"
+    renders = {"without": without.drawn.image, "learnt": learnt.drawn.image}
     read = learning.site_rows(renders | {"target": images})
-    likely = [name for name in sorted(unclear - lost.keys()) if _share(read[name], "without", "learnt") >= SURE]
+    likely = [name for name in sorted(unclear - because.keys()) if _share(read[name], "without", "learnt") >= SURE]
     others, chance = unclear - set(likely), (1 - SURE) / max(1, len(likely))
     if not likely:
-        return others, lost
+        return others, because
     renders = {name: learning.own_scenes(kept | others | {name}).drawn.image for name in likely}
     renders["learnt"] = learning.own_scenes(kept | others).drawn.image
     read = learning.site_rows(renders | {"target": images})
-    return others | {name for name in likely if _share(read[name], name, "learnt") < 1 - chance}, lost
+    return others | {name for name in likely if _share(read[name], name, "learnt") < 1 - chance}, because
 
 
 def _share(of: dict[str, tuple[Tensor, Tensor]], far: str, near: str) -> float:

@@ -173,9 +173,7 @@ def _record(
         share, fitted = skill.get(site, torch.nan), site in learning.learnt
         because = site.keeps or learning.tried.why_not(site)
         if site.name in passed:
-            because = "scenes come no nearer to held-out images by it"
-        if site.name in passed & found.lost.keys():
-            because = f"in renders that look like the target {found.lost[site.name]:.0%} of its variance can be read"
+            because = found.because.get(site.name, "scenes come no nearer to held-out images by it")
         about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}
         about |= {"fitted": fitted, "skill": share if share == share else None, "because": because}
         sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
