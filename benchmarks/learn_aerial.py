@@ -93,13 +93,13 @@ def judged(policy: Policy, truth: Truth) -> dict[str, float]:
 
 def show(table: dict[str, list[dict]]) -> None:
     """Print a line for each name: the mean and range of each column over its rows."""
-    print(f"\n{'':22}" + "".join(f"{column:>22}" for column in COLUMNS))
+    print(f"\n{'':22}" + "".join(f"{column:>26}" for column in COLUMNS))
     for name, rows in table.items():
         cells = []
         for column in COLUMNS:
             each = [row[column] for row in rows]
             cells.append(f"{np.mean(each):7.3f} {min(each):6.3f}..{max(each):6.3f}")
-        print(f"{name:22}" + "".join(f"{cell:>22}" for cell in cells))
+        print(f"{name:22}" + "".join(f"{cell:>26}" for cell in cells))
 
 
 def fit_images(preset: str, name: str, seed: int, out: Path) -> tuple[Policy, dict[str, float]]:
