@@ -212,14 +212,14 @@ def of_unclear(
     """
     unclear = learning.tried.unclear
     without = learning.own_scenes(kept | unclear)
-    lost = learning.tried.lost(without)
     because = {
-        s: f"in renders that look like the target {of:.0%} of its variance can be read" for s, of in lost.items()
+        name: f"in renders that look like the target {share:.0%} of its variance can be read"
+        for name, share in learning.tried.lost(without).items()
     }
     learnt = learning.own_scenes(kept)
     for site, *u in zip(learning.scene_sites, without.overall.unbind(1), learnt.overall.unbind(1), strict=True):
         moved = _distance(*(some[~some.isnan()] for some in u)) or 0.0
-        if site.name in unclear - lost.keys() and moved < LEAST_MOVED:
+        if site.name in unclear - because.keys() and moved < LEAST_MOVED:
             because[site.name] = f"it would be {moved:.2f} of u from its prior, no farther than it may be misread"
     renders = {"without": without.drawn.image, "learnt": learnt.drawn.image}
     read = learning.site_rows(renders | {"target": images})
