@@ -4,18 +4,20 @@ A file may export several models by name, ``SCENARIOS = {"city": ..., "rural": .
 them joined into one (``scenarios.join``), ``streets.py:city,rural`` is these two, and ``streets.py:city`` is one model.
 """
 
+import hashlib
 import importlib
 import os
 import re
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from probscene.batch import RenderBatch, Renderer
 from probscene.drawing import Drawing
-from probscene.errors import ModelError, ProbsceneError
+from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.generator import Command
 from probscene.model import SceneModel
 from probscene.render_check import check_renderer
@@ -77,14 +79,73 @@ def drawn_with(model: SceneModel) -> str:
     Raises:
         DataError: a file of the generator's cannot be read.
     """
-    made = model.generator.fingerprint() if isinstance(model.generator, Command) else ""
-    return "; ".join(filter(None, (model.assets, made)))
+    return "; ".join(filter(None, (model.assets, _generator(model))))
+
+
+def _generator(model: SceneModel) -> str:
+    return model.generator.fingerprint() if isinstance(model.generator, Command) else ""
 
 
 def same_assets(one: str, other: str) -> bool:
     """Whether two models draw with the same assets, by their words; ``--assets`` and an environment variable that name
     one folder give the same."""
     return _VARIABLE.sub("", one) == _VARIABLE.sub("", other)
+
+
+def assets_folder(model: SceneModel, given: Path | str | None) -> str:
+    """The folder that a model is drawn with: ``given``, or what an environment variable names; empty for none."""
+    return os.fspath(given or os.environ.get(model.assets_variable or "", ""))
+
+
+def assets_record(model: SceneModel, given: Path | str | None) -> dict[str, str]:
+    """What ``run.json`` says of what a model draws with: ``assets``, words; of a folder ``assets_sha256``, see
+    ``folder_digest``; and ``assets_folder``, its path, where it is ``given`` and no environment variable's.
+
+    Raises:
+        DataError: see ``drawn_with``.
+    """
+    record = {"assets": drawn_with(model)}
+    if given is not None:
+        record["assets_folder"] = os.path.abspath(given)
+    if folder := assets_folder(model, given):
+        record["assets_sha256"] = folder_digest(folder)
+    return record
+
+
+def recorded_model(record: dict[str, Any], run: Path) -> SceneModel:
+    """The model of the run in a folder, drawn with what the run was begun with, see ``assets_record``: a folder that
+    holds the same, wherever it lies by now. Runs of older versions have words alone, which name its place.
+
+    Raises:
+        RunError: it draws with something else, or its folder is gone.
+        ProbsceneError: see ``load_model`` and ``drawn_with``.
+    """
+    elsewhere = f"Where they lie elsewhere by now, probscene fit --assets FOLDER --out {run} --resume tells the run so."
+    given = record.get("assets_folder")
+    if given is not None and not Path(given).exists():
+        raise RunError(f"Expected the assets of the run {run} in {given}, actual nothing there. {elsewhere}")
+    model = load_model(record["model"], given)
+    now, folder = drawn_with(model), assets_folder(model, given)
+    if not folder or "assets_sha256" not in record:
+        same = same_assets(now, record["assets"])
+    else:
+        same = folder_digest(folder) == record["assets_sha256"] and record["assets"].endswith(_generator(model))
+    if not same:
+        changed = now == record["assets"]
+        hint = f" {elsewhere}" if "assets_sha256" in record and not changed else ""
+        raise RunError(
+            f"Expected model {model.name} to draw with {record['assets'] or 'no assets'}, as when the run {run} was "
+            f"begun, actual {now or 'no assets'}{', changed since' * changed}; put them back, or fit again.{hint}"
+        )
+    return model
+
+
+def folder_digest(folder: str) -> str:
+    """SHA-256 of the names and bytes in a folder, or of a file's bytes, hexadecimal; of nothing where there is none."""
+    digest, root = hashlib.sha256(), Path(folder)
+    for file in sorted(path for path in (root, *root.rglob("*")) if path.is_file()) if folder else ():
+        digest.update(repr(file.relative_to(folder).parts).encode() + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 def _loaded(reference: str) -> SceneModel:

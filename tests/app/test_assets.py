@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from probscene.app.fitting.run import RunFolder
-from probscene.app.loading import load_model, same_assets
+from probscene.app.loading import folder_digest, load_model, same_assets
 from probscene.errors import DataError, ModelError, RunError
 from probscene.models.assets.catalogue import street
 from probscene.sampling import sample
@@ -54,7 +54,7 @@ def test_every_scenario_is_drawn_with_the_folder(tmp_path, reference):
 
 def pictures(folder: Path) -> Path:
     for kind, size in (("car", (40, 20)), ("tree", (30, 30)), ("house", (50, 40))):
-        (folder / kind).mkdir()
+        (folder / kind).mkdir(parents=True)
         Image.fromarray(np.full((*size[::-1], 4), 255, np.uint8)).save(folder / kind / "a.png")
     return folder
 
@@ -131,7 +131,7 @@ def test_a_run_remembers_its_folder(tmp_path, monkeypatch, fresh_folders):
     assert json.loads((tmp_path / "run" / "run.json").read_text())["assets_folder"] == str(folder)
     shutil.move(folder, tmp_path / "moved")
     fresh_folders()
-    with pytest.raises(DataError, match="Expected a folder of meshes, actual .*mine"):
+    with pytest.raises(RunError, match="Expected the assets of .* in .*mine, actual nothing there. .*--assets"):
         RunFolder.at(tmp_path / "run").model.program  # noqa: B018
 
 
@@ -141,6 +141,35 @@ def test_a_run_is_bound_to_what_is_in_the_folder(tmp_path, fresh_folders):
     meshes(folder, SLAB.replace("2.2", "2.3"))
     fresh_folders()
     with pytest.raises(RunError, match="to draw with meshes in .*, as when the run .* was begun, actual meshes in"):
+        RunFolder.at(tmp_path / "run").model.program  # noqa: B018
+
+
+def test_so_it_is_where_words_do_not_say_what_a_folder_holds(tmp_path):
+    folder = pictures(tmp_path / "mine")
+    RunFolder.create(tmp_path / "run", "aerial2d", {}, folder)
+    assert RunFolder.at(tmp_path / "run").model.assets == f"pictures in {folder}"
+    Image.new("RGBA", (40, 20)).save(folder / "car" / "b.png")
+    with pytest.raises(RunError, match=f"actual pictures in {folder}, changed since; put them back, or fit again.$"):
+        RunFolder.at(tmp_path / "run").model.program  # noqa: B018
+
+
+def test_assets_may_be_a_file(tmp_path):
+    file, digests = tmp_path / "ink", []
+    for content in ("blue", "red", "blue"):
+        file.write_text(content)
+        digests.append(folder_digest(str(file)))
+    assert digests[0] == digests[2] != digests[1]
+
+
+def test_a_variable_may_name_another_folder_that_holds_the_same(tmp_path, monkeypatch):
+    folder = pictures(tmp_path / "mine")
+    monkeypatch.setenv("PROBSCENE_SPRITES", str(folder))
+    RunFolder.create(tmp_path / "run", "aerial2d", {})
+    shutil.move(folder, tmp_path / "moved")
+    monkeypatch.setenv("PROBSCENE_SPRITES", str(tmp_path / "moved"))
+    assert RunFolder.at(tmp_path / "run").model.assets == f"pictures in {tmp_path / 'moved'} (PROBSCENE_SPRITES)"
+    monkeypatch.delenv("PROBSCENE_SPRITES")
+    with pytest.raises(RunError, match="to draw with pictures in .*, as when .* was begun, actual no assets; put them"):
         RunFolder.at(tmp_path / "run").model.program  # noqa: B018
 
 

@@ -3,7 +3,6 @@ network was finished: with the same bytes, since a network is found under all th
 
 import hashlib
 import json
-import os
 import platform
 from collections.abc import Sequence
 from functools import cache
@@ -19,6 +18,7 @@ from probscene.errors import ProbsceneError, RunError
 from probscene.inference.features.base import FeatureNet
 
 from ..files import make_folder, write_text
+from ..loading import assets_folder, folder_digest
 from .parts import IN_MEMORY, is_file_part
 from .run import RunFolder
 from .storage import load_tensors, save_tensors, state_of
@@ -57,9 +57,7 @@ class NetworkCache:
             "torch": torch.__version__,
             "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability(), record["threads"]],
             "model": [record["model"], record["model_sha256"], record["assets"], list(run.model.canvas)],
-            "assets": _folder_digest(
-                record.get("assets_folder") or os.environ.get(run.model.assets_variable or "", "")
-            ),
+            "assets": folder_digest(assets_folder(run.model, record.get("assets_folder"))),
             "features": [words[1], repr(run.features) if self.usable and not is_file_part(words[1]) else ""],
             "weights": _digest(state_of(net)),
             "parts": record.get("parts", {}),
@@ -108,14 +106,6 @@ def _digest(tensors: dict[str, Tensor], lines: Sequence[str] = ()) -> str:
     for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
         digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _folder_digest(folder: str) -> str:
-    """Of all that a folder of assets holds; the words that a model has for it need not say."""
-    digest = hashlib.sha256()
-    for file in sorted(path for path in Path(folder).rglob("*") if path.is_file()) if folder else ():
-        digest.update(repr(file.relative_to(folder).parts).encode() + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
 

@@ -17,7 +17,7 @@ from probscene.policy import Policy
 
 from ..files import make_folder, write_json, write_whole
 from ..labelling.few import FewLabels
-from ..loading import BUILT_IN, drawn_with, lasting_reference, load_model, same_assets, split_reference
+from ..loading import BUILT_IN, assets_record, lasting_reference, load_model, recorded_model, split_reference
 from ..modules import file_digest
 from .learnt.parameters import apart, with_parameters
 from .parts import (
@@ -91,9 +91,8 @@ class RunFolder(Storage):
             digest = None if file is None else file_digest(file)
         make_folder(path)
         about: dict[str, Any] = {"format": FORMAT, "model": reference, "model_sha256": digest}
-        about |= {"assets": drawn_with(loaded), "within_support": not record.get("preset", {}).get("on_prior")}
-        if assets is not None:
-            about["assets_folder"] = os.path.abspath(assets)
+        about |= assets_record(loaded, assets)
+        about |= {"within_support": not record.get("preset", {}).get("on_prior")}
         run = cls(path, record | about, loaded, parts)
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
         if file is not None:
@@ -124,13 +123,7 @@ class RunFolder(Storage):
             reference = self.record["model"]
             self.check_objects("model")
             self._unchanged(Path(split_reference(reference)[0]), self.record["model_sha256"], "model")
-            model = load_model(reference, self.record.get("assets_folder"))
-            if not same_assets(actual := drawn_with(model), self.record["assets"]):
-                raise RunError(
-                    f"Expected model {model.name} to draw with {self.record['assets'] or 'no assets'}, as when the run "
-                    f"{self.path} was begun, actual {actual or 'no assets'}; put them back, or fit again."
-                )
-            self._model = model
+            self._model = recorded_model(self.record, self.path)
         if self.record.get("preset", {}).get("on_prior") and self._model.pretraining is not None:
             self._model = replace(self._model, pretraining=None)
         return self._model

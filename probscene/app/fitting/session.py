@@ -21,7 +21,7 @@ from ..checking.generator_check import cost
 from ..checking.model_check import QUICK, check_model
 from ..files import write_json
 from ..labelling.few import FewLabels, labels_record, read_few
-from ..loading import lasting_reference, load_model, split_reference
+from ..loading import drawn_with, folder_digest, lasting_reference, load_model, split_reference
 from ..modules import file_digest
 from ..progress import Display
 from ..targets import Target, lasting_target, open_images, say_notes
@@ -138,7 +138,7 @@ def resume(
     Args:
         model, target, preset, assets, settings: what the run must have been begun with, where it is not None; the
             settings are ``seed``, ``skip_bad`` and ``threads``. A model and images in memory are taken as they are;
-            files may lie elsewhere by now, and the run then knows them by their new place.
+            files may lie elsewhere by now, as may a folder of assets, and the run then knows them by their new place.
         parts: what the user brought as objects.
         make: the class of the run.
         labels: those that it was begun with, where they are not None; they, too, may lie elsewhere.
@@ -150,7 +150,7 @@ def resume(
     """
     run = make.at(out, model if isinstance(model, SceneModel) else None, parts)
     before = dict(run.record)
-    images = _relocate(run, model, target, labels, show)
+    images = _relocate(run, model, target, assets, labels, show)
     given = {
         "model": in_memory(model.name) if isinstance(model, SceneModel) else model and lasting_reference(model),
         "target": None if target is None else lasting_target(target) or "images in memory",
@@ -249,10 +249,15 @@ def check_takes_labels(features: Features) -> None:
 
 
 def _relocate(
-    run: RunFolder, model: str | SceneModel | None, target: Target | None, labels: Path | None, show: Display
+    run: RunFolder,
+    model: str | SceneModel | None,
+    target: Target | None,
+    assets: Path | None,
+    labels: Path | None,
+    show: Display,
 ) -> Images | None:
-    """Let a run's record name the model's file, the images and the labels where they lie now, if what is given has the
-    same bytes as what the run was begun with.
+    """Let a run's record name the model's file, its folder of assets, the images and the labels where they lie now, if
+    what is given has the same bytes as what the run was begun with.
 
     Returns:
         The images, where they had to be opened for that.
@@ -263,6 +268,9 @@ def _relocate(
         if names != begun or not Path(file).is_file() or file_digest(Path(file)) != record["model_sha256"]:
             return None
         record["model"] = lasting_reference(model)
+    if assets is not None and folder_digest(os.path.abspath(assets)) == record.get("assets_sha256"):
+        record["assets_folder"] = os.path.abspath(assets)
+        record["assets"] = drawn_with(run.model)
     if labels is not None and "labels" in record:
         found = labels_record(labels)
         if found["sha256"] == record["labels"]["sha256"]:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from probscene.app.fitting.run import RunFolder
+
 
 @pytest.fixture
 def moved(discs, target, fitted, tmp_path):
@@ -35,6 +37,36 @@ def test_a_run_goes_on_with_files_that_lie_elsewhere(call, fitted, moved):
     assert (out / "guide.safetensors").read_bytes() == (fitted / "guide.safetensors").read_bytes()
     done = call("report", out, "--out", here / "report")
     assert done.code == 0, done.err
+
+
+INKED = """
+import dataclasses
+MODEL = dataclasses.replace(MODEL, with_assets=lambda folder: dataclasses.replace(MODEL, assets=f"inks in {folder}"))
+"""
+
+
+@pytest.mark.parametrize("ink", ["blue", "red"])
+def test_a_folder_of_assets_may_lie_elsewhere_if_it_holds_the_same(call, fitted, moved, tmp_path, ink):
+    here, out = moved
+    (here / "model.py").write_text((here / "model.py").read_text() + INKED)
+    for folder, content in (("begun", "blue"), ("inks", ink)):
+        (here / folder).mkdir()
+        (here / folder / "ink").write_text(content)
+    made = RunFolder.create(tmp_path / "other", f"{here / 'model.py'}", {}, here / "begun").record
+    keys = ("model", "model_sha256", "assets", "assets_folder", "assets_sha256")
+    record = json.loads((out / "run.json").read_text()) | {key: made[key] for key in keys}
+    (out / "run.json").write_text(json.dumps(record | {"target": str(here / "images")}))
+    shutil.rmtree(here / "begun")
+    done = call("fit", "--out", out, "--resume")
+    assert done.code == 2 and f"probscene fit --assets FOLDER --out {out} --resume" in done.err
+    done = call("fit", "--out", out, "--resume", "--assets", here / "inks")
+    if ink == "red":
+        assert done.code == 2 and "Expected the assets_folder that the run" in done.err
+        return
+    assert done.code == 0, done.err
+    record = json.loads((out / "run.json").read_text())
+    assert (record["assets"], record["assets_folder"]) == (f"inks in {here / 'inks'}", str(here / "inks"))
+    assert (out / "guide.safetensors").read_bytes() == (fitted / "guide.safetensors").read_bytes()
 
 
 def test_it_says_what_to_name(call, moved):
