@@ -6,7 +6,8 @@ The target's images are drawn by the model's own target program with its own spr
 nine on the first road and three on the others, in the mean. Each seed has a target of its own, and fits see the folder
 alone. Printed is the total variation of 20,000 learnt structures from the distributions that the target was drawn from,
 the mean numbers of cars, and log q of 5,000 structures that no image shows, in nats a scene: its bound is the target's
-own log p. The fits of one preset and seed share their feature network, whose training counts as the first one's time.
+own log p. Beside them are the prior, the start, and the floor: as many structures of the target as it has images. The
+fits of one preset and seed share their feature network, whose training counts as the first one's time.
 """
 
 import argparse
@@ -67,10 +68,10 @@ def shares(mean: float) -> np.ndarray:
     return probs / probs.sum()
 
 
-def judged(policy: Policy, truth: Truth) -> dict[str, float]:
-    """How far a policy's structures are from the target's."""
+def judged(policy: Policy, truth: Truth, num: int = 20_000) -> dict[str, float]:
+    """How far ``num`` structures of a policy are from the target's distributions."""
     seed_everything(99)
-    derivation, _ = derive_complete(GRAMMAR, policy, 20_000, MODEL.max_steps)
+    derivation, _ = derive_complete(GRAMMAR, policy, num, MODEL.max_steps)
     found = per_parent(derivation, GRAMMAR.kind("road"), GRAMMAR.kind("car"))
     first, others = found.count[found.rank == 0], found.count[found.rank > 0]
     roads = derivation.counts(len(GRAMMAR.kinds))[:, GRAMMAR.kind("road")]
@@ -117,7 +118,11 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=5000)
     args = parser.parse_args()
-    rows = [{"fit": "prior", **judged(MODEL.prior, Truth())}, {"fit": "target", **judged(TARGET, Truth())}]
+    rows = [
+        {"fit": "prior", **judged(MODEL.prior, Truth())},
+        {"fit": "start", **judged(MODEL.pretraining_policy, Truth())},
+        {"fit": "floor", **judged(TARGET, Truth(), args.images)},
+    ]
     for seed in args.seeds:
         target = MODEL.target(0)
         images = args.out / f"target-{seed}"

@@ -1,11 +1,13 @@
 """How close a fit comes to the truth on Multi-MNIST, from target images that another program drew.
 
     python benchmarks/learn_multi_mnist.py --mnist FOLDER [--out FOLDER] [--presets quick oracle] [--targets 0]
+        [--learn structure]
 
 The images are drawn here with numpy and OpenCV from the digits of t10k (the original IDX files), which the model does
 not have; the fit sees the folder alone. Printed is the total variation of the number of digits and of their classes
-between 20,000 learnt structures and the distributions that the target was drawn from, and of the labels of 5,000 images
-that ``generate`` writes. Runs of one preset and seed share their feature network, which depends on nothing else.
+between 20,000 structures and the distributions that the target was drawn from, of the prior, of the start and of what
+was learnt, and of the labels of 5,000 images that ``generate`` writes. The floor is between two samples of the truth
+that are as large as the target. Runs of one preset and seed share their feature network, which depends on nothing else.
 """
 
 import argparse
@@ -24,12 +26,13 @@ from given import mnist_option, needed_mnist, out_option
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.preset import STRUCTURE
+from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
 from probscene.app.fitting.storage import timing
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
+from probscene.inference.judging.metrics import total_variation
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
@@ -47,6 +50,8 @@ PRESETS = {
 }
 ORACLE_BATCHES = 100
 GENERATED = 5000  # images
+FLOOR_PAIRS = 50
+SOURCES = ("prior", "start", "learnt", "generated", "floor")
 
 
 def distributions(target: int) -> tuple[np.ndarray, np.ndarray]:
@@ -98,16 +103,37 @@ def distances_generated(policy, target: int, folder: Path) -> tuple[float, float
 
 def from_truth(seen: np.ndarray, target: int) -> tuple[float, float]:
     """Total variation of number and of classes between counts ``(N, 10)`` and the truth."""
-    number, share = distributions(target)
-    lengths = np.bincount(seen.sum(1), minlength=32) / len(seen)
-    number = np.pad(number, (0, len(lengths) - len(number)))
-    return float(np.abs(lengths - number).sum() / 2), float(np.abs(seen.sum(0) / seen.sum() - share).sum() / 2)
+    return apart(shares(seen), distributions(target))
+
+
+def shares(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each number of digits, and of each class, in counts ``(N, 10)``."""
+    return np.bincount(seen.sum(1)) / len(seen), seen.sum(0) / seen.sum()
+
+
+def apart(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
+    """Total variation of number and of classes."""
+    number, classes = (total_variation(*pair) for pair in zip(one, other, strict=True))
+    return number, classes
+
+
+def floor(target: int, images: int) -> tuple[float, float]:
+    """The mean distances of two samples of the truth, of as many images as the target has."""
+    (number, share), rng = distributions(target), np.random.default_rng([9, target])
+
+    def sample() -> tuple[np.ndarray, np.ndarray]:
+        lengths = rng.choice(len(number), images, p=number)
+        return shares(rng.multinomial(lengths, share))
+
+    each = [apart(sample(), sample()) for _ in range(FLOOR_PAIRS)]
+    number_apart, classes_apart = np.mean(each, 0)
+    return float(number_apart), float(classes_apart)
 
 
 def fit_images(name: str, target: int, seed: int, args) -> tuple[LSTMGuide, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
     images, out = args.out / f"target-{target}", args.out / f"{name}-{target}"
-    preset = replace(PRESETS[name], learn=STRUCTURE)
+    preset = replace(PRESETS[name], learn=args.learn)
     run = fit("multi_mnist", images, preset, seed, out=out, resume=True, cache=args.out / "cache")
     return run.guide, timing(run)
 
@@ -146,35 +172,45 @@ def main():
     parser.add_argument("--targets", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=5000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--learn", choices=[STRUCTURE, BOTH], default=STRUCTURE, help="as of probscene fit (%(default)s)"
+    )
     args = parser.parse_args()
     args.mnist = needed_mnist(args.mnist)
     rows = []
     for name in args.presets:
         for target in args.targets:
             draw_target(args.mnist, target, args.out / f"target-{target}", args.images)
-            before = distances(MODEL.prior, target)
             if name == "oracle":
                 guide, took = fit_counts(target, args.seed, args.images)
             else:
                 guide, took = fit_images(name, target, args.seed, args)
-            after = distances(guide, target)
-            made = distances_generated(guide, target, args.out / f"{name}-{target}-generated")
-            rows.append({"preset": name, "target": target, "prior": before, "learnt": after})
-            rows[-1] |= {"generated": made, "seconds": took}
+            rows.append(
+                {
+                    "preset": name,
+                    "target": target,
+                    "prior": distances(MODEL.prior, target),
+                    "start": distances(MODEL.pretraining_policy, target),
+                    "learnt": distances(guide, target),
+                    "generated": distances_generated(guide, target, args.out / f"{name}-{target}-generated"),
+                    "floor": floor(target, args.images),
+                    "seconds": took,
+                }
+            )
             print(json.dumps(rows[-1]), flush=True)
             write_json(args.out / "results.json", rows)
-    head = [
-        f"{'preset':12}",
-        *(f"{what}: {'prior':>8} {'learnt':>8} {'generated':>10}" for what in ("number", "classes")),
-    ]
-    print("\n" + " ".join(head) + "   each target")
-    for name in args.presets:
-        mine = [row for row in rows if row["preset"] == name]
-        prior, learnt, made = (np.array([row[key] for row in mine]) for key in ("prior", "learnt", "generated"))
-        means = zip(prior.mean(0), learnt.mean(0), made.mean(0), strict=True)
-        text = " ".join(f"{p:16.3f} {q:8.3f} {g:10.3f} " for p, q, g in means)
-        each = zip(learnt, made, strict=True)
-        print(f"{name:12} {text}  " + "  ".join(f"{n:.3f}/{c:.3f} {a:.3f}/{b:.3f}" for (n, c), (a, b) in each))
+    show(args.presets, rows)
+
+
+def show(presets: list[str], rows: list[dict]) -> None:
+    """Print a line for each preset and what is compared: the means over the targets, then what was learnt of each."""
+    print(f"\n{'':20}" + "".join(f"{source:>11}" for source in SOURCES) + "   learnt, each target")
+    for name in presets:
+        for column, what in enumerate(("number", "classes")):
+            found = np.array([[row[source][column] for source in SOURCES] for row in rows if row["preset"] == name])
+            cells = "".join(f"{mean:11.3f}" for mean in found.mean(0))
+            each = " ".join(f"{value:.3f}" for value in found[:, SOURCES.index("learnt")])
+            print(f"{name:12}{what:8}{cells}   {each}")
 
 
 if __name__ == "__main__":
