@@ -140,6 +140,15 @@ def recorded_model(record: dict[str, Any], run: Path) -> SceneModel:
     return model
 
 
+def drawn_alike(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether two runs of one model draw with the same, by their records: with folders that hold the same, wherever
+    they lie, or by their words."""
+    digests = one.get("assets_sha256"), other.get("assets_sha256")
+    if None in digests:
+        return same_assets(one["assets"], other["assets"])
+    return digests[0] == digests[1]
+
+
 def folder_digest(folder: str) -> str:
     """SHA-256 of the names and bytes in a folder, or of a file's bytes, hexadecimal; of nothing where there is none."""
     digest, root = hashlib.sha256(), Path(folder)

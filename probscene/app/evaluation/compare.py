@@ -20,6 +20,7 @@ from probscene.inference.judging.tally import Tally
 
 from ..fitting.fit import Progress
 from ..fitting.run import RunFolder
+from ..loading import drawn_alike
 from .evaluate import Evaluation, network_counts
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
@@ -28,7 +29,6 @@ from .structure_counts import GROUPS, PARENTS, label
 from .visible import Visible, counted, number_of, seen_by, whole_note
 
 TRUTH, ESTIMATE = "truth", "estimate"
-SAME = ("model", "model_sha256", "assets")  # what runs of one model agree in
 
 
 class Row(NamedTuple):
@@ -141,15 +141,24 @@ def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
                 f"actual another {name!r} at {path}; rename the folder, or save the run under another name."
             )
         first = next(iter(runs.values()), run)
-        if differs := next((key for key in SAME if run.record[key] != first.record[key]), None):
-            what = {"model": "", "model_sha256": " as another file", "assets": " with other assets"}[differs]
+        differs = _differs(first.record, run.record)
+        if differs is not None:
             raise RunError(
                 f"Expected runs of one model, actual {first.path} of {first.record['model']} and {path} of "
-                f"{run.record['model']}{what}; compare runs of the same model."
+                f"{run.record['model']}{differs}; compare runs of the same model."
             )
         run.check_finished()
         runs[name] = run
     return runs
+
+
+def _differs(one: dict[str, Any], other: dict[str, Any]) -> str | None:
+    """In what another run's model is another one, by their records; None where it is the same."""
+    if one["model"] != other["model"]:
+        return ""
+    if one["model_sha256"] != other["model_sha256"]:
+        return " as another file"
+    return None if drawn_alike(one, other) else " with other assets"
 
 
 def compare(

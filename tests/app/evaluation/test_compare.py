@@ -40,10 +40,10 @@ def two(call, discs, fitted, target, tmp_path_factory) -> list[Path]:
     return [folder / "lstm", folder / "pcfg"]
 
 
-def untrained(folder: Path, model: str, seed: int, target: str = "images") -> Path:
+def untrained(folder: Path, model: str, seed: int, target: str = "images", assets: Path | None = None) -> Path:
     """A run whose guide learnt nothing, and which has seen no image."""
     record = {"guide": QUICK.guide_settings(), "preset": dataclasses.asdict(QUICK), "target": target, "seed": seed}
-    run = RunFolder.create(folder, model, record)
+    run = RunFolder.create(folder, model, record, assets)
     torch.manual_seed(seed)
     guide = run.new_guide()
     guide.out.bias.data[[k for k, rule in enumerate(run.model.grammar.rules) if not rule.rhs]] += 2.0  # short lists
@@ -192,6 +192,25 @@ def test_the_runs_own_target_is_taken_where_none_is_named(call, two, target, tmp
     assert done.code == 0 and "what the feature network sees" in done.out and "An estimate without labels" in done.out
     done = call("compare", *two, "--labels", target.labels, "--num", 100, "--out", tmp_path / "c.png")
     assert done.code == 0 and "TV and W-1 to the truth" in done.out
+
+
+INKED = """
+import dataclasses
+MODEL = dataclasses.replace(MODEL, with_assets=lambda folder: dataclasses.replace(MODEL, assets=f"inks in {folder}"))
+"""
+
+
+def test_assets_may_lie_in_several_places_if_they_are_the_same(tmp_path):
+    model = tmp_path / "inked.py"
+    model.write_text(PLATES.read_text() + INKED)
+    runs = []
+    for name, ink in (("a", "blue"), ("b", "blue"), ("c", "red")):
+        (tmp_path / "inks" / name).mkdir(parents=True)
+        (tmp_path / "inks" / name / "ink").write_text(ink)
+        runs.append(untrained(tmp_path / name, str(model), 0, assets=tmp_path / "inks" / name))
+    assert list(open_runs(runs[:2])) == ["a", "b"]
+    with pytest.raises(RunError, match=f"{runs[2]} of {model} with other assets"):
+        open_runs(runs)
 
 
 def test_what_cannot_be_compared(call, two, nested, target, tmp_path):
