@@ -125,12 +125,9 @@ def recorded_model(record: dict[str, Any], run: Path) -> SceneModel:
     if given is not None and not Path(given).exists():
         raise RunError(f"Expected the assets of the run {run} in {given}, actual nothing there. {elsewhere}")
     model = load_model(record["model"], given)
-    now, folder = drawn_with(model), assets_folder(model, given)
-    if not folder or "assets_sha256" not in record:
-        same = same_assets(now, record["assets"])
-    else:
-        same = folder_digest(folder) == record["assets_sha256"] and record["assets"].endswith(_generator(model))
-    if not same:
+    found = assets_record(model, given)
+    if not (drawn_alike(found, record) and record["assets"].endswith(_generator(model))):
+        now = found["assets"]
         changed = now == record["assets"]
         hint = f" {elsewhere}" if "assets_sha256" in record and not changed else ""
         raise RunError(
