@@ -141,8 +141,13 @@ def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
                 f"actual another {name!r} at {path}; rename the folder, or save the run under another name."
             )
         first = next(iter(runs.values()), run)
-        differs = _differs(first.record, run.record)
-        if differs is not None:
+        same = {
+            "": run.record["model"] == first.record["model"],
+            " as another file": run.record["model_sha256"] == first.record["model_sha256"],
+            " with other assets": drawn_alike(run.record, first.record),
+        }
+        if not all(same.values()):
+            differs = next(words for words, alike in same.items() if not alike)
             raise RunError(
                 f"Expected runs of one model, actual {first.path} of {first.record['model']} and {path} of "
                 f"{run.record['model']}{differs}; compare runs of the same model."
@@ -150,15 +155,6 @@ def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
         run.check_finished()
         runs[name] = run
     return runs
-
-
-def _differs(one: dict[str, Any], other: dict[str, Any]) -> str | None:
-    """In what another run's model is another one, by their records; None where it is the same."""
-    if one["model"] != other["model"]:
-        return ""
-    if one["model_sha256"] != other["model_sha256"]:
-        return " as another file"
-    return None if drawn_alike(one, other) else " with other assets"
 
 
 def compare(
