@@ -32,7 +32,7 @@ from probscene.app.fitting.storage import timing
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.judging.metrics import total_variation
+from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
@@ -108,7 +108,7 @@ def from_truth(seen: np.ndarray, target: int) -> tuple[float, float]:
 
 def shares(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of each number of digits, and of each class, in counts ``(N, 10)``."""
-    return np.bincount(seen.sum(1)) / len(seen), seen.sum(0) / seen.sum()
+    return histogram(seen.sum(1)), pooled_shares(seen)
 
 
 def apart(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
