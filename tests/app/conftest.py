@@ -128,3 +128,12 @@ def check_fault(result, code: int, *parts: str) -> None:
     assert result.err.endswith(line + "\n") and "Traceback" not in result.err
     for part in parts:
         assert part in line
+
+
+@pytest.fixture
+def inked() -> str:
+    """Lines that let a model's file take a folder of assets, which its pictures do not show."""
+    return """
+import dataclasses
+MODEL = dataclasses.replace(MODEL, with_assets=lambda folder: dataclasses.replace(MODEL, assets=f"inks in {folder}"))
+"""

@@ -194,15 +194,9 @@ def test_the_runs_own_target_is_taken_where_none_is_named(call, two, target, tmp
     assert done.code == 0 and "TV and W-1 to the truth" in done.out
 
 
-INKED = """
-import dataclasses
-MODEL = dataclasses.replace(MODEL, with_assets=lambda folder: dataclasses.replace(MODEL, assets=f"inks in {folder}"))
-"""
-
-
-def test_assets_may_lie_in_several_places_if_they_are_the_same(tmp_path):
+def test_assets_may_lie_in_several_places_if_they_are_the_same(tmp_path, inked):
     model = tmp_path / "inked.py"
-    model.write_text(PLATES.read_text() + INKED)
+    model.write_text(PLATES.read_text() + inked)
     runs = []
     for name, ink in (("a", "blue"), ("b", "blue"), ("c", "red")):
         (tmp_path / "inks" / name).mkdir(parents=True)

@@ -39,16 +39,10 @@ def test_a_run_goes_on_with_files_that_lie_elsewhere(call, fitted, moved):
     assert done.code == 0, done.err
 
 
-INKED = """
-import dataclasses
-MODEL = dataclasses.replace(MODEL, with_assets=lambda folder: dataclasses.replace(MODEL, assets=f"inks in {folder}"))
-"""
-
-
 @pytest.mark.parametrize("ink", ["blue", "red"])
-def test_a_folder_of_assets_may_lie_elsewhere_if_it_holds_the_same(call, fitted, moved, tmp_path, ink):
+def test_a_folder_of_assets_may_lie_elsewhere_if_it_holds_the_same(call, fitted, moved, tmp_path, ink, inked):
     here, out = moved
-    (here / "model.py").write_text((here / "model.py").read_text() + INKED)
+    (here / "model.py").write_text((here / "model.py").read_text() + inked)
     for folder, content in (("begun", "blue"), ("inks", ink)):
         (here / folder).mkdir()
         (here / folder / "ink").write_text(content)
