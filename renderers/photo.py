@@ -13,7 +13,7 @@ from probscene.photo import Photo, check_photo
 
 from . import engine
 from .kernels import tone
-from .kernels.finish import finish
+from .kernels.finish import blur_images, compress_images, develop_images
 
 _CHUNK = 1 << 28  # pixels of one launch; the kernel's offsets are 32-bit
 _GREY = np.array([0.299, 0.587, 0.114])
@@ -72,11 +72,19 @@ class PhotoFinish:
             if self._scratch.size < workers * room:
                 self._scratch = np.zeros(workers * room, np.float32)
             some = image[3 * start * pixels : 3 * part.stop * pixels + 8]
-            finish(
-                int(toned), workers, part.stop - start, height, width, room, weights.shape[1], np.zeros(1, np.int32),
-                table[part].ravel(), seeds[part], weights[part].ravel(), steps[part].ravel(), _COSINES, self._scratch,
-                some, some[: some.size // 8 * 8].view(np.uint64),
-            )  # fmt: skip
+            words = some[: some.size // 8 * 8].view(np.uint64)
+            rows, size = table[part], (workers, part.stop - start, height, width)
+            photos = rows.ravel()
+            if not toned and ((rows[:, tone.TONED] != 0) | (rows[:, tone.NOISE] > 0)).any():
+                develop_images(0, *size, np.zeros(1, np.int32), photos, seeds[part], some, words)
+            if most:
+                queue = np.zeros(1, np.int32)
+                blur_images(*size, room, weights.shape[1], queue, photos, weights[part].ravel(), self._scratch, some)
+                if (rows[:, tone.LATER] > 0).any():
+                    develop_images(1, *size, np.zeros(1, np.int32), photos, seeds[part], some, words)
+            if coded:
+                queue = np.zeros(1, np.int32)
+                compress_images(*size, room, queue, photos, steps[part].ravel(), _COSINES, self._scratch, some)
 
 
 def photographed(photo: Photo, image: Tensor, threads: int = 1) -> Tensor:

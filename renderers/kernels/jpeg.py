@@ -12,7 +12,6 @@ from .lanes import high, low
 COSINES = 64  # forward, and then backward
 
 i32, f32 = ti.i32, ti.f32
-array = ti.types.ndarray(f32, 1)
 
 
 @ti.func
@@ -22,74 +21,47 @@ def nearest(value: f32):
 
 
 @ti.real_func
-def blend(to: i32, one: i32, other: i32, count: i32, a: f32, b: f32, scratch: array):
-    """A first sum of two lines."""
-    for i in range(count):
-        scratch[to + i] = a * scratch[one + i] + b * scratch[other + i]
-
-
-@ti.real_func
-def add(to: i32, one: i32, other: i32, count: i32, a: f32, b: f32, scratch: array):
-    """Another sum."""
-    for i in range(count):
-        scratch[to + i] = scratch[to + i] + (a * scratch[one + i] + b * scratch[other + i])
-
-
-@ti.func
-def transform(
-    to: i32, source: i32, lines: i32, count: i32, cosines_base: i32, cosines: ti.template(), scratch: ti.template()
-):
-    """Eight lines as sums of eight others; either lie ``lines`` apart."""
-    for k in range(i32(8)):
-        line, c = to + k * lines, cosines_base + i32(8) * k
-        blend(line, source, source + lines, count, cosines[c], cosines[c + 1], scratch)
-        for pair in range(i32(1), i32(4)):
-            at, which = source + i32(2) * pair * lines, c + i32(2) * pair
-            add(line, at, at + lines, count, cosines[which], cosines[which + 1], scratch)
-
-
-@ti.real_func
-def move(to: i32, to_lines: i32, source: i32, lines: i32, count: i32, scratch: array):
-    """Eight lines to elsewhere."""
-    for k in range(i32(8)):
-        for i in range(count):
-            scratch[to + k * to_lines + i] = scratch[source + k * lines + i]
-
-
-@ti.real_func
-def settle(at: i32, count: i32, step: f32, scratch: array):
-    """A line in whole steps."""
-    for i in range(count):
-        scratch[at + i] = nearest(scratch[at + i] / step) * step
-
-
-@ti.real_func
-def limit(at: i32, count: i32, scratch: array):
-    """A line in whole numbers of -128..127."""
-    for i in range(count):
-        scratch[at + i] = low(high(nearest(scratch[at + i]), f32(-128.0)), f32(127.0))
-
-
-@ti.func
 def quantise(
-    plane: i32, rows: i32, blocks: i32, spare: i32, steps_base: i32, steps: ti.template(), cosines: ti.template(),
-    scratch: ti.template(),
+    plane: i32, rows: i32, blocks: i32, spare: i32, steps_base: i32, steps: ti.types.ndarray(f32, 1),
+    cosines: ti.types.ndarray(f32, 1), scratch: ti.types.ndarray(f32, 1),
 ):  # fmt: skip
-    """A plane through its cosine transforms in whole steps and back, to whole numbers in -128..127."""
-    strip, other = i32(8) * blocks, spare + i32(64) * blocks
+    """A plane through its cosine transforms in whole steps and back, to whole numbers in -128..127.
+
+    Each strip of eight rows takes 18 transforms of eight lines, which lie a strip or a row of blocks apart: one down
+    the columns, for each column of the blocks one along the rows and, in whole steps, its inverse, and one back.
+    """
+    strip, turned = i32(8) * blocks, spare + i32(64) * blocks
     for first in range(rows >> i32(3)):
-        at = plane + first * strip
-        move(spare, strip, at, rows * blocks, strip, scratch)
-        transform(other, spare, strip, strip, i32(0), cosines, scratch)
-        for column in range(i32(8)):
-            here, there = other + column * strip, spare + column * strip
-            transform(there, here, blocks, blocks, i32(0), cosines, scratch)
-            for row in range(i32(8)):
-                settle(there + row * blocks, blocks, steps[steps_base + 8 * row + column], scratch)
-            transform(here, there, blocks, blocks, i32(COSINES), cosines, scratch)
-        transform(spare, other, strip, strip, i32(COSINES), cosines, scratch)
-        limit(spare, i32(8) * strip, scratch)
-        move(at, rows * blocks, spare, strip, strip, scratch)
+        for k in range(i32(8)):
+            at = plane + first * strip + k * rows * blocks
+            for i in range(strip):
+                scratch[spare + k * strip + i] = scratch[at + i]
+        for step in range(i32(18)):
+            inner, back = (step > 0) & (step < 17), step == 17 or (step > 0 and (step & 1) == 0)
+            column = ti.select(inner, (step - i32(1)) >> i32(1), i32(0))
+            lines = ti.select(inner, blocks, strip)
+            from_spare = (step == 0) | (inner & back)
+            source = ti.select(from_spare, spare, turned) + column * strip
+            to = ti.select(from_spare, turned, spare) + column * strip
+            cosine = ti.select(back, i32(COSINES), i32(0))
+            for k in range(i32(8)):
+                line, c = to + k * lines, cosine + i32(8) * k
+                a, b = cosines[c], cosines[c + 1]
+                for i in range(lines):
+                    scratch[line + i] = a * scratch[source + i] + b * scratch[source + lines + i]
+                for pair in range(i32(1), i32(4)):
+                    one = source + i32(2) * pair * lines
+                    a, b = cosines[c + 2 * pair], cosines[c + 2 * pair + 1]
+                    for i in range(lines):
+                        scratch[line + i] = scratch[line + i] + (a * scratch[one + i] + b * scratch[one + lines + i])
+                a = ti.select(inner & (not back), steps[steps_base + i32(8) * k + column], f32(0.0))
+                for i in range(ti.select(a > 0, lines, i32(0))):
+                    scratch[line + i] = nearest(scratch[line + i] / a) * a
+        for k in range(i32(8)):
+            at = plane + first * strip + k * rows * blocks
+            for i in range(strip):
+                value = nearest(scratch[spare + k * strip + i])
+                scratch[at + i] = low(high(value, f32(-128.0)), f32(127.0))
 
 
 @ti.func
@@ -177,8 +149,8 @@ def compress(
     red = blue + rows * blocks * i32(2)
     spare = red + rows * blocks * i32(2)
     to_planes(first, height, width, rows, blocks, luminance, blue, red, image, scratch)
-    quantise(luminance, rows, blocks, spare, steps_base, steps, cosines, scratch)
-    for colour in range(i32(2)):
-        plane = ti.select(colour == 0, blue, red)
-        quantise(plane, rows >> i32(1), blocks >> i32(1), spare, steps_base + i32(64), steps, cosines, scratch)
+    for plane in range(i32(3)):
+        halved = ti.select(plane == 0, i32(0), i32(1))
+        at = ti.select(plane == 0, luminance, ti.select(plane == 1, blue, red))
+        quantise(at, rows >> halved, blocks >> halved, spare, steps_base + i32(64) * halved, steps, cosines, scratch)
     from_planes(first, height, width, rows, blocks, luminance, blue, red, image, scratch)

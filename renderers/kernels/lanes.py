@@ -6,7 +6,11 @@ of an array of vectors, of which it asks once.
 
 A ``ti.real_func`` asks once as well, for all that it does, so its loops over arrays are computed side by side: spans of
 triangles are drawn by such, in whole ``LANES``. What it calls may hold no branch and no loop, which Taichi 1.7 would
-put into the kernel instead.
+put into the kernel instead. It is as fast only where LLVM puts it into the kernel, so it is called from one or two
+places.
+
+A kernel calls one real function and no other. Taichi 1.7 names a compiled kernel in its cache by the real functions as
+well, in the order of their addresses: with a second one every process finds another name, and compiles it anew.
 """
 
 from ..engine import ti

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 ENGINE = """
 import os, torch
@@ -28,7 +29,7 @@ def child(expected):
 
 def _run(code, **environment):
     command = [sys.executable, "-W", "error", "-c", ENGINE + code]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment}, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment}, timeout=600)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -50,3 +51,44 @@ assert renderer(drawing).pixels.item() > 0 and field[1] == 7
 def test_taichi_works_where_no_cache_can_be_written(tmp_path):
     (tmp_path / "file").touch()
     _run("renderer(drawing)", XDG_CACHE_HOME=str(tmp_path / "file"))
+
+
+RENDERERS = Path(__file__).resolve().parents[2] / "renderers"
+KERNELS = [path for path in RENDERERS.rglob("*.py") for _ in range(path.read_text().count("@ti.kernel"))]
+EVERY_KERNEL = """
+from collections import defaultdict
+import numpy as np
+from probscene.mesh import Mesh
+from probscene.photo import Photo
+from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.photo import photographed
+from probscene.world import Camera, Light, Meshes, World, resolve_meshes, resolve_scene
+
+function, called = engine.ti.lang.kernel_impl.Func, defaultdict(set)
+call = function.func_call_rvalue
+def recorded(self, key, args):
+    called[id(engine.get_runtime().compiling_callable)].add(self.func.__name__)
+    return call(self, key, args)
+function.func_call_rvalue = recorded
+
+renderer(drawing)
+effects = Photo(contrast=0.5, blur=1.0, noise=1.0, jpeg_quality=50.0)
+photographed(resolve_scene(effects, 1), torch.zeros(1, 3, 20, 20, dtype=torch.uint8))
+mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]), (9, 9, 9))
+camera, light, photo = (resolve_scene(part, 1) for part in (Camera(), Light(), Photo()))
+layer = resolve_meshes(Meshes("a", (mesh,), 0, 9.0, 0.0), one > 0)
+world = World(drawing.kind, ("a",), (layer,), camera=camera, light=light, photo=photo, ground=None)
+for samples in (1, 4):
+    MeshRenderer((20, 20), samples=samples)(world)
+print(*(" ".join(sorted(names)) for names in called.values()), sep=",")
+"""
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    """Taichi finds a kernel of two real functions only where they happen to have the same order of addresses."""
+    folder, compiled = tmp_path / "taichi", []
+    for _ in range(2):
+        called = _run(EVERY_KERNEL, PROBSCENE_CACHE=str(tmp_path)).strip().split(",")
+        compiled.append(sorted(path.name for path in folder.glob("*.tic")))
+        assert all(" " not in names for names in called), called
+    assert len(compiled[0]) == len(set(compiled[0])) >= len(KERNELS) and compiled[0] == compiled[1]

@@ -107,7 +107,7 @@ def render(
                         last, area = draw_instance(
                             k, last, target, height, width, ti.static(2 if fine else 1), base, seen_base + room,
                             stamp_base, corner_base, record_base, mark_base, texel, whole, real, positions, triangles,
-                            faces, seen, stamp, corners, records, marks, extent,
+                            faces, seen, shadow, stamp, corners, records, marks, extent,
                         )  # fmt: skip
                         if node >= 0:
                             total = target * tables.RESULTS + tables.WHOLE
@@ -120,8 +120,9 @@ def render(
                     for k in range(first[scene], first[scene + 1]):
                         if whole[k * tables.INTEGERS + tables.CASTS] != 0:
                             cast_shadow(
-                                k, map_size, map_base, corner_base, whole, real, positions, triangles, shadow, corners
-                            )
+                                k, map_size, map_base, corner_base, whole, real, positions, triangles, seen, shadow,
+                                corners,
+                            )  # fmt: skip
                 light, photo = shading.lights(scene, scene_table), tone_of(scene, photos)
                 for row in range(height):
                     pixel, line_at = row * width, base + row * width

@@ -99,8 +99,8 @@ def draw_instance(
     k: i32, count: i32, node: i32, height: i32, width: i32, zooms: i32, base: i32, fine_base: i32,
     stamp_base: i32, corner_base: i32, record_base: i32, mark_base: i32, texel: f64,
     whole: ti.template(), real: ti.template(), positions: ti.template(), triangles: ti.template(),
-    faces: ti.template(), seen: ti.template(), stamp: ti.template(), corners: ti.template(), records: ti.template(),
-    marks: ti.template(), extent: ti.template(),
+    faces: ti.template(), seen: ti.template(), shadow: ti.template(), stamp: ti.template(), corners: ti.template(),
+    records: ti.template(), marks: ti.template(), extent: ti.template(),
 ):  # fmt: skip
     """Draw what faces the camera with records from ``count + 1`` on.
 
@@ -169,7 +169,7 @@ def draw_instance(
                             u0 * by + shift, v0 * by + shift, u1 * by + shift, v1 * by + shift, u2 * by + shift,
                             v2 * by + shift, w[2] - (w[0] + w[1]) * shift / by, w[0] / by, w[1] / by, last + 1,
                             ti.cast(node >= 0 and zoom == 1, i32), height * zoom, width * zoom,
-                            ti.select(zoom == 1, base, fine_base), stamp_base, seen, stamp,
+                            ti.select(zoom == 1, base, fine_base), stamp_base, seen, shadow, stamp,
                         )  # fmt: skip
                         visible, area = visible | seen_here, area + fresh
                 if visible != 0:

@@ -63,24 +63,34 @@ def stamp_row(first: i32, last: i32, at: i32, stamp: ti.template()):
 
 
 @ti.real_func
-def draw_span(at: i32, count: i32, start: f32, slope: f32, record: i32, seen: ti.types.ndarray(u64, 1)) -> i32:
-    """Draw samples from a place of the visibility buffer on; 1/z is ``start`` at the first and linear.
+def draw_span(
+    at: i32, count: i32, start: f32, slope: f32, record: i32, seen: ti.types.ndarray(u64, 1),
+    shadow: ti.types.ndarray(f32, 1),
+) -> i32:  # fmt: skip
+    """Draw samples from a place of the visibility buffer on, or where the record is -1 texels of the shadow map.
 
-    Up to ``LANES - 1`` words behind them are written as they were. Returns whether any sample is seen.
+    1/z of a sample, how near to the sun a texel is, is ``start`` at the first and linear. Up to ``LANES - 1`` behind
+    them are written as they were. Returns whether any sample is seen.
     """
     changed = u64(0)
-    for i in range(whole_lanes(count)):
-        old, word = seen[at + i], key(start + slope * ti.cast(i, f32), record)
-        new = ti.select((i < count) & (word > old), word, old)
-        changed |= new ^ old
-        seen[at + i] = new
+    if record >= 0:
+        for i in range(whole_lanes(count)):
+            old, word = seen[at + i], key(start + slope * ti.cast(i, f32), record)
+            new = ti.select((i < count) & (word > old), word, old)
+            changed |= new ^ old
+            seen[at + i] = new
+    else:
+        for i in range(whole_lanes(count)):
+            old, near = shadow[at + i], start + slope * ti.cast(i, f32)
+            shadow[at + i] = ti.select((i < count) & (near > old), near, old)
     return ti.cast(changed != 0, i32)
 
 
 @ti.func
 def fill(
     a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, w: f64, w_u: f64, w_v: f64, record: i32, stamped: i32,
-    height: i32, width: i32, base: i32, stamp_base: i32, seen: ti.template(), stamp: ti.template(),
+    height: i32, width: i32, base: i32, stamp_base: i32, seen: ti.template(), shadow: ti.template(),
+    stamp: ti.template(),
 ):  # fmt: skip
     """Draw a triangle with corners (a, b) of columns and rows; 1/z is ``w`` at the first sample and linear.
 
@@ -95,7 +105,7 @@ def fill(
         first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, width)
         if first < last:
             start = ti.cast(w + w_v * y + w_u * ti.cast(first, f64), f32)
-            visible |= draw_span(base + row * width + first, last - first, start, slope, record, seen)
+            visible |= draw_span(base + row * width + first, last - first, start, slope, record, seen, shadow)
             if stamped != 0:
                 area += stamp_row(first, last, stamp_base + row * ((width + 63) >> 6), stamp)
     return visible, area

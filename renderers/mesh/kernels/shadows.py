@@ -4,15 +4,15 @@ The map is cleared, written and read in tiles of 16 x 16, and only those that so
 """
 
 from ...engine import ti
-from ...kernels.lanes import LANES, floats, high, low, whole, whole_lanes
+from ...kernels.lanes import LANES, floats, high, low, whole
 from .. import tables
 from ..tables import ON_MAP
-from .raster import by_height, columns, up
+from .raster import by_height, columns, draw_span, up
 from .vertices import CORNER, transform, vertex
 
 NOTHING = -1e30
 TILE = 4  # bits of a tile's width
-SPARE = 1 << 2 * TILE  # texels behind each worker's map, a tile of them, which `cast_span` may write to
+SPARE = 1 << 2 * TILE  # texels behind each worker's map, a tile of them, which ``draw_span`` may write to
 SLACK = 0.02  # metres by which a shadow keeps off what casts it
 
 i32, f32, f64 = ti.i32, ti.f32, ti.f64
@@ -50,21 +50,10 @@ def open_tiles(k: i32, mark: i32, size: i32, base: i32, whole: ti.template(), sh
                         shadow[line + 16] = f32(NOTHING)
 
 
-@ti.real_func
-def cast_span(at: i32, count: i32, start: f32, slope: f32, shadow: ti.types.ndarray(f32, 1)):
-    """Draw texels from a place of the map on; how near to the sun they are is ``start`` at the first and linear.
-
-    Up to ``LANES - 1`` texels behind them are written as they were.
-    """
-    for i in range(whole_lanes(count)):
-        old, near = shadow[at + i], start + slope * ti.cast(i, f32)
-        shadow[at + i] = ti.select((i < count) & (near > old), near, old)
-
-
 @ti.func
 def fill_map(
     a0: f64, b0: f64, a1: f64, b1: f64, a2: f64, b2: f64, d: f64, d_u: f64, d_v: f64,
-    size: i32, base: i32, shadow: ti.template(),
+    size: i32, base: i32, seen: ti.template(), shadow: ti.template(),
 ):  # fmt: skip
     """Keep what is nearest to the sun; its distance is ``d`` at the first texel and linear."""
     u0, v0, u1, v1, u2, v2 = by_height(a0, b0, a1, b1, a2, b2)
@@ -74,13 +63,14 @@ def fill_map(
         y = ti.cast(row, f64)
         first, last = columns(y, u0, v0, v1, u1, whole, upper, lower, size)
         start = ti.cast(d + d_v * y + d_u * ti.cast(first, f64), f32)
-        cast_span(base + row * size + first, last - first, start, slope, shadow)
+        draw_span(base + row * size + first, last - first, start, slope, i32(-1), seen, shadow)
 
 
 @ti.func
 def cast_shadow(
     k: i32, size: i32, base: i32, corner_base: i32, whole: ti.template(), real: ti.template(),
-    positions: ti.template(), triangles: ti.template(), shadow: ti.template(), corners: ti.template(),
+    positions: ti.template(), triangles: ti.template(), seen: ti.template(), shadow: ti.template(),
+    corners: ti.template(),
 ):  # fmt: skip
     """Draw an instance on the shadow map; of a closed mesh the triangles that face the sun will do."""
     transform(k, tables.TO_MAP, 0, corner_base, whole, real, positions, corners)
@@ -98,7 +88,7 @@ def cast_shadow(
                 d_u = (one[2] * other[1] - one[1] * other[2]) / faces
                 d_v = (one[0] * other[2] - one[2] * other[0]) / faces
                 start = a[2] - d_u * a[0] - d_v * a[1]
-                fill_map(a[0], a[1], b[0], b[1], c[0], c[1], start - SLACK, d_u, d_v, size, base, shadow)
+                fill_map(a[0], a[1], b[0], b[1], c[0], c[1], start - SLACK, d_u, d_v, size, base, seen, shadow)
 
 
 @ti.func
