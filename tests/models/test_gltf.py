@@ -459,6 +459,13 @@ def test_a_factor_that_is_dark_keeps_its_hue(tmp_path):
     assert (file.read(tmp_path)["colour"] == (200, 10, 30)).all()
 
 
+def test_a_grey_picture_of_16_bits(tmp_path):
+    file = File()
+    values = np.uint16(QUARTERS[..., 0]) * 257
+    file.tree["images"] = [{"bufferView": file.view(png(values)), "mimeType": "image/png"}]
+    assert (middles(file.read(tmp_path)) == RED[0]).all()
+
+
 @pytest.mark.parametrize(
     "name",
     ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu", "MSFT_lod", "KHR_techniques_webgl"],

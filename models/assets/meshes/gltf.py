@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
-from PIL import Image
 
 from probscene.errors import DataError
 
-from .part import Part, check_geometry, check_number, decoded, is_tinted
+from .part import Part, check_geometry, check_number, decoded, is_tinted, opened
 
 DRAWN = {
     "EXT_mesh_gpu_instancing",
@@ -35,6 +34,7 @@ _NUMBERS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _CLAMP, _MIRROR = 33071, 33648
+_AT_REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 _GREY = 200.0  # of 255, of what has neither a material nor colours
 
 
@@ -82,6 +82,8 @@ class _Gltf:
 
     def __init__(self, file: Path, tree: dict[str, Any], binary: bytes):
         self.file, self.tree = file, tree
+        if (version := str(tree.get("asset", {}).get("version", "2.0"))).startswith("1"):
+            raise DataError(f"Expected glTF 2.0, actual {version} in {file}; export it again.")
         if beyond := sorted(set(tree.get("extensionsRequired", [])) - DRAWN):
             raise self._needs(beyond[0])
         uris = [buffer.get("uri") for buffer in tree.get("buffers", [])]
@@ -260,13 +262,7 @@ class _Gltf:
                 data = self._data(image["uri"], "texture")
             uri = image.get("uri", "data:")
             name = f"the picture inside {self.file}" if uri.startswith("data:") else str(self._path(uri))
-            try:
-                opened = Image.open(io.BytesIO(data))
-            except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-                raise DataError(
-                    f"Expected a picture, actual {name}, which {self.file} names; replace it by a PNG or JPEG."
-                ) from None
-            self.pictures[source] = decoded(self.file, name, opened)
+            self.pictures[source] = decoded(self.file, name, opened(self.file, name, io.BytesIO(data)))
         sampler = self.tree["samplers"][texture["sampler"]] if "sampler" in texture else {}
         return self.pictures[source], (sampler.get("wrapS", 0), sampler.get("wrapT", 0))
 
@@ -283,7 +279,11 @@ class _Gltf:
         if sparse := accessor.get("sparse"):
             at = self._rows(sparse["indices"], sparse["count"], np.dtype(_NUMBERS[sparse["indices"]["componentType"]]))
             values[at[:, 0]] = self._rows(sparse["values"], sparse["count"], dtype, width)
-        return np.maximum(values / np.iinfo(dtype).max, -1.0) if accessor.get("normalized") else values
+        return (
+            np.maximum(values / np.iinfo(dtype).max, -1.0)
+            if accessor.get("normalized") and dtype.kind != "f"
+            else values
+        )
 
     def _rows(self, place: dict[str, Any], count: int, dtype: np.dtype, width: int = 1) -> np.ndarray:
         view = place["bufferView"]
@@ -309,9 +309,6 @@ class _Gltf:
 
     def _path(self, uri: str) -> Path:
         return self.file.parent / unquote(uri)
-
-
-_AT_REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 
 
 def _matrices(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:

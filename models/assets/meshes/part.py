@@ -1,5 +1,6 @@
 """One piece of a mesh file, as every format is read, and what is checked of it."""
 
+import io
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,6 +55,20 @@ def is_tinted(material: str) -> bool:
     return any(word in material.lower() for word in ("paint", "tint"))
 
 
+def opened(file: Path, name: str, source: str | io.BytesIO) -> Image.Image:
+    """A texture, from a path or from its bytes.
+
+    Raises:
+        DataError: it is no picture.
+    """
+    try:
+        return Image.open(source)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        raise DataError(
+            f"Expected a picture, actual {name}, which {file} names; replace it by a PNG or JPEG."
+        ) from None
+
+
 def decoded(file: Path, name: str, image: Image.Image) -> np.ndarray:
     """A texture's pixels, ``(h, w, 3)`` uint8; Pillow decodes them only now.
 
@@ -61,6 +76,8 @@ def decoded(file: Path, name: str, image: Image.Image) -> np.ndarray:
         DataError: they do not decode.
     """
     try:
+        if image.mode.startswith("I;16"):  # which Pillow would cut off at 255
+            image = Image.fromarray(np.rint(np.asarray(image) / 257).astype(np.uint8))
         return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(

@@ -17,9 +17,9 @@ from probscene.errors import DataError
 
 from ..solids import corner_normals, volume
 from . import gltf
-from .part import Part, check_geometry, check_number, decoded, is_tinted
+from .part import Part, check_geometry, check_number, decoded, is_tinted, opened
 from .polygons import Polygons, unfillable
-from .sources import textures_of
+from .sources import Texture, textures_of
 from .texture_sheet import sheet
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
@@ -107,7 +107,7 @@ def _through_trimesh(file: Path) -> list[Part]:
         return _parts(file, scene, textures, trimesh.Trimesh)
 
 
-def _parts(file: Path, scene, textures: dict[str, str], triangular: type) -> list[Part]:
+def _parts(file: Path, scene, textures: dict[str, Texture], triangular: type) -> list[Part]:
     parts = []
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
@@ -143,7 +143,7 @@ def _ply_faces(file: Path, piece) -> Polygons:
     return corners
 
 
-def _look(file: Path, piece, textures: dict[str, str]):
+def _look(file: Path, piece, textures: dict[str, Texture]):
     """Colour, tint, uv and texture of one piece of geometry."""
     triangles, visual = np.asarray(piece.faces), piece.visual
     white = np.full((len(triangles), 3), 255.0)
@@ -155,13 +155,14 @@ def _look(file: Path, piece, textures: dict[str, str]):
     material = visual.material
     factor, image = getattr(material, "diffuse", None), getattr(material, "image", None)
     name = str(getattr(material, "name", "") or "")
-    if image is None and (texture := textures.get(name)):
-        raise DataError(f"Expected a picture, actual {texture}, which {file} names; replace it by a PNG or JPEG.")
+    texture = textures.get(name, Texture("one"))
+    if image is None and name in textures:  # also where it has options, which trimesh takes for its name
+        image = opened(file, texture.path, texture.path)
     tinted = is_tinted(name)
     if image is None or visual.uv is None or len(visual.uv) != len(piece.vertices):
         return white if factor is None else np.asarray(factor, float)[:3] * np.ones_like(white), tinted, None, None
-    uv = np.asarray(visual.uv, float)[triangles] * [1, -1] + [0, 1]
-    return white, tinted, uv, decoded(file, textures.get(name, "one"), image)  # OBJ's texture replaces its Kd
+    uv = (np.asarray(visual.uv, float) * texture.scale + texture.offset)[triangles] * [1, -1] + [0, 1]
+    return white, tinted, uv, decoded(file, texture.path, image)  # OBJ's texture replaces its Kd
 
 
 def _welded(positions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,9 +10,19 @@ from probscene.errors import DataError
 
 from .polygons import unfillable
 
+_OPTION = re.compile(r"-(\w+)((?:\s+(?:[-+]?[\d.]+(?:[eE][-+]?\d+)?|on|off))+)\s+")
 
-def textures_of(file: Path) -> dict[str, str]:
-    """The pictures' paths by the materials that name them, of an OBJ and its MTL; PLY and STL name no files.
+
+class Texture(NamedTuple):
+    """A picture's path, and what texture coordinates are multiplied by and moved by, v upward."""
+
+    path: str
+    scale: tuple[float, ...] = (1.0, 1.0)
+    offset: tuple[float, ...] = (0.0, 0.0)
+
+
+def textures_of(file: Path) -> dict[str, Texture]:
+    """The pictures by the materials that name them, of an OBJ and its MTL; PLY and STL name no files.
 
     Raises:
         DataError: a file that is named and not there, an OBJ with a polygon that trimesh would fill wrongly.
@@ -32,7 +43,7 @@ def _text(file: Path) -> str:
         raise DataError(f"Expected a readable file, actual {file} ({error.strerror}).") from None
 
 
-def _obj(file: Path) -> dict[str, str]:
+def _obj(file: Path) -> dict[str, Texture]:
     lines = _lines(file)
     _check_polygons(file, lines)
     used, textures = {rest for word, rest in lines if word == "usemtl"}, {}
@@ -44,7 +55,7 @@ def _obj(file: Path) -> dict[str, str]:
             if word == "newmtl":
                 material = rest
             elif word.lower() == "map_kd" and material in used:
-                textures[material] = _there(file, mtl.parent, _without_options(rest))
+                textures[material] = _texture(file, mtl.parent, rest)
     return textures
 
 
@@ -78,13 +89,21 @@ def _numbers(words: list[str]) -> list[float]:
     return found if len(found) == 3 else [np.nan] * 3
 
 
-def _without_options(text: str) -> str:
-    """The file's name after options such as ``-s 1 1 1``."""
-    return re.sub(r"^(-\w+(\s+(?:-?[\d.]+|on|off))+\s+)+", "", text)
-
-
-def _there(file: Path, folder: Path, name: str) -> str:
+def _texture(file: Path, folder: Path, text: str) -> Texture:
+    """A file's name after options such as ``-s 1 1 1``."""
+    name, options = text, {}
+    while option := _OPTION.match(name):
+        name, options[option[1]] = name[option.end() :], option[2].split()
     path = folder / name.replace("\\", "/")
     if not path.is_file():
         raise DataError(f"Expected the texture {name} of {file} in {folder}, actual no such file; put it there.")
-    return str(path)
+    try:
+        scale, offset = (
+            tuple(float(number) for number in (*options.get(key, ()), rest, rest)[:2])
+            for key, rest in (("s", 1), ("o", 0))
+        )
+    except ValueError:
+        raise DataError(
+            f"Expected numbers after -s and -o of the texture {name} of {file}, actual {text}; mend them."
+        ) from None
+    return Texture(str(path), scale, offset)
