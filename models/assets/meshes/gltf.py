@@ -86,8 +86,10 @@ class _Gltf:
             raise DataError(f"Expected glTF 2.0, actual {version} in {file}; export it again.")
         if beyond := sorted(set(tree.get("extensionsRequired", [])) - DRAWN):
             raise self._needs(beyond[0])
-        uris = [buffer.get("uri") for buffer in tree.get("buffers", [])]
-        self.buffers = [binary if uri is None and i == 0 else self._data(uri, "data") for i, uri in enumerate(uris)]
+        self.buffers = [
+            self._data(buffer["uri"], "data") if i or "uri" in buffer else binary
+            for i, buffer in enumerate(tree.get("buffers", []))
+        ]
         self.pictures: dict[int, np.ndarray] = {}
 
     def parts(self) -> list[Part]:
