@@ -14,7 +14,7 @@ from torch import Tensor
 from .errors import ModelError
 from .photo import Photo
 
-_ROUNDING = 1e-4  # by which a colour may leave 0..1
+_COLOUR_LIMITS = -1.0, 2.0  # within which a channel is clipped to 0..1; beyond them it has another scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class Drawing:
         photo: what a camera makes of it, every value ``(N,)`` as ``world.resolve_scene`` gives it; nothing where None.
 
     Raises:
-        ModelError: a background that is not three finite numbers, or not in 0..1.
+        ModelError: a background that is not three finite numbers, or of another scale than 0..1.
     """
 
     kind: Tensor
@@ -197,17 +197,17 @@ class Drawing:
 
 
 def check_colour(name: str, colour: Tensor) -> None:
-    """See that finite channels of colours are in 0..1, but for rounding.
+    """See that finite channels of colours have the scale 0..1. What a distribution draws a little beyond is clipped.
 
     Raises:
-        ModelError: one is not, such as a colour of 0 to 255.
+        ModelError: they have another, such as 0 to 255.
     """
     if not colour.numel():
         return
     low, high = (float(end) for end in colour.aminmax())
-    if low < -_ROUNDING or high > 1 + _ROUNDING:
-        worst = low if low < -_ROUNDING else high
-        remedy = "divide by 255" if 2 <= worst <= 255 else "draw it from a distribution that stays there, or clamp it"
+    if low < _COLOUR_LIMITS[0] or high > _COLOUR_LIMITS[1]:
+        worst = low if low < _COLOUR_LIMITS[0] else high
+        remedy = "divide by 255" if 0 < worst <= 255 else "draw it from a distribution that stays there, or clamp it"
         raise ModelError(f"Expected {name} in 0..1, actual {worst:g}; {remedy}.")
 
 
@@ -227,7 +227,7 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
 
     Raises:
         ModelError: a value that is no number, a tensor that does not broadcast, a sprite index outside the atlas, a
-            value that is not finite, or a tint that is not in 0..1.
+            value that is not finite, or a tint of another scale than 0..1.
     """
     shape = present.shape
 

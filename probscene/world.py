@@ -183,7 +183,7 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
 
     Raises:
         ModelError: a tensor that does not broadcast, an index outside the meshes, a value that is not finite, or a tint
-            that is not in 0..1.
+            of another scale than 0..1.
     """
     name = f"Meshes({layer.kinds!r})"
     index = _full(f"{name}.mesh", layer.mesh, tuple(present.shape), torch.int64)
@@ -213,8 +213,8 @@ def resolve_scene(part: Part, num_scenes: int) -> Part:
     """Every field as one value a scene, ``(N,)`` float32, colours ``(N, 3)``; seeds int64.
 
     Raises:
-        ModelError: a value of another shape, one that is not finite, a colour that is not in 0..1, a focal length that
-            is not positive, or what a photo cannot have.
+        ModelError: a value of another shape, one that is not finite, a colour of another scale than 0..1, a focal
+            length that is not positive, or what a photo cannot have.
     """
     values = {}
     for field in fields(part):
