@@ -60,7 +60,7 @@ def folder(path: str) -> Scenery:
 
 
 def _pictures(path: Path, size: float) -> tuple[np.ndarray, ...]:
-    files = sorted(path.glob("*.png"))
+    files = sorted(p for p in path.glob("*") if p.suffix.lower() == ".png" and not p.name.startswith("."))
     if not files:
         raise DataError(f"Expected PNG files in {path}, actual none; make the folders car, tree and house there.")
     found = []
@@ -69,10 +69,11 @@ def _pictures(path: Path, size: float) -> tuple[np.ndarray, ...]:
         if picture is None or picture.ndim != 3 or picture.shape[2] != 4 or picture.dtype != np.uint8:
             raise DataError(f"Expected an RGBA picture of 8 bits, actual {file}; add an alpha channel.")
         scale = size / max(picture.shape[:2])
+        down, across = (scale if round(side * scale) else 1 / side for side in picture.shape[:2])  # at least one pixel
         picture = picture.astype(np.float64)
         alpha = picture[..., 3:] / 255.0
         premultiplied = np.concatenate([picture[..., 2::-1] * alpha, picture[..., 3:]], 2)
-        small = cv2.resize(premultiplied, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(premultiplied, None, fx=across, fy=down, interpolation=cv2.INTER_AREA)
         found.append(_straight(small))
     return tuple(found)
 

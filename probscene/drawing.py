@@ -14,6 +14,8 @@ from torch import Tensor
 from .errors import ModelError
 from .photo import Photo
 
+_COLOUR_LIMITS = -1.0, 2.0  # within which a channel is clipped to 0..1; beyond them it has another scale
+
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
@@ -164,7 +166,7 @@ class Drawing:
         photo: what a camera makes of it, every value ``(N,)`` as ``world.resolve_scene`` gives it; nothing where None.
 
     Raises:
-        ModelError: a background that is not three finite numbers.
+        ModelError: a background that is not three finite numbers, or of another scale than 0..1.
     """
 
     kind: Tensor
@@ -183,6 +185,7 @@ class Drawing:
                 f"Expected the background of a drawing as three numbers in 0..1, red, green and blue, actual "
                 f"{self.background!r}; write background=(0.2, 0.2, 0.2)."
             )
+        check_colour("background", torch.tensor(rgb))
 
     def __len__(self) -> int:
         return self.kind.shape[0]
@@ -191,6 +194,21 @@ class Drawing:
         """The same drawing of some of the scenes."""
         layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
         return replace(self, kind=self.kind[scenes], layers=layers, photo=of_scenes(self.photo, scenes))
+
+
+def check_colour(name: str, colour: Tensor) -> None:
+    """See that finite channels of colours have the scale 0..1. What a distribution draws a little beyond is clipped.
+
+    Raises:
+        ModelError: they have another, such as 0 to 255.
+    """
+    if not colour.numel():
+        return
+    low, high = (float(end) for end in colour.aminmax())
+    if low < _COLOUR_LIMITS[0] or high > _COLOUR_LIMITS[1]:
+        worst = low if low < _COLOUR_LIMITS[0] else high
+        remedy = "divide by 255" if 0 < worst <= 255 else "draw it from a distribution that stays there, or clamp it"
+        raise ModelError(f"Expected {name} in 0..1, actual {worst:g}; {remedy}.")
 
 
 AnyPart = TypeVar("AnyPart")
@@ -208,8 +226,8 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
     """Broadcast a ``Sprites`` to ``present (N, M)`` and check what a renderer relies on.
 
     Raises:
-        ModelError: a value that is no number, a tensor that does not broadcast, a sprite index outside the atlas, or a
-            value that is not finite.
+        ModelError: a value that is no number, a tensor that does not broadcast, a sprite index outside the atlas, a
+            value that is not finite, or a tint of another scale than 0..1.
     """
     shape = present.shape
 
@@ -228,8 +246,11 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
                 f"Expected Sprites({sprites.kinds!r}).{name} to broadcast to (scenes, nodes) = {tuple(shape)}, "
                 f"actual shape {tuple(value.shape)}."
             ) from None
-        if value.is_floating_point() and not torch.isfinite(value[present]).all():
+        shown = value[present]
+        if value.is_floating_point() and not torch.isfinite(shown).all():
             raise ModelError(f"Expected finite values in Sprites({sprites.kinds!r}).{name}, actual NaN or infinity.")
+        if name == "tint":
+            check_colour(f"Sprites({sprites.kinds!r}).tint", shown)
         return value.contiguous()
 
     index = full("sprite", sprites.sprite, torch.int64)

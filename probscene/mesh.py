@@ -29,8 +29,8 @@ class Mesh:
         texture: ``(h, w, 3)`` uint8 sRGB, multiplies the colour; needs ``uv``.
 
     Raises:
-        ModelError: no triangle, an array of another shape, a vertex that is not there, values that are not finite, or a
-            mesh of more than 200 m.
+        ModelError: no triangle, an array of another shape, a vertex that is not there, values that are not finite, a
+            colour of 0 to 1 or beyond 255, or a mesh of more than 200 m.
     """
 
     positions: np.ndarray
@@ -45,7 +45,7 @@ class Mesh:
         F = len(self.triangles)
         if F == 0 or len(self.positions) == 0:
             raise ModelError("Expected a mesh with triangles, actual an empty one; export it again.")
-        colour = np.asarray(self.colour, np.uint8)
+        colour = np.asarray(self.colour)
         tinted = np.ones(F, bool) if self.tinted is None else self.tinted
         self._keep("positions", self.positions, np.float32, (len(self.positions), 3))
         self._keep("triangles", self.triangles, np.int32, (F, 3))
@@ -76,6 +76,14 @@ class Mesh:
             raise ModelError(f"Expected {name} of a mesh of shape {shape}, actual {value.shape}.")
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise ModelError(f"Expected finite {name} of a mesh, actual NaN or infinity; export it again.")
+        if dtype is np.uint8:
+            low, high = float(value.min()), float(value.max())
+            if low < 0 or high > 255:
+                raise ModelError(
+                    f"Expected {name} of a mesh in 0..255, actual {low if low < 0 else high:g}; clip it there."
+                )
+            if value.dtype.kind == "f" and 0 < high <= 1:
+                raise ModelError(f"Expected {name} of a mesh in 0..255, actual {high:g}; multiply by 255.")
         value = np.ascontiguousarray(value, dtype).copy()
         value.flags.writeable = False
         object.__setattr__(self, name, value)

@@ -12,7 +12,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from .drawing import of_scenes
+from .drawing import check_colour, of_scenes
 from .errors import ModelError
 from .mesh import Mesh, Surface
 from .photo import Photo, check_photo
@@ -182,7 +182,8 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
     """Broadcast a ``Meshes`` to ``present (N, M)`` and check what a renderer relies on.
 
     Raises:
-        ModelError: a tensor that does not broadcast, an index outside the meshes, or a value that is not finite.
+        ModelError: a tensor that does not broadcast, an index outside the meshes, a value that is not finite, or a tint
+            of another scale than 0..1.
     """
     name = f"Meshes({layer.kinds!r})"
     index = _full(f"{name}.mesh", layer.mesh, tuple(present.shape), torch.int64)
@@ -201,6 +202,7 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
         numbers[key] = _full(f"{name}.{key}", value, (*present.shape, 3), among=present)
     if not (numbers["scale"][present] > 0).all():
         raise ModelError(f"Expected positive {name}.scale, actual {float(numbers['scale'][present].min()):g}.")
+    check_colour(f"{name}.tint", numbers["tint"][present])
     return MeshLayer(layer.meshes, present, index, labelled=layer.labelled, **numbers)
 
 
@@ -211,14 +213,15 @@ def resolve_scene(part: Part, num_scenes: int) -> Part:
     """Every field as one value a scene, ``(N,)`` float32, colours ``(N, 3)``; seeds int64.
 
     Raises:
-        ModelError: a value of another shape, one that is not finite, a focal length that is not positive, or what a
-            photo cannot have.
+        ModelError: a value of another shape, one that is not finite, a colour of another scale than 0..1, a focal
+            length that is not positive, or what a photo cannot have.
     """
     values = {}
     for field in fields(part):
         name, value = f"{type(part).__name__}.{field.name}", getattr(part, field.name)
         if field.name in COLOURS:
             values[field.name] = _full(name, value, (num_scenes, 3))
+            check_colour(name, values[field.name])
         else:
             dtype = torch.int64 if field.name == "seed" else torch.float32
             endless = field.name == "jpeg_quality"

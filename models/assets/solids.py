@@ -7,6 +7,7 @@ F triangles, S rings, R points of a ring.
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,9 @@ from probscene.mesh import Mesh
 
 ROUND = math.radians(66)  # crease of what is round, down to six sides
 SHARP = math.radians(20)
+_CROWD = 256  # faces at a vertex, of which all pairs are compared
+_CELLS = 32  # into which a unit of length is cut, to find normals that are nearly the same
+_PAIRS = 1 << 22  # compared at a time, for the memory's sake
 
 
 Tinted = bool | Sequence[bool] | np.ndarray
@@ -67,21 +71,51 @@ def _across(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def corner_normals(positions: np.ndarray, triangles: np.ndarray, crease: float) -> np.ndarray:
-    """``(F, 3, 3)`` unit normals: at each corner the mean, by area, of the faces there that are within ``crease``."""
-    across = _across(positions, triangles)
+    """``(F, 3, 3)`` unit normals: at each corner the mean, by area, of the faces there that are within ``crease``.
+
+    Where more than 256 faces meet, those whose normals differ by less than about two degrees are taken as one, so that
+    a fan or many copies in one place do not take all pairs of them.
+    """
+    across, least = _across(positions, triangles), math.cos(crease) - 1e-9
     unit = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
     order = np.argsort(triangles.reshape(-1), kind="stable")  # corners by their vertex
     face = order // 3
     many = np.bincount(triangles.reshape(-1), minlength=len(positions))
     start = np.cumsum(many) - many
-    vertex = triangles.reshape(-1)[order]
-    one = np.repeat(np.arange(len(order)), many[vertex])  # every pair of corners at the same vertex
-    other = np.arange(len(one)) - np.repeat(np.cumsum(many[vertex]) - many[vertex], many[vertex]) + start[vertex[one]]
-    near = np.einsum("ij,ij->i", unit[face[one]], unit[face[other]]) > math.cos(crease) - 1e-9
-    sums = np.stack([np.bincount(one[near], across[face[other[near]], k], len(order)) for k in range(3)], 1)
+    paired = np.where(many <= _CROWD, many, 0)
+    pairs = np.cumsum(paired**2)
+    sums = np.zeros((len(order), 3))
+    cuts = np.searchsorted(pairs, np.arange(_PAIRS, pairs[-1], _PAIRS))
+    for low, high in pairwise(np.unique([0, *cuts, len(many)])):  # vertices
+        number = np.repeat(paired[low:high], many[low:high])  # of each corner's pairs
+        first, last = start[low], start[low] + len(number)
+        one = np.repeat(np.arange(len(number)), number)  # every pair of corners at the same vertex
+        before = np.repeat(start[low:high], many[low:high]) - np.cumsum(number) + number
+        other = np.arange(len(one)) + np.repeat(before, number)
+        near = np.einsum("ij,ij->i", unit[face[first + one]], unit[face[other]]) > least
+        sums[first:last] = _totals(one[near], across[face[other[near]]], len(number))
+    for vertex in np.flatnonzero(many > _CROWD):
+        there = slice(start[vertex], start[vertex] + many[vertex])
+        sums[there] = _sums_of_crowd(unit[face[there]], across[face[there]], least)
     normals = np.empty_like(sums)
     normals[order] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
     return normals.reshape(-1, 3, 3)
+
+
+def _sums_of_crowd(unit: np.ndarray, across: np.ndarray, least: float) -> np.ndarray:
+    """``(F, 3)`` for each face at a vertex: the sum of ``across`` of those whose normal has a cosine above ``least``
+    with its own."""
+    _, cell = np.unique(np.round(unit * _CELLS), axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    normal, total = (_totals(cell, values, cell.max() + 1) for values in (unit, across))
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    rows = np.array_split(normal, 1 + len(normal) ** 2 // _PAIRS)
+    return np.concatenate([(some @ normal.T > least).astype(float) @ total for some in rows])[cell]
+
+
+def _totals(index: np.ndarray, values: np.ndarray, number: int) -> np.ndarray:
+    """``(number, 3)`` sums of the rows of ``values`` that have the same index."""
+    return np.stack([np.bincount(index, values[:, k], number) for k in range(3)], 1)
 
 
 def loft(rings, colour, tinted: Tinted = False, crease: float = SHARP, ends=None) -> Solid:

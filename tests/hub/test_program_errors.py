@@ -13,7 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.drawing import Atlas, Sprites, disc
+from probscene.drawing import Atlas, Sprites, disc, resolve
 from probscene.errors import GrammarError, ModelError
 from probscene.grammar import Grammar
 from probscene.model import SceneModel, SceneProgram, scene_model
@@ -196,6 +196,32 @@ WRONG = {
         ModelError,
         "three numbers in 0..1, .* actual 'red'",
     ),
+    "a background of 0 to 255": (
+        lambda: sample(model_of(lambda scene: scene.draw(background=(0.0, 90, 40))), PRIOR, 3),
+        ModelError,
+        r"^Expected background in 0..1, actual 90; divide by 255.$",
+    ),
+    "a background below black": (
+        lambda: sample(model_of(lambda scene: scene.draw(background=(0.0, -5, 0.4))), PRIOR, 3),
+        ModelError,
+        "Expected background in 0..1, actual -5; .* clamp it",
+    ),
+    "a tint of 0 to 255": (
+        lambda: sample(
+            model_of(lambda scene: scene.draw(Sprites.disc("disc", 3.0, 3.0, 6.0, tint=(255, 0, 0)))), PRIOR, 3
+        ),
+        ModelError,
+        r"^Expected Sprites\('disc'\).tint in 0..1, actual 255; divide by 255.$",
+    ),
+    "a tint beyond every scale": (
+        lambda: sample(
+            model_of(lambda scene: scene.draw(Sprites.disc("disc", 3.0, 3.0, 6.0, torch.full((3, 1, 3), 1300.0)))),
+            PRIOR,
+            3,
+        ),
+        ModelError,
+        r"tint in 0..1, actual 1300; .* clamp it",
+    ),
 }
 
 
@@ -204,6 +230,14 @@ def test_a_wrong_kind_of_value_is_one_clear_error(fault):
     make, error, message = WRONG[fault]
     with pytest.raises(error, match=message):
         make()
+
+
+@given(st.floats(-0.5, 1.5), st.integers(0, 2**32))
+def test_colours_about_0_to_1_pass(channel, seed):
+    """A little beyond they are clipped, as distributions draw them; nodes that are not drawn may have any."""
+    present = torch.rand(3, 4, generator=torch.Generator().manual_seed(seed)) < 0.5
+    tint = torch.where(present[..., None], channel, 255.0)
+    assert resolve(Sprites.disc("disc", 0.0, 0.0, 1.0, tint=tint), present).tint.shape == (3, 4, 3)
 
 
 def test_right_values_of_other_types_pass():

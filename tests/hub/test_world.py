@@ -21,7 +21,7 @@ TRIANGLE = {"positions": np.eye(3), "triangles": np.array([[0, 1, 2]]), "colour"
 GREY = Surface("road", np.full((4, 4, 3), 90, np.uint8), (2.0, 2.0))
 
 
-def built(num_scenes=5, camera=None, **more):
+def built(num_scenes=5, camera=None, light=None, **more):
     """Worlds with two lots, each with one or two cars; ``more`` replaces fields of the cars."""
     mesh = Mesh(**TRIANGLE)
     pyro.set_rng_seed(0)
@@ -30,7 +30,7 @@ def built(num_scenes=5, camera=None, **more):
         with scene.nodes("car"):
             x = pyro.sample("car.x", dist.Uniform(5.0, 30.0))
     cars = {"kinds": "car", "meshes": (mesh,), "mesh": 0, "x": x, "y": 1.0, **more}
-    return scene.build(Meshes(**cars), camera=camera or Camera())
+    return scene.build(Meshes(**cars), camera=camera or Camera(), light=light)
 
 
 def test_a_world_holds_every_value_of_every_scene():
@@ -75,6 +75,12 @@ def test_kittis_camera_sees_the_same_on_half_of_the_pixels():
         ({"positions": np.eye(3) * 400}, "at most 200 m, actual 400 m"),
         ({"texture": np.zeros((2, 2, 3), np.uint8)}, "texture coordinates"),
         ({"uv": np.zeros((1, 3, 3))}, r"uv of a mesh of shape \(1, 3, 2\)"),
+        ({"colour": (0.8, 0.1, 0.0)}, r"colour of a mesh in 0..255, actual 0.8; multiply by 255"),
+        ({"colour": np.array([[0, 300, -2]])}, r"colour of a mesh in 0..255, actual -2; clip it"),
+        (
+            {"texture": np.full((2, 2, 3), 0.5), "uv": np.zeros((1, 3, 2))},
+            r"texture of a mesh in 0..255, actual 0.5; multiply by 255",
+        ),
     ],
 )
 def test_meshes_that_are_none(change, message):
@@ -98,6 +104,10 @@ def test_a_mesh_does_not_change_with_its_source():
         ({"x": torch.zeros(3)}, r"x to broadcast to \(5, "),
         ({"yaw": float("nan")}, "finite values in Meshes\\('car'\\).yaw"),
         ({"scale": 0.0}, "positive Meshes\\('car'\\).scale, actual 0"),
+        ({"tint": (255, 0, 0)}, r"Expected Meshes\('car'\).tint in 0..1, actual 255; divide by 255"),
+        ({"tint": torch.tensor([0.5, 1.0, 300.0])}, r"tint in 0..1, actual 300; .* clamp it"),
+        ({"light": Light(zenith=(90, 140, 220))}, r"Expected Light.zenith in 0..1, actual 220; divide by 255"),
+        ({"light": Light(horizon=torch.full((5, 3), 200.0))}, r"Light.horizon in 0..1, actual 200; divide by 255"),
         ({"camera": Camera(focal=-700.0)}, "positive focal length in pixels, actual -700"),
         ({"camera": Camera(pitch=torch.zeros(4, 1))}, r"Camera.pitch to broadcast to \(5, 1\), actual shape \(4, 1\)"),
     ],

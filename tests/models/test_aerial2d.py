@@ -172,6 +172,28 @@ def test_a_folder_that_is_no_folder_of_pictures(wrong, tmp_path):
         folder(str(path))
 
 
+@pytest.mark.parametrize("size", [(2, 900), (900, 2), (1, 40_000), (7, 500), (1, 1), (3, 4)])
+def test_a_picture_of_any_shape_keeps_its_length_and_at_least_one_pixel(tmp_path, size):
+    found = folder(str(pictures(tmp_path, size)))
+    for atlas, length in ((found.cars, 18), (found.trees, 22), (found.houses, 40)):
+        (sprite,) = atlas.sprites
+        height, width = sprite.shape[:2]
+        assert max(height, width) == length
+        assert min(height, width) == pytest.approx(max(1, length * min(size) / max(size)), abs=0.5)
+        assert (sprite == (250, 20, 10, 255)).all()
+
+
+@pytest.mark.parametrize("hidden", ["._one.png", ".one.png", "._two.PNG"])
+def test_hidden_files_and_capital_letters_beside_pictures(tmp_path, hidden):
+    """macOS puts ``._NAME`` beside each NAME in a zip; it is no picture."""
+    path = pictures(tmp_path)
+    (path / "car" / hidden).write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X")
+    (path / "car" / "one.png").rename(path / "car" / "A.PNG")
+    (path / "tree" / "one.png").rename(path / "tree" / "B.Png")
+    found = folder(str(path))
+    assert len(found.cars) == len(found.trees) == len(found.houses) == 1
+
+
 def test_the_sprites_of_the_data_folder(data_dir):
     if not (data_dir / "sprites2d").is_dir():
         pytest.skip("no sprites2d in the data folder")

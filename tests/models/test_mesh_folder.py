@@ -266,6 +266,12 @@ FAULTS = {
     "a named size of none": ("a@0m.obj", CAR_OBJ, "above 0 m"),
     "no materials": ("a.obj", "mtllib gone.mtl\n" + CAR_OBJ, "gone.mtl, actual no such file"),
     "no texture": ("a.obj", TEXTURED, "texture my brick.png of .*no such file", "map_Kd -s 1 1 1 my brick.png\n"),
+    "a texture's scale of words": (
+        "a.obj",
+        TEXTURED,
+        "numbers after -s and -o of .*actual -s on",
+        "map_Kd -s on a.png\n",
+    ),
     "a texture that is none": ("a.obj", TEXTURED, r"Expected a picture, actual .*a\.mtl", "map_Kd a.mtl\n"),
     "a broken texture": (
         "a.obj",
@@ -404,3 +410,25 @@ def test_a_kit_from_outside(tmp_path, data_dir):
     colour = colour_at_middles(sedan)
     lamps = sedan.positions[sedan.triangles].mean(1)[(colour[:, 0] > 220) & (colour[:, 1] > 160) & (colour[:, 2] < 120)]
     assert len(lamps) and lamps[:, 0].min() > 1.5
+
+
+@pytest.mark.parametrize(
+    ("options", "scale", "offset"),
+    [
+        ("-s 2 -0.5 1 -o 0.5 0.25 0", (2, -0.5), (0.5, 0.25)),
+        ("-clamp off -o 0.5", (1, 1), (0.5, 0)),
+        ("-s 0.25 3", (0.25, 3), (0, 0)),
+    ],
+)
+def test_a_texture_of_an_mtl_has_options(tmp_path, options, scale, offset):
+    """As if the coordinates had been scaled and moved; v is upward."""
+    pixels = np.random.default_rng(0).integers(0, 256, (8, 8, 3), np.uint8)
+    uv = np.array([(0.2, 0.1), (0.9, 0.3), (0.4, 0.8)])
+    corners = "".join(f"v {x} 0 {z}\n" for x, z in ((-0.9, -2.2), (0.9, -2.2), (0, 2.2)))
+    for name, option, values in (("a", options, uv), ("b", "", uv * scale + offset)):
+        coordinates = "".join(f"vt {u} {v}\n" for u, v in values)
+        write(tmp_path, "car", f"{name}.obj", f"mtllib {name}.mtl\n{corners}{coordinates}usemtl m\nf 1/1 2/2 3/3\n")
+        write(tmp_path, "car", f"{name}.mtl", f"newmtl m\nmap_Kd {option} my brick.png\n")
+    Image.fromarray(pixels).save(tmp_path / "car" / "my brick.png")
+    a, b = folder(tmp_path)["car"]
+    assert np.allclose(a.uv, b.uv, atol=1e-6) and (a.texture == pixels).all() and (b.texture == pixels).all()

@@ -1,16 +1,19 @@
 """Closed solids: volumes by formula, faces outward, what moving and stretching keeps."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from probscene.models.assets import solids
 from probscene.models.assets.solids import (
     ball,
     box,
     circle,
+    corner_normals,
     finish,
     hoop,
     join,
@@ -108,3 +111,56 @@ def test_a_texture_lies_in_metres():
     part = mapped(box((4, 6, 2)), (2.0, 0.5))
     up = np.abs(part.normals[..., 2]) > 0.5
     assert np.ptp(part.uv[up][:, 0]) == pytest.approx(2) and np.ptp(part.uv[up][:, 1]) == pytest.approx(12)
+
+
+def normals_by_definition(positions, triangles, crease):
+    """Face by face."""
+    a, b, c = np.moveaxis(positions[triangles], 1, 0)
+    across = np.cross(b - a, c - a)
+    unit = across / np.linalg.norm(across, axis=1, keepdims=True)
+    normals = np.empty((len(triangles), 3, 3))
+    for f, k in np.ndindex(len(triangles), 3):
+        there = (triangles == triangles[f, k]).any(1) & (unit @ unit[f] > math.cos(crease))
+        normals[f, k] = across[there].sum(0)
+    return normals / np.linalg.norm(normals, axis=2, keepdims=True)
+
+
+@given(st.integers(0, 2**32), st.integers(4, 9), st.integers(1, 60), st.floats(0.1, 1.5))
+def test_corner_normals_are_means_of_the_faces_there(seed, vertices, faces, crease):
+    rng = np.random.default_rng(seed)
+    positions = rng.normal(size=(vertices, 3))
+    triangles = np.array([rng.permutation(vertices)[:3] for _ in range(faces)])
+    whole = corner_normals(positions, triangles, crease)
+    assert np.allclose(whole, normals_by_definition(positions, triangles, crease), atol=1e-6)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solids, "_PAIRS", faces)
+        assert np.array_equal(corner_normals(positions, triangles, crease), whole)
+
+
+def fan(faces, height):
+    """A cone about z, its triangles from the tip at the origin outward."""
+    rim = np.column_stack([circle(1.0, faces), np.full(faces, -height)])
+    i = np.arange(faces)
+    return np.vstack([[0.0, 0, 0], rim]), np.stack([0 * i, i + 1, (i + 1) % faces + 1], 1)
+
+
+@pytest.mark.parametrize("height", [0.3, 1.0, 4.0])
+def test_a_crowd_of_faces_takes_little_memory(height):
+    """Of 3,000 faces at one vertex, all pairs are nine million."""
+    tracemalloc.start()
+    normals = corner_normals(*fan(3000, height), math.radians(40))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 120e6
+    few = corner_normals(*fan(250, height), math.radians(40))
+    cosine = np.einsum("fi,fi->f", normals[::12, 0], few[:, 0])
+    assert cosine.min() > math.cos(math.radians(3.5))
+
+
+@pytest.mark.parametrize("copies", [2, 100, 1000])
+def test_copies_in_one_place_have_the_normals_of_one(copies):
+    part = ball((1.0, 2.0, 0.5))
+    triangles = np.tile(part.triangles, (copies, 1))
+    normals = corner_normals(part.positions, triangles, solids.ROUND)
+    one = corner_normals(part.positions, part.triangles, solids.ROUND)
+    assert np.allclose(normals.reshape(copies, -1, 3, 3), one, atol=1e-9)

@@ -25,8 +25,6 @@ from probscene.mesh import Mesh
 from ..catalogue import DECORATION, KINDS, street
 from .reader import SUFFIXES, Fields, read
 
-MOST_TRIANGLES = 200_000
-
 
 class Size(NamedTuple):
     """What is measured, along which axis, and between how many metres it is plausible."""
@@ -113,10 +111,6 @@ def described(path: str | Path) -> str:
 def _checked(file: Path, kind: str) -> Mesh:
     """The mesh of a file as it stands on the street, of a size that its kind can have."""
     parts = read(file)
-    if len(parts["triangles"]) > MOST_TRIANGLES:
-        raise DataError(
-            f"Expected at most {MOST_TRIANGLES} triangles, actual {len(parts['triangles'])} in {file}; simplify it."
-        )
     size = SIZES[kind]
     if named := _NAMED.search(file.stem):
         _scale(parts, file, [float(number) for number in named.groups() if number], size.axis)
