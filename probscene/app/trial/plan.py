@@ -228,7 +228,7 @@ def _named(
 def _path(word: str, paths: dict[str, Path]) -> Part:
     if not list_of(Path(word))[0].exists():
         raise DataError(
-            f"Expected a labelled set at {word!r}, actual none; name a folder of COCO or KITTI, a JSON file, an "
+            f"Expected a labelled set at {word!r}, actual none; name a folder of COCO, KITTI or YOLO, a JSON file, an "
             "earlier row, or real, prior, start or learnt where they are given."
         )
     paths[word] = Path(word)
