@@ -104,7 +104,7 @@ def match_target(path: Path, entries: Sequence[Entry], target: Images, some: boo
     but = ""
     if found.others:
         entry, more = found.others[0], len(found.others) - 1
-        but = f", but of {entry.name!r} {entry.where}{f' and {more} more' if more else ''}, which it has not"
+        but = f", but of {_last(entry.name)!r} {entry.where}{f' and {more} more' if more else ''}, which it has not"
     if not found.entries and (some or not missing):
         raise DataError(
             f"Expected labels of images of {target.path} in {path}, actual none{but}; label at least one, by the name "

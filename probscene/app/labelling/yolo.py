@@ -95,7 +95,7 @@ def _object(fields: list[str], where: str, classes: dict[int, str], keypoints: i
         raise DataError(
             f"Expected the number of a class, {min(classes)} to {max(classes)}, {where}, actual {fields[0]!r}; mend it."
         )
-    boxed = len(shares) == 4 + keypoints
+    boxed = len(shares) in (4, 4 + keypoints)
     if not boxed and (len(shares) < 6 or len(shares) % 2):
         remedy = "labels have no score" if len(shares) == 5 else "mend the line"
         raise DataError(

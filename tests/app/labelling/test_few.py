@@ -115,7 +115,7 @@ JSON = {
     "no json": ("{", "COCO's JSON"),
     "a list": ("[]", "images, annotations, categories"),
     "too few": (dict(images=GOOD[:2]), "at least 3 images", "actual 2", "probscene label"),
-    "unknown images": (dict(images=[("image 9", []), ("image 8", [])]), "image 9' in images[0]", "and 1 more"),
+    "unknown images": (dict(images=[("image 9", []), ("image 8", [])]), "'image 9' in images[0]", "and 1 more"),
     "another case of an image": (dict(images=[*GOOD, ("Image 3", [])]), "did you mean 'image 3'"),
     "an image twice": (dict(images=[*GOOD, GOOD[1]]), "second one of image 1", "images[3]"),
     "another case": (dict(images=GOOD, categories=("platelet", "RBC")), "'RBC'", "did you mean 'rbc'"),
