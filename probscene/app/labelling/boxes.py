@@ -65,8 +65,10 @@ def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False
     """
     path = Path(path)
     labels = read_annotations(path)
+    classes, notes = dict[str, str](), tuple[str, ...]()
     if not labels.kitti:
-        classes, notes = labelled_classes(labels.classes, model.classes, _expected("categories", model), path)
+        expected = f"categories among the classes of model {model.name!r} ({', '.join(model.classes)})"
+        classes, notes = labelled_classes(labels.classes, model.classes, expected, path)
     found = match_target(path, labels.images, target, some, labels.stems)
     read = {i: labels.read(entry, target.sizes[i]) for i, entry in found.entries.items()}
     if labels.kitti:
@@ -140,10 +142,6 @@ def on_canvas(
     if small:
         notes += (f"{small} objects of less than {min_height:g} pixels' height are not counted.",)
     return Boxes(list(found), tuple(boxes), classes, notes)
-
-
-def _expected(what: str, model: SceneModel) -> str:
-    return f"{what} among the classes of model {model.name!r} ({', '.join(model.classes)})"
 
 
 def _classes_of_types(

@@ -12,7 +12,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from pycocotools import mask
+import numpy as np
 
 from probscene.errors import DataError
 
@@ -106,7 +106,7 @@ def _annotation(name: str, where: str, entry: dict[str, Any]) -> Annotation:
     said = entry.get("bbox")
     box = _numbers(said, 4)
     if (said is None or said == [] or box == [0, 0, 0, 0]) and entry.get("segmentation"):
-        box = _around(entry["segmentation"], where)
+        box = around(entry["segmentation"], where)
     if box is None or min(box[2:]) <= 0:
         raise DataError(
             f"Expected bbox: x, y, and a width and height above 0 {where}, actual {json.dumps(said)}; mend or delete "
@@ -117,16 +117,14 @@ def _annotation(name: str, where: str, entry: dict[str, Any]) -> Annotation:
     return Annotation(name, x, y, x + width, y + height, crowd=crowd, where=where)
 
 
-def _around(segmentation: Any, where: str) -> list[float]:
-    """The x, y, width and height of polygons or of a mask of run lengths."""
+def around(segmentation: Any, where: str) -> list[float]:
+    """The x, y, width and height of polygons or of a mask of run lengths.
+
+    Raises:
+        DataError: it is neither.
+    """
     if isinstance(segmentation, dict):
-        try:
-            height, width = (int(side) for side in segmentation["size"])
-            runs = segmentation["counts"]
-            coded = mask.frPyObjects(segmentation, height, width) if isinstance(runs, list) else segmentation
-            return mask.toBbox(coded).tolist()
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DataError(f"Expected a mask with size and counts {where}, actual another ({error!r}).") from error
+        return _around_runs(segmentation, where)
     parts = segmentation if isinstance(segmentation, list) and isinstance(segmentation[0], list) else [segmentation]
     corners = [_numbers(part) for part in parts]
     if any(part is None or len(part) < 6 or len(part) % 2 for part in corners):
@@ -136,6 +134,43 @@ def _around(segmentation: Any, where: str) -> list[float]:
         )
     x, y = ([value for part in corners if part for value in part[axis::2]] for axis in (0, 1))
     return [min(x), min(y), max(x) - min(x), max(y) - min(y)]
+
+
+def _around_runs(coded: dict[str, Any], where: str) -> list[float]:
+    """The same of a mask; pycocotools ends the process where one is broken."""
+    counts, size = coded.get("counts"), _numbers(coded.get("size"), 2)
+    runs = _decoded(counts) if isinstance(counts, str) else _numbers(counts)
+    if not runs or size is None or min(runs) < 0 or sum(runs) != size[0] * size[1]:
+        raise DataError(
+            f"Expected a mask with size and counts that add up to it {where}, actual {json.dumps(coded)[:80]}; mend or "
+            "delete it."
+        )
+    ends = np.cumsum(runs).astype(np.int64)
+    first, last = ends[:-1:2], ends[1::2] - 1  # pixels of each run that is not empty, down one column after the other
+    first, last = first[last >= first], last[last >= first]
+    if not len(first):
+        return [0, 0, 0, 0]
+    height = int(size[0])
+    left, right = first // height, last // height
+    top, bottom = np.where(left == right, [first % height, last % height], [[0], [height - 1]])
+    x, y = int(left.min()), int(top.min())
+    return [x, y, int(right.max()) + 1 - x, int(bottom.max()) + 1 - y]
+
+
+def _decoded(text: str) -> list[float] | None:
+    """The run lengths that COCO packs in text, five bits a character, as what they are more than the last but one."""
+    runs, value, shift = list[float](), 0, 0
+    for letter in text:
+        bits = ord(letter) - 48
+        if not 0 <= bits < 64:
+            return None
+        value |= (bits & 31) << shift
+        shift += 5
+        if not bits & 32:
+            value -= (bits & 16) << shift - 4
+            runs.append(value + runs[-2] if len(runs) > 2 else value)
+            value, shift = 0, 0
+    return None if shift else runs
 
 
 def _numbers(value: Any, number: int | None = None) -> list[float] | None:

@@ -80,7 +80,8 @@ def _classes(file: Path) -> tuple[dict[int, str], int]:
     try:
         whole: Any = yaml.safe_load(text_of(file))
     except yaml.YAMLError as error:
-        raise DataError(f"Expected YAML with names of classes in {file}, actual something else ({error}).") from error
+        about = " ".join(str(error).split())
+        raise DataError(f"Expected YAML with names of classes in {file}, actual something else ({about}).") from error
     names = whole.get("names") if isinstance(whole, Mapping) else None
     numbered = dict(enumerate(names)) if isinstance(names, list) else names
     if not isinstance(numbered, Mapping) or not numbered or not all(str(key).isdecimal() for key in numbered):

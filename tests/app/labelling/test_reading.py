@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
+import hypothesis.extra.numpy
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -14,6 +15,7 @@ from pycocotools import mask
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import read_labels
 from probscene.app.labelling.boxes import read_boxes
+from probscene.app.labelling.coco import around
 from probscene.app.labelling.few import labels_record, read_few
 from probscene.app.loading import load_model
 from probscene.app.trial.sets import read_set
@@ -49,12 +51,40 @@ def write_coco(path: Path, images: list, name="image {}", id=int, size=int, shap
                 pixels = np.zeros((HEIGHT, WIDTH), np.uint8, order="F")
                 pixels[y : y + h, x : x + w] = 1
                 coded = mask.encode(pixels)
-                one |= {"segmentation": {**coded, "counts": coded["counts"].decode()}, "bbox": None}
+                counts = coded["counts"].decode() if shape == "mask" else runs_of(pixels)
+                one |= {"segmentation": {**coded, "counts": counts}, "bbox": None}
             annotations.append(one)
     whole = {"images": entries, "annotations": annotations}
     whole["categories"] = [{"id": id(i), "name": label} for i, label in enumerate(CLASSES)]
     path.write_text(json.dumps(whole))
     return path
+
+
+def runs_of(pixels: np.ndarray) -> list[int]:
+    """Of zeros, of ones, of zeros, ..., down the columns."""
+    flat = pixels.flatten(order="F")
+    ends = [*(np.flatnonzero(np.diff(flat)) + 1).tolist(), len(flat)]
+    return ([0] if flat[0] else []) + np.diff([0, *ends]).tolist()
+
+
+masks = hypothesis.extra.numpy.arrays(np.uint8, st.tuples(*[st.integers(1, 40)] * 2), elements=st.integers(0, 1))
+
+
+@given(masks)
+def test_boxes_of_masks_are_pycocotools(pixels):
+    coded = mask.encode(np.asfortranarray(pixels))
+    for counts in (coded["counts"].decode(), runs_of(pixels)):
+        assert around({"size": list(pixels.shape), "counts": counts}, "") == mask.toBbox(coded).tolist()
+
+
+@given(st.text(max_size=9) | st.lists(st.integers(-9, 9) | st.none()), st.lists(st.integers(-9, 9) | st.none()))
+def test_broken_masks_are_named(counts, size):
+    try:
+        x, y, w, h = around({"size": size, "counts": counts}, "here")
+    except DataError as error:
+        assert "size and counts" in str(error) and "here" in str(error)
+    else:
+        assert min(x, y, w, h) >= 0 and y + h <= size[0] and x + w <= size[1]
 
 
 def write_kitti(folder: Path, images: list, name="image {}") -> Path:
@@ -87,7 +117,7 @@ def write_yolo(folder: Path, images: list, name="image {}", polygons=False, list
     objects,
     st.sampled_from([int, float, str, lambda i: f"{i}.0"]),
     st.sampled_from([int, str, float, lambda _: 0, lambda _: None, lambda _: "0"]),
-    st.sampled_from(["bbox", "polygons", "mask"]),
+    st.sampled_from(["bbox", "polygons", "mask", "runs"]),
     st.sampled_from(["image {}", "some/where/image {}", "C:\\data\\image {}", "/abs/image {}"]),
     st.booleans(),
     st.sampled_from(["data.yaml", "classes.txt"]),
@@ -203,8 +233,9 @@ def test_names_of_yolos_classes_are_needed(tmp_path):
         ("names: {a: b}", "names"),
     ):
         (folder / "data.yaml").write_text(text)
-        with pytest.raises(DataError, match=said):
+        with pytest.raises(DataError, match=said) as error:
             read_boxes(folder, CELLS, target(3))
+        assert "\n" not in str(error.value)
     (folder / "data.yaml").unlink()
     with pytest.raises(DataError, match=r"actual 5; for YOLO's labels put their data\.yaml or classes\.txt beside"):
         read_boxes(folder / "labels", CELLS, target(3))
@@ -255,7 +286,7 @@ def test_every_command_reads_cocos_spellings(spelling, tmp_path):
     assert [np.bincount(example.classes, minlength=2).tolist() for example in found.examples] == counts
     for one, example in zip(few.boxes, found.examples, strict=True):
         assert np.allclose(one[:, 1:], example.boxes)
-    more = {"another image": "other.png.", "many others": "x0.jpg and 19 more."}.get(spelling)
+    more = {"another image": "other.png.", "many others": "0/x0.jpg and 19 more."}.get(spelling)
     for notes in (few.notes, labels.notes, found.notes):
         said = [note for note in notes if note.startswith("Not read, since ")]
         assert len(said) == (spelling in ("another image", "many others", "an image of another folder"))
