@@ -54,8 +54,3 @@ class Annotated(NamedTuple):
     classes: tuple[str, ...] = ()
     stems: bool = False
     kitti: bool = False
-
-
-def place(path: Path, key: str, i: int) -> str:
-    """Where an entry of a list in a JSON file is, for messages."""
-    return f"in {key}[{i}] of {path}"

@@ -16,7 +16,7 @@ import numpy as np
 
 from probscene.errors import DataError
 
-from .annotations import Annotated, Annotation, Size, place
+from .annotations import Annotated, Annotation, Size
 from .naming import Entry
 from .text import number_of, text_of
 
@@ -38,10 +38,10 @@ def read_coco(path: Path) -> Annotated:
     names = _by_id(path, "images", whole["images"], "file_name")
     of_image: dict[str, list[tuple[str, str, dict[str, Any]]]] = defaultdict(list)
     for i, entry in enumerate(whole["annotations"]):
-        where = place(path, "annotations", i)
+        where = _place(path, "annotations", i)
         image, category = _known(entry, "image_id", names, where), _known(entry, "category_id", categories, where)
         of_image[image].append((categories[category], where, entry))
-    keys, images = list(names), [Entry(name, place(path, "images", i)) for i, name in enumerate(names.values())]
+    keys, images = list(names), [Entry(name, _place(path, "images", i)) for i, name in enumerate(names.values())]
 
     def read(i: int, size: Size) -> list[Annotation]:
         said = tuple(number_of(whole["images"][i].get(side)) for side in ("height", "width"))
@@ -72,7 +72,7 @@ def _by_id(path: Path, key: str, entries: list[Any], named: str) -> dict[str, st
     """The names of images or categories by their ids, in the order of the file."""
     names: dict[str, str] = {}
     for i, entry in enumerate(entries):
-        where = place(path, key, i)
+        where = _place(path, key, i)
         said = entry.get("id") if isinstance(entry, dict) else None
         number, name = _id(said), entry.get(named) if isinstance(entry, dict) else None
         if number is None or number in names:
@@ -85,10 +85,14 @@ def _by_id(path: Path, key: str, entries: list[Any], named: str) -> dict[str, st
     return names
 
 
+def _place(path: Path, key: str, i: int) -> str:
+    return f"in {key}[{i}] of {path}"
+
+
 def _id(value: Any) -> str | None:
     """An id as text: 1 for 1, 1.0, "1" and "1.0"; None for what is none."""
     if isinstance(value, str):
-        return value.removesuffix(".0") or None
+        return value.strip().removesuffix(".0") or None
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return None
     return str(int(value)) if value == int(value) else str(value)

@@ -84,8 +84,8 @@ def matched(
     unknown = [entries[number] for number in sorted(others) if not passed.of(entries[number].name)]
     _check_case(unknown, [file for i, file in enumerate(files) if i not in chosen], folder, stems)
     more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
-    names = [f"{_last(entry.name)}.txt" if stems else entry.name for entry in unknown]
-    notes = (f"Not read, since {folder} has no such image: {names[0]}{more}.",) if names else ()
+    shown = [f"{_last(entry.name)}.txt" if stems else entry.name for entry in unknown]
+    notes = (f"Not read, since {folder} has no such image: {shown[0]}{more}.",) if shown else ()
     return Matched(chosen, notes, tuple(unknown))
 
 

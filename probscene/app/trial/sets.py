@@ -20,7 +20,7 @@ from probscene.errors import DataError
 
 from ..labelling.annotations import Annotated, Annotation
 from ..labelling.kitti import DONT_CARE, TYPES, class_of
-from ..labelling.naming import matched
+from ..labelling.naming import composed, matched
 from ..labelling.reading import read_annotations
 from ..labelling.yolo import images_beside
 
@@ -94,7 +94,7 @@ def read_set(
             their image; no image, or one that cannot be decoded, or has no label file or another size than its labels
             say; a class that the set does not have.
     """
-    wanted = None if classes is None else tuple(sorted(classes))
+    wanted = None if classes is None else tuple(sorted(map(composed, classes)))
     labels = read_annotations(path)
     files = _images(labels)
     if not labels.images or not files:
@@ -118,8 +118,8 @@ def read_set(
         of_name = {type: class_of(type, named) for type in {*TYPES, *occurring}}
         there = tuple(sorted({name for name in of_name.values() if name}))
     else:
-        there = tuple(sorted(labels.classes))
-        of_name = {name: name for name in wanted or there}
+        there = tuple(sorted(map(composed, labels.classes)))
+        of_name = {name: composed(name) for name in labels.classes if composed(name) in (wanted or there)}
     kept = _kept(path, wanted, there, same and not labels.kitti)
     examples = []
     for number, i in enumerate(order, 1):
