@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from probscene.dataset import SUFFIXES
 from probscene.errors import DataError
 
 from ..labelling.annotations import Annotated, Annotation
@@ -26,7 +27,6 @@ from ..labelling.yolo import images_beside
 
 Progress = Callable[[int, int], None]
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
 EASY, MODERATE, HARD, BEYOND = range(4)
 """From which of KITTI's levels on an object counts; ``BEYOND``: from none. Objects of COCO are all ``EASY``."""
 LEVELS = {EASY: (40.0, 0, 0.15), MODERATE: (25.0, 1, 0.30), HARD: (25.0, 2, 0.50)}
@@ -179,7 +179,7 @@ def _images(labels: Annotated) -> list[Path]:
 
 
 def _pictures(folders: Sequence[Path]) -> list[Path]:
-    """The PNG and JPEG files of folders; hidden ones are none."""
+    """The image files of folders; hidden ones are none."""
     files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
     return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
 

@@ -103,7 +103,7 @@ def trial(
         baselines: rows that the others are compared with; the first where there is none.
         resamples: of the bootstrap.
         workers: processes; the results do not depend on their number.
-        say: hears notes on the sets, before anything is trained.
+        say: hears a note on the sets, before anything is trained.
 
     Raises:
         ProbsceneError: a setting that makes no sense.
@@ -135,7 +135,7 @@ def trial(
     loaded = {} if photographs is None else {REAL: photographs}
     loaded |= {key: _read(path, names, show, same) for key, path in planned.paths.items()}
     for note in dict.fromkeys(note for found in (tested, *loaded.values()) for note in found.notes):
-        say(note)
+        say(f"Note: {note}")
     check(planned, loaded, tested, set(known) - {REAL})
     if generated is not None:
         _check_classes(generated, names, same)
