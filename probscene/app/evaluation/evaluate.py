@@ -227,8 +227,8 @@ def evaluate(
             likelihoods[name] = likelihood(policy, truth.derivation)
     if truth is not None:
         sources["truth"] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
-    read = features_read(run, target, progress)
-    estimate = None if read is None else _estimate(run, read)
+    reading = features_read(run, target, progress)
+    estimate = None if reading is None else _estimate(run, reading)
     if estimate is not None:
         sources["estimate"] = estimate.only(columns)
     path = run.target if target is None else target.path
@@ -236,7 +236,7 @@ def evaluate(
     notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
     short = piled(run.model, run.guide, None if run.unread else estimate, seed)
     beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
-    errors = {} if truth is None else _errors(run, classes, truth, read)
+    errors = {} if truth is None else _errors(run, classes, truth, reading)
     return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, errors)
 
 
