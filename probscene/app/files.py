@@ -36,8 +36,9 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """``write_whole`` for text: UTF-8, the same bytes on every platform."""
-    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8", newline="\n"))
+    """``write_whole`` for text: UTF-8, the same bytes on every platform; of names that are no UTF-8, escapes."""
+    data = text.encode("utf-8", "backslashreplace")
+    write_whole(path, lambda temporary: temporary.write_bytes(data))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -110,7 +110,7 @@ def evaluate(
 
     Args:
         target: the images to judge by; the run's own where None.
-        labels: ``counts.csv``, COCO's ``.json``, ``provenance.jsonl`` or KITTI's folder ``label_2``.
+        labels: ``counts.csv``, COCO's ``.json``, ``provenance.jsonl``, KITTI's folder ``label_2`` or YOLO's ``labels``.
         num: structures a source.
         features: networks for KID and FID, such as ``["efficientnet"]``.
         images: at most so many a side for them; all of the target's where None.
@@ -223,7 +223,7 @@ def trial(
     and test it on labelled real images; the same call goes on after an interruption.
 
     Args:
-        test: labelled real images: a folder of COCO or KITTI, a JSON file, or ``FOLDER@LIST``.
+        test: labelled real images: a folder of COCO, KITTI or YOLO, a JSON file, or ``FOLDER@LIST``.
         out: the folder to write.
         sets: what each detector is shown, by name, such as ``{"rendered": "dataset/", "then 20": "rendered,real:20"}``;
             see ``trial.plan``.

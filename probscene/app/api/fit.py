@@ -79,8 +79,8 @@ def fit(
         assets: a folder that the model is drawn with.
         cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
             folder.
-        labels: of a few of the images, for features that take them: a ``counts.csv``, COCO's ``.json`` or KITTI's
-            folder ``label_2``.
+        labels: of a few of the images, for features that take them: a ``counts.csv``, COCO's ``.json``,
+            KITTI's folder ``label_2`` or YOLO's ``labels``.
         resume: go on with the run in ``out`` where there is one; the other arguments are those that it was begun with.
             Model, target and labels may lie elsewhere by now, if they are the same bytes.
         progress: show it, on stderr.

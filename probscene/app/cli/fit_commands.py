@@ -58,7 +58,9 @@ def fit(
     ] = None,
     labels: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="Of a few of the images: a counts.csv, COCO's .json, or KITTI's label_2."),
+        typer.Option(
+            metavar="PATH", help="Of a few of the images: a counts.csv, COCO's .json, KITTI's label_2, YOLO's labels."
+        ),
     ] = None,
     assets: Assets = None,
     cache: Cache = None,

@@ -60,7 +60,7 @@ def evaluate(
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="A counts.csv (image,CLASS,...), COCO's .json, a provenance.jsonl, or KITTI's folder label_2.",
+            help="A counts.csv (image,CLASS,...), a provenance.jsonl, COCO's .json, KITTI's label_2, or YOLO's labels.",
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,

@@ -14,7 +14,7 @@ from .options import BoxMargin, Seed
 @app.command()
 def trial(
     test: Annotated[
-        Path, typer.Option(metavar="PATH", help="Labelled real images: COCO or KITTI; PATH@LIST for some.")
+        Path, typer.Option(metavar="PATH", help="Labelled real images: COCO, KITTI or YOLO; PATH@LIST for some.")
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
     sets: Annotated[

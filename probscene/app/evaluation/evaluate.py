@@ -3,7 +3,7 @@
 Sources of counts: ``prior``, ``start`` where fits set out from another policy, and ``learnt`` are sampled structures;
 ``truth`` is a file of labels of the target's images; ``estimate`` is what the run's feature network counts in them,
 rounded. The last is no truth: the network learnt on prior renders alone and errs where objects crowd, but it is there
-without a single label.
+without a single label. Where there are both, what was read in each image is held against its labels.
 
 Where kinds nest (cars on roads), children are counted by node and by the node's rank: which no context-free prior can
 weigh, and totals hide.
@@ -29,7 +29,8 @@ from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..walls.inexpressible import Inexpressible, inexpressible
 from ..walls.piled import Piled, piled, sentences
-from .estimate import estimated
+from .count_errors import CountErrors, count_errors
+from .estimate import class_counts, counted_classes, estimated
 from .image_distances import IMAGES, Distances, image_distances
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
@@ -52,6 +53,7 @@ class Evaluation:
         notes: of the labels.
         piled: the lists that are too short for what was learnt.
         inexpressible: the images that the model cannot have, by the labels, else by the estimate.
+        errors: with labels, by class those of the counts that are read in each image; None where none are.
     """
 
     run: RunFolder
@@ -63,6 +65,7 @@ class Evaluation:
     notes: tuple[str, ...] = ()
     piled: tuple[Piled, ...] = ()
     inexpressible: tuple[Inexpressible, ...] = ()
+    errors: dict[str, CountErrors | None] = field(default_factory=dict)
 
     @cached_property
     def unread(self) -> tuple[str, ...]:
@@ -144,6 +147,7 @@ class Evaluation:
             "readings": self.run.readings.get("classes", {}),
             "outcome": self.run.outcome,
             "distances": self.distances(),
+            "count_errors": {name: _plain(found) for name, found in self.errors.items()},
             "walls": {
                 "lists": [found.record() for found in self.piled],
                 "images": [found.record() for found in self.inexpressible],
@@ -223,7 +227,8 @@ def evaluate(
             likelihoods[name] = likelihood(policy, truth.derivation)
     if truth is not None:
         sources["truth"] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
-    estimate = network_counts(run, target, progress)
+    reading = features_read(run, target, progress)
+    estimate = None if reading is None else _estimate(run, reading)
     if estimate is not None:
         sources["estimate"] = estimate.only(columns)
     path = run.target if target is None else target.path
@@ -231,7 +236,8 @@ def evaluate(
     notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
     short = piled(run.model, run.guide, None if run.unread else estimate, seed)
     beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
-    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond)
+    errors = {} if truth is None else _errors(run, classes, truth, reading)
+    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, errors)
 
 
 def _inexpressible(
@@ -256,13 +262,21 @@ def _inexpressible(
 
 
 def network_counts(run: RunFolder, target: Images | None, progress: Progress) -> Source | None:
-    """What the run's feature network counts in the target's images, rounded; None where it does not count.
+    """What the run's feature network counts in the target's images, rounded; None where it does not count all classes.
 
     The features that the fit kept are taken where the images are the fit's, else the images are embedded anew.
     """
-    model = run.model
     names = run.feature_names
-    if estimated(model, names, torch.zeros(0, len(names))) is None:
+    if estimated(run.model, names, torch.zeros(0, len(names))) is None:
+        return None
+    read = features_read(run, target, progress)
+    return None if read is None else _estimate(run, read)
+
+
+def features_read(run: RunFolder, target: Images | None, progress: Progress) -> torch.Tensor | None:
+    """The features ``(L, D)`` of the target's images, counts in objects; None where they count no class, or where there
+    is neither a target nor what the fit kept."""
+    if not counted_classes(run.model, run.feature_names):
         return None
     features, done, total = kept_features(run, target), 0, 0 if target is None else len(target)
 
@@ -276,10 +290,28 @@ def network_counts(run: RunFolder, target: Images | None, progress: Progress) ->
     net = own_net(run)
     if features is None and target is not None:
         features = features_in(run, target, net, each)
-    if features is None:
-        return None
-    found = estimated(model, names, features * getattr(net, "unit", 1.0))
+    return None if features is None else features * getattr(net, "unit", 1.0)
+
+
+def _estimate(run: RunFolder, read: torch.Tensor) -> Source | None:
+    found = estimated(run.model, run.feature_names, read)
     return None if found is None else Source(*found, seed=1)
+
+
+def _errors(
+    run: RunFolder, classes: tuple[str, ...], truth: Labels, read: torch.Tensor | None
+) -> dict[str, CountErrors | None]:
+    """Of the labelled classes that the network can count in the target's images."""
+    labelled, names = truth.structures.counts, counted_classes(run.model, run.feature_names)
+    counts = None if read is None else class_counts(run.model, run.feature_names, read)
+    errors = dict.fromkeys(classes, None)
+    if counts is None or (truth.rows is None and len(counts) != len(labelled)):
+        return errors
+    found = counts.double().numpy()[slice(None) if truth.rows is None else truth.rows]
+    known = [name for name in classes if name in names and name not in run.unread]
+    return errors | {
+        name: count_errors(found[:, names.index(name)], labelled[:, classes.index(name)]) for name in known
+    }
 
 
 def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:

@@ -1,11 +1,11 @@
-"""The truth that learnt structures are judged by. Four kinds:
+"""The truth that learnt structures are judged by. Three kinds:
 
 ``counts.csv``, how many objects of each class an image shows, see ``labelling.counts``.
 
 ``provenance.jsonl`` as ``generate`` writes it: one line an image with the rules of its structure, which says also what
 hangs below what, and how likely a policy would have derived it.
 
-COCO's JSON of boxes, see ``labelling.coco``, and a folder of KITTI's label files, see ``labelling.kitti``.
+Labels with boxes of COCO, KITTI and YOLO, see ``labelling.reading``.
 """
 
 import json
@@ -21,10 +21,11 @@ from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
-from ..labelling.coco import read_coco
-from ..labelling.counts import read_table, text_of
-from ..labelling.kitti import read_kitti
-from ..labelling.naming import NamedImages
+from ..labelling.boxes import read_boxes
+from ..labelling.counts import read_table
+from ..labelling.naming import Entry, match_target
+from ..labelling.reading import has_boxes
+from ..labelling.text import text_of
 from .structure_counts import Counts, StructureCounts, count
 
 SEEN = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
@@ -40,6 +41,7 @@ class Labels(NamedTuple):
         notes: what a person should know, one sentence each.
         min_height: where objects are labelled that can be seen, and not all that a structure has: that of a box which
             is counted, pixels of the canvas.
+        rows: the numbers of the L images in the target; all of its images where None.
     """
 
     structures: StructureCounts
@@ -47,6 +49,7 @@ class Labels(NamedTuple):
     classes: tuple[str, ...] | None = None
     notes: tuple[str, ...] = ()
     min_height: float | None = None
+    rows: list[int] | None = None
 
     def columns(self, model: SceneModel) -> list[int]:
         """Of the model's classes, the C that are labelled, by number."""
@@ -54,35 +57,35 @@ class Labels(NamedTuple):
 
 
 def read_labels(path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Labels:
-    """The labels of a target's images, by the path's kind: a ``.jsonl`` of provenance, a ``.json`` of COCO, a folder of
-    KITTI's labels, else a CSV of counts.
+    """The labels of a target's images, by the path's kind: a ``.jsonl`` of provenance, labels with boxes
+    (``read_annotations``), else a CSV of counts.
 
-    Entries of files that the target left out as bad are passed over.
+    Entries of files that the target left out as bad are passed over, as are those of files that it has not, which the
+    notes say.
 
     Args:
         some: there need not be one for every image; those without are left out.
         min_height: of an object's box that is counted, pixels of its image; for labels with boxes.
 
     Raises:
-        DataError: see ``read_table``, ``read_coco`` and ``read_kitti``; a line that is none of provenance, or whose
+        DataError: see ``read_table`` and ``read_boxes``; a line that is none of provenance, or whose
             rules are not the model's; a least height for what has no boxes.
     """
     path = Path(path)
-    if path.is_dir() or path.suffix == ".json":
-        read = read_kitti if path.is_dir() else read_coco
-        boxes = read(path, model, target, some, min_height)
+    if has_boxes(path):
+        boxes = read_boxes(path, model, target, some, min_height)
         low = min_height * float(np.median(target.scales))
-        notes = (SEEN, *boxes.notes)
-        return Labels(StructureCounts(boxes.counts, {}), classes=boxes.classes, notes=notes, min_height=low)
+        counts, notes = StructureCounts(boxes.counts, {}), (SEEN, *boxes.notes)
+        return Labels(counts, classes=boxes.classes, notes=notes, min_height=low, rows=boxes.rows)
     if min_height:
         raise DataError(
-            f"Expected a folder of KITTI's labels or COCO's JSON for a least height of objects, actual the file {path}."
+            "Expected labels with boxes (COCO's, KITTI's or YOLO's) for a least height of objects, actual the file "
+            f"{path}."
         )
     if path.suffix != ".jsonl":
         table = read_table(path, model.classes, target, some)
-        return Labels(StructureCounts(table.counts, {}), classes=table.classes, notes=table.notes)
-    derivation = _read_derivations(path, model, target, some)
-    return Labels(count(model, derivation), derivation)
+        return Labels(StructureCounts(table.counts, {}), classes=table.classes, notes=table.notes, rows=table.rows)
+    return _read_derivations(path, model, target, some)
 
 
 def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Counts]:
@@ -95,32 +98,32 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
     return names, count(model, Derivation.of(model.grammar, _padded(rules))).counts
 
 
-def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool) -> Derivation:
-    named = NamedImages(path, target, some)
+def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool) -> Labels:
+    entries, of_line = list[Entry](), list[tuple[list[Any], str]]()
     for number, text in enumerate(text_of(path).split("\n"), 1):
         if not text.strip():
             continue
         where = f"in line {number} of {path}"
         try:
             line = json.loads(text)
-            name, rules, spelt = Path(line["image"]).name, list(line["rules"]), line["derivation"]
+            entries.append(Entry(str(line["image"]), where))
+            of_line.append((list(line["rules"]), line["derivation"]))
         except (ValueError, KeyError, TypeError) as error:
             about = f"{type(error).__name__}: {error}"
             raise DataError(
                 f"Expected image, rules and derivation {where}, actual something else ({about})."
             ) from error
-        if named.wanted(name, where):
-            named.found[name] = _rules(model, rules, spelt, where)
-    rules = named.ordered()
+    found = match_target(path, entries, target, some)
+    rules = [_rules(model, *of_line[k], entries[k].where) for k in found.entries.values()]
     try:
         derivation = Derivation.of(model.grammar, _padded(rules))
         whole = derivation.complete.all()
     except GrammarError:
         whole = False
     if not whole:
-        names = (target.paths[i].name for i, row in zip(named.rows(), rules, strict=True) if not _is_whole(model, row))
+        names = (target.paths[i].name for i, row in zip(found.entries, rules, strict=True) if not _is_whole(model, row))
         raise DataError(f"Expected structures of model {model.name!r} in {path}, actual another of {next(names)}.")
-    return derivation
+    return Labels(count(model, derivation), derivation, notes=found.notes, rows=list(found.entries))
 
 
 def _rules(model: SceneModel, rules: list[Any], spelt: str, where: str) -> list[int]:

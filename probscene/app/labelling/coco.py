@@ -1,66 +1,58 @@
 """COCO's JSON: ``images``, ``annotations`` with a ``bbox``, ``categories`` by name; other keys are not read.
 
 An image that is listed and has no annotation shows nothing; one that is not listed is not labelled. A crowd
-(``iscrowd``) is one annotation of an unknown number of objects: an image with one of a labelled class has no known
-counts, and is taken as not labelled, which a note says. Annotations that are marked ``ignore`` or ``difficult`` are
-counted as all others.
+(``iscrowd``) is one annotation of an unknown number of objects. Annotations that are marked ``ignore`` or ``difficult``
+are counted as all others. Where there is no ``bbox``, it is that of the ``segmentation``, polygons or run lengths.
+Numbers may be written as text, ids as 1.0 for 1; a width or height of 0 is an unknown one.
 """
 
 import json
+import math
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from probscene.dataset import Images
-from probscene.errors import DataError
-from probscene.model import SceneModel
+import numpy as np
 
-from .boxes import Box, Boxes, finite, on_canvas, place
-from .counts import text_of
-from .naming import NamedImages, base_name, labelled_classes
+from probscene.errors import DataError
+
+from .annotations import Annotated, Annotation, Size
+from .naming import Entry
+from .text import number_of, text_of
 
 LISTS = ("images", "annotations", "categories")
 
 
-def read_coco(path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Boxes:
-    """The boxes of a target's images. Entries of files that the target left out as bad are passed over.
-
-    Args:
-        some: there need not be an entry for every image; those without are left out.
-        min_height: of a box that is counted, pixels of its file.
+def read_coco(path: Path) -> Annotated:
+    """What a file says.
 
     Raises:
-        DataError: no such file or no COCO, an image that is not there, is twice there, has another size or none of
-            whose entries is; an annotation of no image or category, or whose box is none or beside its image; no
-            category that the model has a class for. The first is named.
+        DataError: no such file or no COCO; an image or category without a name, or with an id or a name that another
+            one has; an annotation of no image or category. The first is named.
     """
-    path = Path(path)
     whole = _whole(path)
-    categories: dict[int | str, str] = {}
-    for i, entry in enumerate(whole["categories"]):
-        where = place(path, "categories", i)
-        categories[_new_id(entry, categories, where)] = _text(entry, "name", where)
-    expected = f"categories among the classes of model {model.name!r} ({', '.join(model.classes)})"
-    classes, notes = labelled_classes(categories.values(), model.classes, expected, path)
-    named = NamedImages(path, target, some)
-    names = _names(path, whole["images"], named)
-    crowded: set[str] = set()
+    categories = _by_id(path, "categories", whole["categories"], "name")
+    twice = [name for name in categories.values() if list(categories.values()).count(name) > 1]
+    if twice:
+        raise DataError(f"Expected categories with a name each in {path}, actual {twice[0]!r} more than once.")
+    names = _by_id(path, "images", whole["images"], "file_name")
+    of_image: dict[str, list[tuple[str, str, dict[str, Any]]]] = defaultdict(list)
     for i, entry in enumerate(whole["annotations"]):
-        where = place(path, "annotations", i)
+        where = _place(path, "annotations", i)
         image, category = _known(entry, "image_id", names, where), _known(entry, "category_id", categories, where)
-        box = _box(entry, category, where)
-        if category in classes and image in named.found:
-            if entry.get("iscrowd"):
-                crowded.add(image)
-            named.found[image].append(box)
-    for image in crowded:
-        del named.found[image]
-    named.unknown = crowded
-    if crowded:
-        notes += (
-            f"{len(crowded)} images are taken as not labelled, since a crowd (iscrowd) says not how many it has: "
-            f"{', '.join(sorted(crowded)[:5])}{' ...' if len(crowded) > 5 else ''}.",
-        )
-    return on_canvas(target, named.rows(), named.ordered(), classes, notes, min_height)
+        of_image[image].append((categories[category], where, entry))
+    keys, images = list(names), [Entry(name, _place(path, "images", i)) for i, name in enumerate(names.values())]
+
+    def read(i: int, size: Size) -> list[Annotation]:
+        said = tuple(number_of(whole["images"][i].get(side)) for side in ("height", "width"))
+        if all(side > 0 for side in said) and said != size:
+            raise DataError(
+                f"Expected {images[i].name} to be {said[1]:.9g}x{said[0]:.9g} as {images[i].where}, actual "
+                f"{size[1]}x{size[0]}; give labels of these images, not of images of another size."
+            )
+        return [_annotation(*each) for each in of_image[keys[i]]]
+
+    return Annotated(path, (path,), images, read, tuple(categories.values()))
 
 
 def _whole(path: Path) -> dict[str, list[Any]]:
@@ -76,52 +68,118 @@ def _whole(path: Path) -> dict[str, list[Any]]:
     return whole
 
 
-def _names(path: Path, images: list[Any], named: NamedImages) -> dict[int | str, str]:
-    """The file's name of each image by its id; those of the target that are used get an empty list in ``named``."""
-    names: dict[int | str, str] = {}
-    size = {file.name: size for file, size in zip(named.target.paths, named.target.sizes, strict=True)}
-    for i, entry in enumerate(images):
-        where = place(path, "images", i)
-        key, name = _new_id(entry, names, where), base_name(_text(entry, "file_name", where))
-        names[key] = name
-        if not named.wanted(name, where):
-            continue
-        named.found[name] = []
-        said = entry.get("height"), entry.get("width")
-        if None not in said and said != size[name]:
+def _by_id(path: Path, key: str, entries: list[Any], named: str) -> dict[str, str]:
+    """The names of images or categories by their ids, in the order of the file."""
+    names: dict[str, str] = {}
+    for i, entry in enumerate(entries):
+        where = _place(path, key, i)
+        said = entry.get("id") if isinstance(entry, dict) else None
+        number, name = _id(said), entry.get(named) if isinstance(entry, dict) else None
+        if number is None or number in names:
             raise DataError(
-                f"Expected {name} to be {said[1]}x{said[0]} as {where}, actual {size[name][1]}x{size[name][0]}; "
-                "give labels of these images, not of images of another size."
+                f"Expected an id that no other entry has {where}, actual {json.dumps(said)}; mend the entry."
             )
+        if isinstance(name, bool) or not isinstance(name, str | int) or name == "":
+            raise DataError(f"Expected a {named} {where}, actual {json.dumps(name)}; mend the entry.")
+        names[number] = str(name)
     return names
 
 
-def _box(entry: dict[str, Any], name: str, where: str) -> Box:
-    box = entry.get("bbox")
-    if not isinstance(box, list) or len(box) != 4 or not finite(box) or min(box[2:]) <= 0:
+def _place(path: Path, key: str, i: int) -> str:
+    return f"in {key}[{i}] of {path}"
+
+
+def _id(value: Any) -> str | None:
+    """An id as text: 1 for 1, 1.0, "1" and "1.0"; None for what is none."""
+    if isinstance(value, str):
+        return value.strip().removesuffix(".0") or None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return str(int(value)) if value == int(value) else str(value)
+
+
+def _known(entry: Any, key: str, known: dict[str, str], where: str) -> str:
+    said = entry.get(key) if isinstance(entry, dict) else None
+    found = _id(said)
+    if found is None or found not in known:
+        raise DataError(f"Expected {key} to be an id that is listed {where}, actual {json.dumps(said)}; mend it.")
+    return found
+
+
+def _annotation(name: str, where: str, entry: dict[str, Any]) -> Annotation:
+    said = entry.get("bbox")
+    box = _numbers(said, 4)
+    if (said is None or said == [] or box == [0, 0, 0, 0]) and entry.get("segmentation"):
+        box = around(entry["segmentation"], where)
+    if box is None or min(box[2:]) <= 0:
         raise DataError(
-            f"Expected bbox: x, y, and a width and height above 0 {where}, actual {json.dumps(box)}; mend or delete it."
+            f"Expected bbox: x, y, and a width and height above 0 {where}, actual {json.dumps(said)}; mend or delete "
+            "it."
         )
     x, y, width, height = box
-    return Box(name, x, y, x + width, y + height, height, where)
+    crowd = number_of(entry.get("iscrowd")) > 0 or entry.get("iscrowd") is True
+    return Annotation(name, x, y, x + width, y + height, crowd=crowd, where=where)
 
 
-def _new_id(entry: Any, known: dict[int | str, str], where: str) -> int | str:
-    key = entry.get("id") if isinstance(entry, dict) else None
-    if isinstance(key, int | str) and key not in known:
-        return key
-    raise DataError(f"Expected an id that no other entry has {where}, actual {json.dumps(key)}; mend the entry.")
+def around(segmentation: Any, where: str) -> list[float]:
+    """The x, y, width and height of polygons or of a mask of run lengths.
+
+    Raises:
+        DataError: it is neither.
+    """
+    if isinstance(segmentation, dict):
+        return _around_runs(segmentation, where)
+    parts = segmentation if isinstance(segmentation, list) and isinstance(segmentation[0], list) else [segmentation]
+    corners = [_numbers(part) for part in parts]
+    if any(part is None or len(part) < 6 or len(part) % 2 for part in corners):
+        raise DataError(
+            f"Expected polygons of at least three corners x, y {where}, actual {json.dumps(segmentation)[:80]}; mend "
+            "or delete it."
+        )
+    x, y = ([value for part in corners if part for value in part[axis::2]] for axis in (0, 1))
+    return [min(x), min(y), max(x) - min(x), max(y) - min(y)]
 
 
-def _text(entry: dict[str, Any], key: str, where: str) -> str:
-    text = entry.get(key)
-    if not isinstance(text, str) or not text:
-        raise DataError(f"Expected a {key} {where}, actual {json.dumps(text)}; mend the entry.")
-    return text
+def _around_runs(coded: dict[str, Any], where: str) -> list[float]:
+    """The same of a mask; pycocotools ends the process where one is broken."""
+    counts, size = coded.get("counts"), _numbers(coded.get("size"), 2)
+    runs = _decoded(counts) if isinstance(counts, str) else _numbers(counts)
+    if not runs or size is None or min(runs) < 0 or sum(runs) != size[0] * size[1]:
+        raise DataError(
+            f"Expected a mask with size and counts that add up to it {where}, actual {json.dumps(coded)[:80]}; mend or "
+            "delete it."
+        )
+    ends = np.cumsum(runs).astype(np.int64)
+    first, last = ends[:-1:2], ends[1::2] - 1  # pixels of each run that is not empty, down one column after the other
+    first, last = first[last >= first], last[last >= first]
+    if not len(first):
+        return [0, 0, 0, 0]
+    height = int(size[0])
+    left, right = first // height, last // height
+    top, bottom = np.where(left == right, [first % height, last % height], [[0], [height - 1]])
+    x, y = int(left.min()), int(top.min())
+    return [x, y, int(right.max()) + 1 - x, int(bottom.max()) + 1 - y]
 
 
-def _known(entry: Any, key: str, known: dict[int | str, str], where: str) -> str:
-    found = entry.get(key) if isinstance(entry, dict) else None
-    if not isinstance(found, int | str) or found not in known:
-        raise DataError(f"Expected {key} to be an id that is listed {where}, actual {json.dumps(found)}; mend it.")
-    return known[found]
+def _decoded(text: str) -> list[float] | None:
+    """The run lengths that COCO packs in text, five bits a character, as what they are more than the last but one."""
+    runs, value, shift = list[float](), 0, 0
+    for letter in text:
+        bits = ord(letter) - 48
+        if not 0 <= bits < 64:
+            return None
+        value |= (bits & 31) << shift
+        shift += 5
+        if not bits & 32:
+            value -= (bits & 16) << shift - 4
+            runs.append(value + runs[-2] if len(runs) > 2 else value)
+            value, shift = 0, 0
+    return None if shift else runs
+
+
+def _numbers(value: Any, number: int | None = None) -> list[float] | None:
+    """A list of numbers of pixels; None for all else."""
+    if not isinstance(value, list) or (number is not None and len(value) != number):
+        return None
+    found = [number_of(each) for each in value]
+    return found if all(abs(each) < 1e9 for each in found) else None

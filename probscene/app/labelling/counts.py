@@ -21,7 +21,8 @@ from probscene.dataset import Images
 from probscene.errors import DataError
 
 from ..files import write_text
-from .naming import NamedImages, base_name, labelled_classes
+from .naming import Entry, composed, labelled_classes, match_target
+from .text import text_of
 
 
 class Table(NamedTuple):
@@ -41,7 +42,8 @@ class Table(NamedTuple):
 
 
 def read_table(path: Path, classes: tuple[str, ...], target: Images, some: bool = False) -> Table:
-    """The counts of a target's images. Rows of files that the target left out as bad are passed over.
+    """The counts of a target's images. Rows of files that the target left out as bad, or that it has not, are passed
+    over; the latter are said.
 
     Args:
         classes: the model's.
@@ -49,8 +51,7 @@ def read_table(path: Path, classes: tuple[str, ...], target: Images, some: bool 
 
     Raises:
         DataError: no such file, no column of a class, two of one name, a row of another length or with some of its
-            counts, an image that is not there, twice there or without a row, or what is not a count; the first is
-            named.
+            counts, two rows of an image or none, or what is not a count; the first is named.
     """
     path = Path(path)
     header, lines = _lines(path)
@@ -62,19 +63,16 @@ def read_table(path: Path, classes: tuple[str, ...], target: Images, some: bool 
         if len(fields) != len(header):
             raise DataError(f"Expected {len(header)} fields in line {number} of {path}, actual {len(fields)}.")
     cells = [(number, dict(zip(header, fields, strict=True))) for number, fields in lines]
-    empty = tuple(name for name in found if cells and not any(row[name] for _, row in cells))
+    empty = tuple(name for name in found if cells and not any(row[name].strip() for _, row in cells))
     if empty and len(empty) < len(found):
-        found = tuple(name for name in found if name not in empty)
+        found = {name: own for name, own in found.items() if name not in empty}
         notes += (f"Not labelled, since its column is empty: {', '.join(empty)}.",)
-    named = NamedImages(path, target, some)
-    for number, row in cells:
-        where, name = f"in line {number} of {path}", base_name(row["image"])
-        counted = any(row[c] for c in found)
-        if not (name or counted) or not named.wanted(name, where) or not counted:
-            continue
-        named.found[name] = [_count(row[c], c, name, where) for c in found]
-    rows = named.rows()
-    return Table(rows, np.array(named.ordered(), np.int64).reshape(len(rows), len(found)), found, notes)
+    cells = [(number, row) for number, row in cells if any(row[name].strip() for name in found)]
+    entries = [Entry(row["image"], f"in line {number} of {path}") for number, row in cells]
+    images = match_target(path, entries, target, some)
+    counts = [[_count(cells[k][1][name].strip(), name, *entries[k]) for name in found] for k in images.entries.values()]
+    whole = np.array(counts, np.int64).reshape(len(counts), len(found))
+    return Table(list(images.entries), whole, tuple(found.values()), (*images.notes, *notes))
 
 
 def write_counts(path: Path, names: list[str], counts: NDArray[np.int64], classes: tuple[str, ...]) -> None:
@@ -89,30 +87,17 @@ def write_cells(path: Path, rows: list[list[str]], classes: tuple[str, ...]) -> 
     write_text(path, text.getvalue())
 
 
-def text_of(path: Path) -> str:
-    """A file of labels.
-
-    Raises:
-        DataError: there is none, or it is no UTF-8.
-    """
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(f"Expected a file of labels at {path}, actual none: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"Expected a text file in UTF-8, actual {path}: {error}.") from error
-
-
 def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and the fields of each further row with its number."""
     text = text_of(path)
     first = text.partition("\n")[0]
     try:
-        rows = list(csv.reader(io.StringIO(text), delimiter=max(",;\t", key=first.count), strict=True))
+        lines = io.StringIO(text, newline="")
+        rows = list(csv.reader(lines, delimiter=max(",;\t", key=first.count), strict=True))
     except csv.Error as error:
         raise DataError(f"Expected a CSV file in UTF-8, actual {path}: {error}.") from error
-    rows = [[field.strip() for field in row] for row in rows]
-    return rows[0] if rows else [], [(number, fields) for number, fields in enumerate(rows[1:], 2) if any(fields)]
+    named = [(number, fields) for number, fields in enumerate(rows[1:], 2) if any(field.strip() for field in fields)]
+    return [composed(name.strip()) for name in rows[0]] if rows else [], named
 
 
 def _count(text: str, column: str, name: str, where: str) -> int:

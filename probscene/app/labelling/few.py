@@ -15,9 +15,9 @@ from probscene.errors import DataError
 from probscene.inference.features.base import Labelled
 from probscene.model import SceneModel
 
-from .coco import read_coco
+from .boxes import read_boxes
 from .counts import read_table
-from .kitti import read_kitti
+from .reading import has_boxes, label_files
 
 LEAST = 3  # images, of which one can be left out and two are left to choose by
 
@@ -42,23 +42,23 @@ class FewLabels(NamedTuple):
 
 
 def read_few(path: Path, model: SceneModel, target: Images, least: int = LEAST) -> FewLabels:
-    """The labels of some of a target's images: COCO's JSON, a folder of KITTI's labels, else a CSV of counts.
+    """The labels of some of a target's images: with boxes, see ``read_annotations``, else a CSV of counts.
 
     Args:
         least: images that must be labelled.
 
     Raises:
-        DataError: see ``read_coco``, ``read_kitti`` and ``read_table``; whole structures (``.jsonl``); fewer than
+        DataError: see ``read_boxes`` and ``read_table``; whole structures (``.jsonl``); fewer than
             ``least`` images are labelled.
     """
     path, boxes, notes = Path(path), None, ()
     if path.suffix == ".jsonl":
         raise DataError(
-            f"Expected labels that people give (a CSV of counts, COCO's JSON or a folder of KITTI's), actual {path} of "
-            "whole structures; give those to 'probscene evaluate'."
+            f"Expected labels that people give (a CSV of counts, COCO's JSON, a folder of KITTI's or YOLO's), actual "
+            f"{path} of whole structures; give those to 'probscene evaluate'."
         )
-    if path.is_dir() or path.suffix == ".json":
-        read = (read_kitti if path.is_dir() else read_coco)(path, model, target, True)
+    if has_boxes(path):
+        read = read_boxes(path, model, target, True)
         boxes = read.boxes
     else:
         read = read_table(path, model.classes, target, True)
@@ -115,7 +115,7 @@ def labels_record(path: Path) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> str:
-    if not path.is_dir():
+    if not path.is_dir() and label_files(path) == (path,):
         return hashlib.sha256(path.read_bytes()).hexdigest()
-    files = [[file.name, hashlib.sha256(file.read_bytes()).hexdigest()] for file in sorted(path.glob("*.txt"))]
+    files = [[file.name, hashlib.sha256(file.read_bytes()).hexdigest()] for file in label_files(path)]
     return hashlib.sha256(json.dumps(files).encode()).hexdigest()

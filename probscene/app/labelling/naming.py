@@ -1,85 +1,129 @@
-"""The names that a file of labels has for images and classes, matched with the target's and the model's."""
+"""The names that labels have for images and classes, matched with files and with a model's classes.
+
+Names match when they are the same, also where their letters are composed otherwise (Unicode's NFC and NFD), where one
+has folders before it, and where only one of them has white space at its ends. Bytes that are no UTF-8 are written as
+``printable`` has them, and match as such.
+"""
 
 import re
-from collections import Counter
-from collections.abc import Iterable
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from probscene.dataset import Images
 from probscene.errors import DataError
 
 
-class NamedImages:
-    """What a file of labels says of a target's images, or of some, by name, each exactly once.
+class Entry(NamedTuple):
+    """What labels say of one image.
+
+    Attributes:
+        name: of the image, with or without folders.
+        where: it is in the labels, for messages.
+    """
+
+    name: str
+    where: str
+
+
+class Matched(NamedTuple):
+    """Which entries are of which images.
+
+    Attributes:
+        entries: by the image's number, the number of its entry, in the order of the images.
+        notes: what a person should know, one sentence each.
+        others: names of entries that are of no image, with their places.
+    """
+
+    entries: dict[int, int]
+    notes: tuple[str, ...] = ()
+    others: tuple[Entry, ...] = ()
+
+
+def matched(
+    entries: Sequence[Entry], files: Sequence[Path], folder: Path, left_out: Iterable[Path] = (), stems: bool = False
+) -> Matched:
+    """Match entries with images, one to one. Those of no image are left out, which a note says.
+
+    Args:
+        folder: of the images, for messages.
+        left_out: further images, whose entries are passed over.
+        stems: names are without the ending of the image's file.
+
+    Raises:
+        DataError: an entry is of two images, or two are of one; or one is of no image, but of one without an entry
+            but for case.
+    """
+    names, of_file = _Names(files, stems), defaultdict[int, list[int]](list)
+    others = list[int]()
+    for number, entry in enumerate(entries):
+        found = names.of(entry.name)
+        if len(found) > 1:
+            raise DataError(
+                f"Expected the name of one image {entry.where}, actual {entry.name!r}, which {len(found)} files in "
+                f"{folder} have; give them different names."
+            )
+        if found:
+            of_file[found[0]].append(number)
+        else:
+            others.append(number)
+    chosen = dict[int, int]()
+    for i, numbers in sorted(of_file.items()):
+        alike = [_folders_alike(entries[number].name, files[i]) for number in numbers]
+        best = [number for number, depth in zip(numbers, alike, strict=True) if depth == max(alike)]
+        if len(best) > 1:
+            raise DataError(
+                f"Expected one row an image, actual a second one of {files[i].name} {entries[best[1]].where}; keep one "
+                "of them."
+            )
+        chosen[i] = best[0]
+        others += [number for number in numbers if number != best[0]]
+    passed = _Names(list(left_out), stems)
+    unknown = [entries[number] for number in sorted(others) if not passed.of(entries[number].name)]
+    _check_case(unknown, [file for i, file in enumerate(files) if i not in chosen], folder, stems)
+    more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
+    shown = [f"{_last(entry.name)}.txt" if stems else entry.name for entry in unknown]
+    notes = (f"Not read, since {folder} has no such image: {shown[0]}{more}.",) if shown else ()
+    return Matched(chosen, notes, tuple(unknown))
+
+
+def match_target(path: Path, entries: Sequence[Entry], target: Images, some: bool, stems: bool = False) -> Matched:
+    """Match entries with a target's images; those of files that the target left out as bad are passed over.
 
     Args:
         path: of the labels, for messages.
-        some: there need not be labels of every image.
+        some: there need not be an entry for every image.
 
-    Attributes:
-        found: by name; the caller adds what it reads.
-        unknown: names of images that have an entry but no usable label, such as a crowd: they are not missed.
+    Raises:
+        DataError: see ``matched``; an image without an entry, where not only some are expected; none of any.
     """
-
-    def __init__(self, path: Path, target: Images, some: bool):
-        self.path, self.target, self.some = path, target, some
-        self.known = Counter(file.name for file in target.paths)
-        self.left_out = {file.name for file in target.bad}
-        self.found: dict[str, Any] = {}
-        self.unknown: set[str] = set()
-
-    def wanted(self, name: str, where: str) -> bool:
-        """Whether an entry is of an image that is used; one of a file that the target left out as bad is not.
-
-        Raises:
-            DataError: it is of no image, of two, or of one that has an entry already.
-        """
-        if name in self.left_out and name not in self.known:
-            return False
-        if name not in self.known:
-            near = _alike(name, self.known)
-            raise DataError(
-                f"Expected the name of an image in {self.target.path} {where}, actual {name!r}; "
-                f"{f'did you mean {near!r}?' if near else 'mend the name, or leave the entry out.'}"
-            )
-        if self.known[name] > 1:
-            raise DataError(
-                f"Expected the name of one image {where}, actual {name!r}, which {self.known[name]} files of the "
-                "target have; give them different names."
-            )
-        if name in self.found or name in self.unknown:
-            raise DataError(f"Expected one row an image, actual a second one of {name} {where}; keep one of them.")
-        return True
-
-    def rows(self) -> list[int]:
-        """The numbers of the images that it is about, in the order of the target's files.
-
-        Raises:
-            DataError: there are no labels of an image, and not only some are expected; none of any.
-        """
-        missing = [f.name for f in self.target.paths if f.name not in self.found and f.name not in self.unknown]
-        if not self.found and (self.some or not missing):
-            raise DataError(
-                f"Expected labels of images of {self.target.path} in {self.path}, actual none; label at least one."
-            )
-        if missing and not self.some:
-            names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-            raise DataError(
-                f"Expected labels of every image of {self.target.path} in {self.path}, actual none of {names}; if only "
-                "some are labelled, add --some-labels."
-            )
-        return [i for i, file in enumerate(self.target.paths) if file.name in self.found]
-
-    def ordered(self) -> list[Any]:
-        """What was found, in the order of ``rows``."""
-        return [self.found[self.target.paths[i].name] for i in self.rows()]
+    found = matched(entries, target.paths, target.path, target.bad, stems)
+    missing = [file.name for i, file in enumerate(target.paths) if i not in found.entries]
+    but = ""
+    if found.others:
+        entry, more = found.others[0], len(found.others) - 1
+        but = f", but of {_last(entry.name)!r} {entry.where}{f' and {more} more' if more else ''}, which it has not"
+    if not found.entries and (some or not missing):
+        raise DataError(
+            f"Expected labels of images of {target.path} in {path}, actual none{but}; label at least one, by the name "
+            "of its file."
+        )
+    if missing and not some:
+        names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+        raise DataError(
+            f"Expected labels of every image of {target.path} in {path}, actual none of {names}{but}; if only some are "
+            "labelled, add --some-labels."
+        )
+    return found
 
 
 def labelled_classes(
     names: Iterable[str], classes: tuple[str, ...], what: str, path: Path
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The model's classes that a file of labels names, in the model's order, and notes on its other names.
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """By their names in a file of labels, the model's classes that it names, in the model's order, and notes on its
+    other names.
 
     Args:
         names: of the file.
@@ -89,32 +133,86 @@ def labelled_classes(
         DataError: one is spelt a little differently from a class that is not named otherwise; or none is a class.
     """
     names = list(dict.fromkeys(names))
-    others = [name for name in names if name not in classes]
-    free = [name for name in classes if name not in names]
+    own = {composed(name): name for name in classes}
+    others = [name for name in names if composed(name) not in own]
+    free = [name for name in classes if composed(name) not in map(composed, names)]
     for name in others:
-        if near := _alike(name, free):
+        if near := next((other for other in free if _plain(other) == _plain(name)), None):
             raise DataError(
                 f"Expected {what} in {path}, actual {name!r}; did you mean {near!r}? Write it as the model does."
             )
-    found = tuple(name for name in classes if name in names)
+    found = {name: own[composed(name)] for name in names if composed(name) in own}
     if not found:
         raise DataError(
             f"Expected {what} in {path}, actual {', '.join(others) or 'none'}; give at least one by the model's name."
         )
     note = f"Not counted, since the model has no such class: {', '.join(others)}."
-    return found, (note,) if others else ()
+    return dict(sorted(found.items(), key=lambda pair: classes.index(pair[1]))), (note,) if others else ()
 
 
-def base_name(name: str) -> str:
+def printable(name: str) -> str:
+    r"""A file's name as text that UTF-8 can hold: a byte that is none, such as E9, becomes ``\udce9``."""
+    return name.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+class _Names:
+    """Files by their names, as they are and as they match otherwise."""
+
+    def __init__(self, files: Sequence[Path], stems: bool):
+        self.files = files
+        self.tables = [defaultdict[str, list[int]](list) for _ in range(3)]
+        for i, file in enumerate(files):
+            for table, key in zip(self.tables, _keys(file.stem if stems else file.name), strict=True):
+                table[key].append(i)
+
+    def of(self, name: str) -> list[int]:
+        """The numbers of the files that a name may be of: of those that it is of by its last part, the ones whose
+        folders are the most like its own."""
+        for said in (name, _last(name)):
+            for table, key in zip(self.tables, _keys(said), strict=True):
+                if found := table.get(key):
+                    alike = [_folders_alike(name, self.files[i]) for i in found]
+                    return [i for i, depth in zip(found, alike, strict=True) if depth == max(alike)]
+        return []
+
+
+def _last(name: str) -> str:
     """The name of a file without its folders, of whatever system they are."""
     return re.split(r"[/\\]", name)[-1]
 
 
-def _alike(name: str, others: Iterable[str]) -> str | None:
-    """One that differs in case, in what joins its words or in an s at its end only."""
-    return next((other for other in others if _plain(other) == _plain(name)), None)
+def _keys(name: str) -> tuple[str, str, str]:
+    text = composed(printable(name))
+    return name, text, text.strip()
+
+
+def _folders_alike(name: str, file: Path) -> int:
+    """How many folders, from the last one up, a name and a file have in common."""
+    number = 0
+    for one, other in zip(re.split(r"[/\\]", name)[-2::-1], file.parts[-2::-1], strict=False):
+        if composed(one) != composed(other):
+            break
+        number += 1
+    return number
+
+
+def _check_case(unknown: Sequence[Entry], free: Sequence[Path], folder: Path, stems: bool) -> None:
+    """See that no entry of no image is of one that has none, but for case."""
+    near = {(file.stem if stems else file.name).casefold(): file for file in free}
+    for entry in unknown:
+        if file := near.get(_last(entry.name).casefold()):
+            raise DataError(
+                f"Expected the name of an image in {folder} {entry.where}, actual {entry.name!r}; did you mean "
+                f"{file.name!r}?"
+            )
+
+
+def composed(name: str) -> str:
+    """With letters and their accents as one character, where there is one."""
+    return unicodedata.normalize("NFC", name)
 
 
 def _plain(name: str) -> str:
-    plain = re.sub(r"[\s_-]+", "", name.casefold())
+    """Without case, what joins words, and an s at the end."""
+    plain = re.sub(r"[\s_-]+", "", composed(name).casefold())
     return plain.removesuffix("s") or plain

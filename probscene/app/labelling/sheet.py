@@ -24,6 +24,7 @@ from probscene.errors import DataError
 
 from ..files import make_folder, write_text, write_whole
 from .counts import write_cells
+from .naming import printable
 
 LARGEST = 1280  # pixels of a picture's longer side
 
@@ -34,7 +35,7 @@ class Sheet(NamedTuple):
     Attributes:
         page: the HTML.
         table: the CSV.
-        names: of the images to count in, in their order.
+        names: of the images to count in, in their order, as they are written there.
     """
 
     page: Path
@@ -64,8 +65,8 @@ def write_sheet(
         MachineError: it cannot be written.
     """
     check_empty(out)
-    names = tuple(target.paths[row].name for row in rows)
-    cells = [[name, *done] for name, done in (before or {}).items()]
+    names = tuple(printable(target.paths[row].name) for row in rows)
+    cells = [[printable(name), *done] for name, done in (before or {}).items()]
     table = [*cells, *([name, *[""] * len(classes)] for name in names)]
     make_folder(out.parent)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as aside:

@@ -19,6 +19,7 @@ import numpy as np
 
 from probscene.errors import DataError, ProbsceneError
 
+from ..labelling.naming import composed
 from .sets import Example, LabelledSet
 
 REAL = "real"
@@ -109,12 +110,12 @@ def only(found: LabelledSet, names: Path) -> LabelledSet:
         stems = list(dict.fromkeys(names.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"Expected a text file of image names at {names}, actual none to be read ({error}).") from error
-    there = {example.path.stem: example for example in found.examples}
-    lacking = [stem for stem in stems if stem not in there]
+    there = {composed(example.path.stem): example for example in found.examples}
+    lacking = [stem for stem in stems if composed(stem) not in there]
     if lacking or not stems:
         actual = f"{lacking[0]!r}, which it has not" if lacking else "none"
         raise DataError(f"Expected in {names} names of images of {found.path}, without ending, actual {actual}.")
-    return found._replace(examples=tuple(there[stem] for stem in stems))
+    return found._replace(examples=tuple(there[composed(stem)] for stem in stems))
 
 
 def split(found: LabelledSet, number: int, seed: int) -> tuple[LabelledSet, LabelledSet]:
@@ -228,7 +229,7 @@ def _named(
 def _path(word: str, paths: dict[str, Path]) -> Part:
     if not list_of(Path(word))[0].exists():
         raise DataError(
-            f"Expected a labelled set at {word!r}, actual none; name a folder of COCO or KITTI, a JSON file, an "
+            f"Expected a labelled set at {word!r}, actual none; name a folder of COCO, KITTI or YOLO, a JSON file, an "
             "earlier row, or real, prior, start or learnt where they are given."
         )
     paths[word] = Path(word)

@@ -1,30 +1,32 @@
-"""Labelled images that a trial trains or tests on: a folder of COCO, as ``generate`` and others write it, or of KITTI.
+"""Labelled images that a trial trains or tests on: of COCO, as ``generate`` and others write it, of KITTI or of YOLO.
 
     FOLDER/annotations.json and FOLDER/images/, or the JSON file itself, with the images beside it or in images/
     FOLDER/image_2 and FOLDER/label_2
+    FOLDER/data.yaml, FOLDER/images/ and FOLDER/labels/
 
 Axis letters: N objects, H W.
 """
 
 import hashlib
-import json
-import math
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from probscene.dataset import SUFFIXES
 from probscene.errors import DataError
 
-from ..labelling.kitti import DONT_CARE, TYPES, Object, read_objects
+from ..labelling.annotations import Annotated, Annotation
+from ..labelling.kitti import DONT_CARE, TYPES, class_of
+from ..labelling.naming import composed, matched
+from ..labelling.reading import read_annotations
+from ..labelling.yolo import images_beside
 
 Progress = Callable[[int, int], None]
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
 EASY, MODERATE, HARD, BEYOND = range(4)
 """From which of KITTI's levels on an object counts; ``BEYOND``: from none. Objects of COCO are all ``EASY``."""
 LEVELS = {EASY: (40.0, 0, 0.15), MODERATE: (25.0, 1, 0.30), HARD: (25.0, 2, 0.50)}
@@ -62,12 +64,14 @@ class LabelledSet(NamedTuple):
         path: where from.
         classes: their names, sorted.
         kitti: whether its labels have KITTI's levels.
+        notes: what a person should know, one sentence each.
     """
 
     path: Path
     classes: tuple[str, ...]
     examples: tuple[Example, ...]
     kitti: bool = False
+    notes: tuple[str, ...] = ()
 
 
 def read_set(
@@ -76,28 +80,55 @@ def read_set(
     progress: Progress = lambda *_: None,
     same: bool = False,
 ) -> LabelledSet:
-    """All of a set, its images decoded and its labels checked.
+    """All of a set, its images decoded and its labels checked. Labels of images that are not there are not read, which
+    a note says.
 
     Args:
         classes: those to keep; all that it has where None. KITTI's types count as classes of their names, whatever the
             case, or by ``labelling.kitti.TYPES``.
-        same: a set of COCO must have no others.
+        same: a set of COCO or YOLO must have no others.
         progress: called with the number of images read, and of all.
 
     Raises:
-        DataError: no such set; labels that cannot be read, of unknown images or classes, or with boxes that are none or
-            lie off their image; an image that is missing, cannot be decoded, or has another size than its labels say;
-            a class that the set does not have.
+        DataError: no such set; labels that cannot be read, of unknown classes, or with boxes that are none or lie off
+            their image; no image, or one that cannot be decoded, or has no label file or another size than its labels
+            say; a class that the set does not have.
     """
-    if (path / "label_2").is_dir() and (path / "image_2").is_dir():
-        return _read_kitti(path, None if classes is None else tuple(sorted(classes)), progress)
-    file = path / "annotations.json" if path.is_dir() else path
-    if not file.is_file():
+    wanted = None if classes is None else tuple(sorted(map(composed, classes)))
+    labels = read_annotations(path)
+    files = _images(labels)
+    if not labels.images or not files:
+        actual = f"no image such as {labels.images[0].name}" if labels.images else "none of them"
         raise DataError(
-            f"Expected labelled images in {path}: annotations.json (COCO) with its images, or KITTI's image_2 and "
-            "label_2, actual neither; name the folder of a data set."
+            f"Expected labelled images in {path}: annotations.json (COCO) with its images, KITTI's image_2 and "
+            f"label_2, or YOLO's data.yaml, images and labels, actual {actual}; name the folder of a data set."
         )
-    return _read_coco(path, file, None if classes is None else tuple(sorted(classes)), progress, same)
+    found = matched(labels.images, files, files[0].parent, stems=labels.stems)
+    lacking = [file for i, file in enumerate(files) if i not in found.entries] if labels.stems else []
+    if lacking:
+        raise DataError(
+            f"Expected a label file for each image in {labels.path}, actual none of {lacking[0]}; write an empty one "
+            "where it shows nothing, or take it out."
+        )
+    # In the order of COCO's list, and in that of the files of others.
+    order = list(found.entries) if labels.stems else sorted(found.entries, key=lambda i: found.entries[i])
+    if labels.kitti:
+        occurring = {one.name for i in order for one in labels.read(found.entries[i], (0, 0))} - {DONT_CARE}
+        named = wanted or tuple(sorted({type.casefold() for type in occurring}))
+        of_name = {type: class_of(type, named) for type in {*TYPES, *occurring}}
+        there = tuple(sorted({name for name in of_name.values() if name}))
+    else:
+        there = tuple(sorted(map(composed, labels.classes)))
+        of_name = {name: composed(name) for name in labels.classes if composed(name) in (wanted or there)}
+    kept = _kept(path, wanted, there, same and not labels.kitti)
+    examples = []
+    for number, i in enumerate(order, 1):
+        pixels = read_image(files[i])
+        objects = labels.read(found.entries[i], pixels.shape[:2])
+        entries = [entry for one in objects for entry in _entries(one, of_name, labels.kitti)]
+        examples.append(_example(files[i], pixels, entries, kept))
+        progress(number, len(order))
+    return LabelledSet(path, kept, tuple(examples), labels.kitti, found.notes)
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -123,109 +154,60 @@ def digest_of(found: LabelledSet) -> str:
     return made.hexdigest()
 
 
-def _read_coco(path: Path, file: Path, wanted: tuple[str, ...] | None, progress: Progress, same: bool) -> LabelledSet:
-    try:
-        record = json.loads(file.read_text(encoding="utf-8-sig"))
-        names = {category["id"]: category["name"] for category in record["categories"]}
-        images = {image["id"]: image for image in record["images"]}
-        files = [str(image["file_name"]) for image in record["images"]]
-        of_image: dict[Any, list[dict[str, Any]]] = {key: [] for key in images}
-        unknown = [a for a in record["annotations"] if a["image_id"] not in images or a["category_id"] not in names]
-        for annotation in record["annotations"] if not unknown else ():
-            of_image[annotation["image_id"]].append(annotation)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        about = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise DataError(f"Expected COCO's images, annotations and categories in {file}, actual {about}.") from error
-    _check_once(file, "image files", files)
-    _check_once(file, "images", [f"id {image['id']}" for image in record["images"]])
-    if unknown:
-        one = unknown[0]
-        raise DataError(
-            f"Expected annotations of images and categories that {file} lists, actual annotation {one.get('id')} of "
-            f"image {one['image_id']} and category {one['category_id']}."
-        )
-    _check_once(file, "categories", list(map(str, names.values())))
-    if not images:
-        raise DataError(f"Expected images in {file}, actual none.")
-    classes = _kept(path, wanted, tuple(sorted(map(str, names.values()))), same)
-    folder = next(
-        (f for f in (file.parent / "images", file.parent) if (f / files[0]).is_file()), file.parent / "images"
-    )
-    examples = []
-    for number, (key, image) in enumerate(images.items(), 1):
-        kept = [a for a in of_image[key] if str(names[a["category_id"]]) in classes]
-        boxes = np.array([_corners(a, file) for a in kept], np.float32).reshape(-1, 4)
-        crowd = np.array([bool(a.get("iscrowd", 0)) for a in kept], bool)
-        of_class = np.array([classes.index(str(names[a["category_id"]])) for a in kept], np.int64)
-        said = (image.get("height"), image.get("width"))
-        levels = np.zeros(len(kept), np.int64)
-        where = folder / str(image["file_name"])
-        examples.append(_example(where, boxes, np.where(crowd, -1, of_class), levels, ~crowd, said, file))
-        progress(number, len(images))
-    return LabelledSet(path, classes, tuple(examples))
+class _Object(NamedTuple):
+    """What an annotation stands for; its class is None for a region, see ``Example``."""
+
+    one: Annotation
+    name: str | None
+    level: int
+    real: bool
 
 
-def _corners(annotation: Mapping[str, Any], file: Path) -> list[float]:
-    box: Any = annotation.get("bbox")
-    try:
-        x, y, w, h = map(float, box)
-        if not (all(map(math.isfinite, (x, y, w, h))) and w > 0 and h > 0):
-            raise ValueError
-    except (TypeError, ValueError):
-        raise DataError(
-            f"Expected a bbox of x, y, width and height, the last two positive, in {file}, actual {box} in annotation "
-            f"{annotation.get('id')}."
-        ) from None
-    return [x, y, x + w, y + h]
+def _images(labels: Annotated) -> list[Path]:
+    """The image files that labels may be of."""
+    if labels.kitti:
+        return _pictures([labels.path.parent / "image_2"])
+    if labels.stems:
+        return _pictures(images_beside(labels))
+    names = [one.name.replace("\\", "/") for one in labels.images]
+    for root in (labels.path.parent / "images", labels.path.parent):
+        folders = sorted({(root / name).parent for name in names} | {root})
+        files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir()) if file.is_file()]
+        if matched(labels.images, files, root).entries:
+            return files
+    return []
 
 
-def _read_kitti(path: Path, wanted: tuple[str, ...] | None, progress: Progress) -> LabelledSet:
-    images = sorted(file for file in (path / "image_2").iterdir() if file.suffix.lower() in SUFFIXES)
-    if not images:
-        raise DataError(f"Expected PNG or JPEG images in {path / 'image_2'}, actual none.")
-    lines = {image: read_objects(path / "label_2" / f"{image.stem}.txt") for image in images}
-    occurring = {one.type for each in lines.values() for one in each} - {DONT_CARE}
-    classes = wanted or tuple(sorted({type.casefold() for type in occurring}))
-    of_type = {type: _class_of(type, classes) for type in {*TYPES, *occurring}}
-    _kept(path, wanted, tuple(sorted({name for name in of_type.values() if name})))
-    examples = []
-    for number, (image, objects) in enumerate(lines.items(), 1):
-        found = [entry for one in objects for entry in _entries(one, of_type)]
-        boxes = np.array([entry[0] for entry in found], np.float32).reshape(-1, 4)
-        of_class = [-1 if name is None else classes.index(name) for _, name, _, _ in found]
-        levels, real = ([entry[i] for entry in found] for i in (2, 3))
-        where = path / "label_2" / f"{image.stem}.txt"
-        arrays = np.array(of_class, np.int64), np.array(levels, np.int64), np.array(real, bool)
-        examples.append(_example(image, boxes, *arrays, (None, None), where))
-        progress(number, len(lines))
-    return LabelledSet(path, classes, tuple(examples), kitti=True)
+def _pictures(folders: Sequence[Path]) -> list[Path]:
+    """The image files of folders; hidden ones are none."""
+    files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
+    return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
 
 
-def _entries(one: Object, of_type: Mapping[str, str | None]) -> Iterable[tuple[list[float], str | None, int, bool]]:
-    """What a line stands for: a box, its class, its level, and whether it is an object of that class."""
-    box = [one.left, one.top, max(one.right, one.left + 1e-3), max(one.bottom, one.top + 1e-3)]
-    if one.type == DONT_CARE:
-        yield box, None, BEYOND, False
+def _entries(one: Annotation, of_name: Mapping[str, str | None], kitti: bool) -> Iterable[_Object]:
+    """What an annotation stands for: of KITTI as its protocol has it."""
+    if not kitti:
+        if one.name in of_name:
+            yield _Object(one, None if one.crowd else one.name, EASY, not one.crowd)
         return
-    own, like = of_type[one.type], of_type.get(ALIKE.get(one.type, ""))
+    one = one._replace(right=max(one.right, one.left + 1e-3), bottom=max(one.bottom, one.top + 1e-3))
+    if one.name == DONT_CARE:
+        yield _Object(one, None, BEYOND, False)
+        return
+    own, like = of_name[one.name], of_name.get(ALIKE.get(one.name, ""))
     if own is not None and own != like:
-        yield box, own, level(one), True
+        yield _Object(one, own, level(one), True)
     if like is not None:
-        yield box, like, BEYOND, False
+        yield _Object(one, like, BEYOND, False)
 
 
-def level(one: Object) -> int:
+def level(one: Annotation) -> int:
     """The first of KITTI's levels that an object belongs to."""
     high = one.bottom - one.top
     for number, (least, occluded, truncated) in LEVELS.items():
         if high >= least and one.occluded <= occluded and one.truncated <= truncated:
             return number
     return BEYOND
-
-
-def _class_of(type: str, classes: tuple[str, ...]) -> str | None:
-    own = {name.casefold(): name for name in classes}
-    return next((own[name] for name in (type.casefold(), *TYPES.get(type, ())) if name in own), None)
 
 
 def _kept(path: Path, wanted: tuple[str, ...] | None, there: tuple[str, ...], same: bool = False) -> tuple[str, ...]:
@@ -248,36 +230,21 @@ def _kept(path: Path, wanted: tuple[str, ...] | None, there: tuple[str, ...], sa
     return there if wanted is None else wanted
 
 
-def _check_once(file: Path, what: str, names: list[str]) -> None:
-    twice = [name for name, number in Counter(names).items() if number > 1]
-    if twice:
-        raise DataError(f"Expected {what} with a name each in {file}, actual {twice[0]!r} more than once.")
-
-
-def _example(
-    path: Path,
-    boxes: NDArray[np.float32],
-    classes: NDArray[np.int64],
-    levels: NDArray[np.int64],
-    real: NDArray[np.bool_],
-    said: tuple[Any, Any],
-    labels: Path,
-) -> Example:
-    """An example whose image is decoded and whose boxes are on it, and cut to it."""
-    pixels = read_image(path)
+def _example(path: Path, pixels: NDArray[np.uint8], objects: list[_Object], classes: tuple[str, ...]) -> Example:
+    """An example whose boxes are on its image, and cut to it."""
     height, width = pixels.shape[:2]
-    if None not in said and said != (height, width):
-        raise DataError(
-            f"Expected {path} as large as {labels} says, {said[1]}x{said[0]}, actual {width}x{height}; give the labels "
-            "of these images."
-        )
+    sides = [[one.left, one.top, one.right, one.bottom] for one, *_ in objects]
+    boxes = np.array(sides, np.float32).reshape(-1, 4)
     cut = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
+    real = np.array([each.real for each in objects], bool)
     off = np.flatnonzero(((cut[:, 2] <= cut[:, 0]) | (cut[:, 3] <= cut[:, 1])) & real)
     if len(off):
-        x0, y0, x1, y1 = boxes[off[0]]
+        (x0, y0, x1, y1), one = boxes[off[0]], objects[off[0]].one
         raise DataError(
-            f"Expected boxes on the image {path} of {width}x{height}, actual one from {x0:g}, {y0:g} to {x1:g}, "
-            f"{y1:g} in {labels}; mend it."
+            f"Expected boxes on the image {path} of {width}x{height} {one.where}, actual {one.name} from {x0:g}, "
+            f"{y0:g} to {x1:g}, {y1:g}; mend it."
         )
+    of_class = np.array([-1 if name is None else classes.index(name) for _, name, *_ in objects], np.int64)
+    levels = np.array([each.level for each in objects], np.int64)
     digest = hashlib.sha256(f"{height}x{width}".encode() + pixels.tobytes()).hexdigest()
-    return Example(path, cut, classes, levels, real, (height, width), digest)
+    return Example(path, cut, of_class, levels, real, (height, width), digest)

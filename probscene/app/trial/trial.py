@@ -134,6 +134,8 @@ def trial(
     bases = baselines_of(planned, baselines)
     loaded = {} if photographs is None else {REAL: photographs}
     loaded |= {key: _read(path, names, show, same) for key, path in planned.paths.items()}
+    for note in dict.fromkeys(note for found in (tested, *loaded.values()) for note in found.notes):
+        say(f"Note: {note}")
     check(planned, loaded, tested, set(known) - {REAL})
     if generated is not None:
         _check_classes(generated, names, same)

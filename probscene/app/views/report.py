@@ -253,7 +253,7 @@ def _figures(evaluation: Evaluation) -> str:
     """Every table of the evaluation that the charts do not hold."""
     parts = []
     compared = *tables.apart(evaluation, spread=True), *tables.nested(evaluation, spread=True)
-    for table in (*compared, *tables.likelihoods(evaluation), *tables.images(evaluation)):
+    for table in (*compared, *tables.errors(evaluation), *tables.likelihoods(evaluation), *tables.images(evaluation)):
         head = [str(column.header).replace(" *", "") for column in table.columns]
         rows = list(zip(*(column.cells for column in table.columns), strict=True))
         parts.append(

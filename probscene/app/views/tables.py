@@ -33,7 +33,7 @@ FLOOR = "The floor is what two halves of the target are apart. FID depends on th
 def show(evaluation: Evaluation, console: Console) -> None:
     """Print the distances, then the histograms in percent with half the width of their 95 % intervals."""
     roomy = console.width >= ROOMY
-    more = (*nested(evaluation, roomy), *likelihoods(evaluation), *images(evaluation))
+    more = (*errors(evaluation), *nested(evaluation, roomy), *likelihoods(evaluation), *images(evaluation))
     for table in (*apart(evaluation, roomy), _numbers(evaluation), _classes(evaluation), *more):
         _print(table, console)
         console.print()
@@ -197,6 +197,17 @@ def nested(evaluation: Evaluation, spread: bool = False) -> list[Table]:
 
 def _mean(each: dict[str, Tally], name: str) -> Interval | None:
     return each[name].mean() if name in each else None
+
+
+def errors(evaluation: Evaluation) -> list[Table]:
+    """With labels, how far the counts read in each image are from them."""
+    if not evaluation.errors:
+        return []
+    table = _table("Counts read in each labelled image", "class", ["mean absolute error", "correlation", "images"])
+    for name, found in evaluation.errors.items():
+        cells = ("-", "-", "-") if found is None else (*(_figure(x, 2) for x in found[1:]), str(found.images))
+        table.add_row(name, *cells)
+    return [table]
 
 
 def likelihoods(evaluation: Evaluation) -> list[Table]:

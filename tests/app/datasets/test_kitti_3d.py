@@ -18,7 +18,7 @@ from PIL import Image
 from probscene.app.chunks import CHUNK
 from probscene.app.datasets import coco, kitti
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.labelling.kitti import read_kitti
+from probscene.app.labelling.boxes import read_boxes
 from probscene.app.loading import load_model
 from probscene.batch import RenderBatch, Space
 from probscene.dataset import ImageFolder
@@ -180,7 +180,7 @@ def test_torchvision_reads_the_same(tmp_path):
     assert [one["occluded"] for one in read] == [0, 1, 2] and read[2]["truncated"] > 0.1 > read[0]["truncated"]
     folder = tmp_path / "Kitti/raw/training/label_2"
     target = ImageFolder(tmp_path / "Kitti/raw/training/image_2", (HEIGHT, WIDTH), 3)
-    read = read_kitti(folder, MODEL, target)
+    read = read_boxes(folder, MODEL, target)
     counts, classes = read.counts, read.classes
     assert dict(zip(classes, counts[0].tolist(), strict=True)) == {"car": 2, "pedestrian": 1, "bike": 0}
 

@@ -159,7 +159,7 @@ def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
     titles = [line.strip() for line in lines if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
         "Distance to the truth", "TV: total variation", "Distance to what the feature network sees *",
-        "Images by number of objects", "Objects by class"]  # fmt: skip
+        "Images by number of objects", "Objects by class", "Counts read in each labelled image"]  # fmt: skip
 
 
 def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_path):

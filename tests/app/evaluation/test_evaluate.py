@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from probscene.app.evaluation.compare import compare
+from probscene.app.evaluation.count_errors import count_errors
 from probscene.app.evaluation.evaluate import evaluate, network_counts
 from probscene.app.evaluation.labels import Labels, counts_of_dataset
 from probscene.app.evaluation.sources import Source
@@ -86,6 +87,64 @@ def test_distances_are_those_between_the_counts(fitted, target):
             pooled = [s.counts.sum(0) / s.counts.sum() for s in (one, other)]
             assert measured[b][a]["classes"] == pytest.approx(abs(pooled[0] - pooled[1]).sum() / 2)
             assert set(measured[b][a]["each_class"]) == set(CLASSES)
+
+
+counted = st.lists(st.tuples(st.floats(-1, 30), st.integers(0, 30)), min_size=3, max_size=40)
+
+
+@given(counted)
+def test_errors_of_counts_are_those_of_the_definitions(pairs):
+    read, labelled = (np.array(side) for side in zip(*pairs, strict=True))
+    found = count_errors(read, labelled)
+    assert found.images == len(pairs)
+    assert found.mean_absolute.value == pytest.approx(sum(abs(a - b) for a, b in pairs) / len(pairs))
+    assert 0 <= found.mean_absolute.low <= found.mean_absolute.value <= found.mean_absolute.high
+    if read.std() < 1e-9 or labelled.std() == 0:
+        assert found.correlation is None
+    elif read.std() > 1e-3:
+        assert found.correlation.value == pytest.approx(scipy.stats.pearsonr(read, labelled).statistic, abs=1e-6)
+        assert -1 <= found.correlation.low <= found.correlation.high <= 1
+    exact = count_errors(labelled.astype(float), labelled)
+    assert exact.mean_absolute == (0, 0, 0)
+    assert exact.correlation is None or exact.correlation.value == pytest.approx(1)
+
+
+def test_intervals_of_errors_hold_the_truth_as_often_as_they_say():
+    """For a normal error of variance 1 the mean absolute one is sqrt(2 / pi); readings with it go with labels of
+    variance 1 at sqrt(1 / 2)."""
+    rng, held = np.random.default_rng(0), np.zeros(2)
+    for _ in range(200):
+        labelled = rng.poisson(100, 80)
+        read = labelled + rng.normal(0, 10, 80)
+        found = count_errors(read, labelled)
+        true = 10 * np.sqrt(2 / np.pi), np.sqrt(1 / 2)
+        held += [x.low <= t <= x.high for x, t in zip(found[1:], true, strict=True)]
+    assert (held >= 176).all()  # 95 % less five standard deviations, and what a bootstrap of 80 images lacks
+
+
+def test_what_was_read_of_each_image_is_held_against_its_labels(fitted, target):
+    run = RunFolder.at(fitted)
+    read = run.read_tensors("real")["features"][:, :2].numpy()
+    rows = [30, 3, 11, 20]
+    some = labels(target.counts[sorted(rows)])._replace(rows=sorted(rows))
+    for truth, chosen in ((labels(target.counts), slice(None)), (some, sorted(rows))):
+        found = evaluate(run, opened(target.images), truth, quiet, num=20)
+        for c, name in enumerate(CLASSES):
+            error = np.abs(read[chosen, c] - target.counts[chosen, c]).mean()
+            assert found.errors[name].mean_absolute.value == pytest.approx(error)
+            assert found.record()["count_errors"][name]["mean_absolute"]["value"] == pytest.approx(error)
+    table = found_table(found)
+    assert "Counts read in each labelled image" in table and f"{found.errors['red'].mean_absolute.value:.2f}" in table
+    assert not evaluate(run, opened(target.images), None, quiet, num=20).errors
+    paper = RunFolder(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
+    without = evaluate(paper, opened(target.images), labels(target.counts), quiet, num=20)
+    assert without.errors == dict.fromkeys(CLASSES) and re.search(r"red +│ +- │ +- │ +- ", found_table(without))
+
+
+def found_table(evaluation) -> str:
+    console = Console(width=200, file=io.StringIO())
+    show(evaluation, console)
+    return console.file.getvalue()
 
 
 def test_shares_of_no_objects_are_not_compared(fitted, target):

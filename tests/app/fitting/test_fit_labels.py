@@ -76,9 +76,9 @@ def test_labels_are_checked_before_anything_is_written(call, discs, target, part
     assert done.code == 2 and not out.exists()
     assert "Expected features that labels can calibrate, actual 'count'" in done.err
     assert all(f"--features {name}" in done.err for name in takers_of_labels())
-    few.write_text(few.read_text().replace("000001.png", "x.png"))
+    few.write_text(few.read_text().replace("000001.png,", "000001.png,x"))
     done = call(*words(discs, target, out, "--features", parts, "--labels", few))
-    assert done.code == 2 and not out.exists() and "'x.png'" in done.err
+    assert done.code == 2 and not out.exists() and "of 000001.png" in done.err
     done = call(*words(discs, target, out, "--features", parts, "--labels", tmp_path / "none.csv"))
     assert done.code == 2 and not out.exists() and "none.csv, actual none" in done.err
 

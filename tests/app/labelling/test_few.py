@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
-from probscene.app.labelling.boxes import Box, on_canvas
+from probscene.app.labelling.annotations import Annotation
+from probscene.app.labelling.boxes import on_canvas
 from probscene.app.labelling.counts import write_cells
 from probscene.app.labelling.few import LEAST, PartlyLabelled, labels_record, read_few
 from probscene.app.loading import load_model
@@ -57,7 +58,7 @@ def test_a_box_lies_where_its_pixels_are_seen(case):
     picture = np.zeros(size, np.uint8)
     picture[y0:y1, x0:x1] = 255
     target = SimpleNamespace(sizes=[size], windows=[window(size, canvas)], canvas=canvas)
-    (found,) = on_canvas(target, [0], [[Box("a", x0, y0, x1, y1, y1 - y0, "")]], ("a",), ()).boxes
+    (found,) = on_canvas(target, {0: [Annotation("a", x0, y0, x1, y1)]}, ("a",), ()).boxes
     assume(len(found))
     rows, columns = (fitted(picture, canvas)[0] > 127).nonzero()
     assume(len(rows))
@@ -114,7 +115,7 @@ JSON = {
     "no json": ("{", "COCO's JSON"),
     "a list": ("[]", "images, annotations, categories"),
     "too few": (dict(images=GOOD[:2]), "at least 3 images", "actual 2", "probscene label"),
-    "an unknown image": (dict(images=[*GOOD, ("image 9", [])]), "images[3]", "'image 9'"),
+    "unknown images": (dict(images=[("image 9", []), ("image 8", [])]), "'image 9' in images[0]", "and 1 more"),
     "another case of an image": (dict(images=[*GOOD, ("Image 3", [])]), "did you mean 'image 3'"),
     "an image twice": (dict(images=[*GOOD, GOOD[1]]), "second one of image 1", "images[3]"),
     "another case": (dict(images=GOOD, categories=("platelet", "RBC")), "'RBC'", "did you mean 'rbc'"),
@@ -149,8 +150,6 @@ CSV = {
     "a fraction": ("image 0,1,2,.5", "line 2", "'platelet' of image 0", "'.5'", "whole number"),
     "a part of a row": ("image 0,1,,2", "line 2", "'wbc' of image 0", "leave the whole row empty"),
     "twice": ("image 1,1,2,3", "second one of image 1"),
-    "unknown": ("image 7,1,2,3", "'image 7'"),
-    "no name": (",1,2,3", "name of an image"),
 }
 
 

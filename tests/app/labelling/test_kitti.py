@@ -19,7 +19,8 @@ from probscene.app.evaluation.labels import SEEN, read_labels
 from probscene.app.evaluation.structure_counts import sampled
 from probscene.app.evaluation.visible import SHOWN, Seen, counted, shown
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.kitti import read_kitti, read_objects
+from probscene.app.labelling.boxes import read_boxes
+from probscene.app.labelling.kitti import read_objects
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
@@ -47,7 +48,7 @@ def test_counts_are_those_of_the_lines(tmp_path_factory, frames):
     for i, types in enumerate([*frames, ["Car"]]):  # the last one is of no image
         (folder / f"{i:06d}.txt").write_text("".join(line(type) + "\n" for type in types))
     target = images("x", [f"{i:06d}.{('png', 'jpg')[i % 2]}" for i in range(len(frames))])
-    read = read_kitti(folder, STREET, target)
+    read = read_boxes(folder, STREET, target)
     counts, classes, notes = read.counts, read.classes, read.notes
     assert classes == ("car", "pedestrian", "bike", "truck")  # nobody labels trees
     assert counts.tolist() == [[sum(CLASS.get(t) == c for t in types) for c in classes] for types in frames]
@@ -64,8 +65,8 @@ def test_low_objects_are_counted_only_where_not_said_otherwise(tmp_path):
     (tmp_path / "a.txt").write_text("\n".join(line("Car", height) for height in (10, 24.9, 25, 60)))
     (tmp_path / "b.txt").write_text(line("DontCare", 3) + "\r\n\n")
     target = images("x", ["a.png", "b.png"])
-    assert read_kitti(tmp_path, STREET, target).counts[:, 0].tolist() == [4, 0]
-    read = read_kitti(tmp_path, STREET, target, min_height=25)
+    assert read_boxes(tmp_path, STREET, target).counts[:, 0].tolist() == [4, 0]
+    read = read_boxes(tmp_path, STREET, target, min_height=25)
     counts, notes = read.counts, read.notes
     assert counts[:, 0].tolist() == [2, 0] and "2 objects of less than 25 pixels" in notes[-1]
 
@@ -74,13 +75,13 @@ def test_regions_count_as_marked_where_an_object_in_them_could_be_counted(tmp_pa
     for name, height in (("a", 24.9), ("b", 25), ("c", 60)):
         (tmp_path / f"{name}.txt").write_text(f"{line('Car')}\n{line('DontCare', height)}\n{line('DontCare', 3)}\n")
     target = images("x", ["a.png", "b.png", "c.png"])
-    *_, note = read_kitti(tmp_path, STREET, target, min_height=25).notes
+    *_, note = read_boxes(tmp_path, STREET, target, min_height=25).notes
     assert note == (
         "2 of 3 images have regions marked DontCare that are at least 25 pixels high; objects there are not labelled, "
         "so that these images may show more than their labels say."
     )
-    assert "3 of 3 images have regions marked DontCare; objects" in read_kitti(tmp_path, STREET, target).notes[-1]
-    assert "DontCare" not in " ".join(read_kitti(tmp_path, STREET, target, min_height=61).notes)
+    assert "3 of 3 images have regions marked DontCare; objects" in read_boxes(tmp_path, STREET, target).notes[-1]
+    assert "DontCare" not in " ".join(read_boxes(tmp_path, STREET, target, min_height=61).notes)
 
 
 def test_objects_whose_middle_is_cut_away_are_not_counted(tmp_path):
@@ -89,7 +90,7 @@ def test_objects_whose_middle_is_cut_away_are_not_counted(tmp_path):
     assert tuple(target.windows[0]) == (50, 0, 200, 400)
     middles = (48, 49.4, 49.5, 150, 249.4, 249.5, 260)  # the upper row's own is 0
     (tmp_path / "a.txt").write_text("\n".join(f"Car 0 0 0 10 {y - 4} 50 {y + 4} {REST}" for y in middles))
-    read = read_kitti(tmp_path, STREET, target)
+    read = read_boxes(tmp_path, STREET, target)
     counts, notes = read.counts, read.notes
     assert counts[0, 0] == 3
     assert notes == ("4 objects that lie where images are cut are not counted.",)
@@ -102,26 +103,26 @@ def test_boxes_of_images_of_another_size_are_refused(tmp_path):
         (tmp_path / "a.txt").write_text(line("Car") + "\n" + line("Car", height, left))
         if error:
             with pytest.raises(DataError, match=r"image of 1242x375 in .*a\.txt, actual .*of another size"):
-                read_kitti(tmp_path, STREET, target)
+                read_boxes(tmp_path, STREET, target)
         else:
-            assert read_kitti(tmp_path, STREET, target).counts[0, 0] == 2
+            assert read_boxes(tmp_path, STREET, target).counts[0, 0] == 2
 
 
 def test_names_of_the_model_go_first(tmp_path):
     (tmp_path / "a.txt").write_text("\n".join(map(line, ("Pedestrian", "Person_sitting", "Person_sitting"))))
     model = SimpleNamespace(name="m", classes=("person", "Person_Sitting"))
-    assert read_kitti(tmp_path, model, images("x", ["a.png"])).counts.tolist() == [[1, 2]]
+    assert read_boxes(tmp_path, model, images("x", ["a.png"])).counts.tolist() == [[1, 2]]
 
 
 def test_images_without_a_file_are_left_out_only_where_some_are_labelled(tmp_path):
     (tmp_path / "b.txt").write_text(line("Car"))
     target = images("x", ["a.png", "b.png", "c.png"])
-    with pytest.raises(DataError, match="actual none named a.txt and 1 more"):
-        read_kitti(tmp_path, STREET, target)
-    assert read_kitti(tmp_path, STREET, target, some=True).counts.tolist() == [[1, 0, 0, 0]]
+    with pytest.raises(DataError, match="actual none of a.png and 1 more"):
+        read_boxes(tmp_path, STREET, target)
+    assert read_boxes(tmp_path, STREET, target, some=True).counts.tolist() == [[1, 0, 0, 0]]
     (tmp_path / "b.txt").unlink()
-    with pytest.raises(DataError, match="actual none named a.txt and 2 more"):
-        read_kitti(tmp_path, STREET, target, some=True)
+    with pytest.raises(DataError, match="actual none; label at least one"):
+        read_boxes(tmp_path, STREET, target, some=True)
 
 
 FAULTS = {
@@ -142,18 +143,18 @@ def test_wrong_lines_are_named(fault, tmp_path):
     wrong, *parts = FAULTS[fault]
     (tmp_path / "000007.txt").write_text("\n".join([line("Car"), "", wrong, line("Van")]))
     with pytest.raises(DataError, match=r"^Expected .* in line 3 of .*000007\.txt") as error:
-        read_kitti(tmp_path, STREET, images("x", ["000007.png"]))
+        read_boxes(tmp_path, STREET, images("x", ["000007.png"]))
     assert all(part in str(error.value) for part in parts) and "\n" not in str(error.value)
 
 
 def test_what_is_no_text_or_has_no_class(tmp_path):
     (tmp_path / "a.txt").write_bytes(b"Car \xff")
     with pytest.raises(DataError, match="UTF-8"):
-        read_kitti(tmp_path, STREET, images("x", ["a.png"]))
+        read_boxes(tmp_path, STREET, images("x", ["a.png"]))
     (tmp_path / "a.txt").write_text(line("Car"))
     model = SimpleNamespace(name="digits", classes=("0", "1"))
     with pytest.raises(DataError, match=r"'digits' has classes for \(0, 1\), actual Car"):
-        read_kitti(tmp_path, model, images("x", ["a.png"]))
+        read_boxes(tmp_path, model, images("x", ["a.png"]))
 
 
 def test_a_written_dataset_is_read_back(tmp_path):
@@ -245,7 +246,7 @@ def test_the_benchmarks_own_labels(data_dir, tmp_path):
         known = {row["frame"]: row for row in csv.DictReader(file)}
     frames = sorted(path.stem for path in (folder / "label_2").iterdir())
     model = SimpleNamespace(name="kitti", classes=("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist"))
-    read = read_kitti(folder / "label_2", model, images("x", [f"{frame}.jpg" for frame in frames]))
+    read = read_boxes(folder / "label_2", model, images("x", [f"{frame}.jpg" for frame in frames]))
     counts, classes = read.counts, read.classes
     assert counts.tolist() == [[int(known[frame][name]) for name in classes] for frame in frames]
     (tmp_path / "Kitti" / "raw").mkdir(parents=True)
@@ -256,5 +257,5 @@ def test_the_benchmarks_own_labels(data_dir, tmp_path):
         image.close()
         own = read_objects(folder / "label_2" / f"{Path(dataset.images[k]).stem}.txt")
         assert [(one["type"], *one["bbox"], one["truncated"], one["occluded"]) for one in read] == [
-            tuple(one) for one in own
+            (one.name, one.left, one.top, one.right, one.bottom, one.truncated, one.occluded) for one in own
         ]

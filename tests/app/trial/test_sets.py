@@ -56,19 +56,18 @@ def spoiled(key: str, index: int, **values):
 @pytest.mark.parametrize(
     ("how", "said"),
     [
-        (spoiled("annotations", 0, bbox=[1, 2, 0, 3]), r"positive.*annotation 1"),
-        (spoiled("annotations", 0, bbox=[1, 2, float("nan"), 3]), r"bbox.*annotation 1"),
-        (spoiled("annotations", 0, bbox="box"), r"bbox.*annotation 1"),
-        (spoiled("annotations", 0, bbox=[90, 2, 5, 5]), r"boxes on the image.*000\.png.*64x64"),
-        (spoiled("annotations", 0, image_id=77), r"annotation 1 of image 77"),
-        (spoiled("annotations", 0, category_id=9), r"category 9"),
-        (spoiled("images", 1, file_name="000.png"), r"'000\.png' more than once"),
-        (spoiled("images", 1, id=0), r"id 0.*more than once"),
+        (spoiled("annotations", 0, bbox=[1, 2, 0, 3]), r"above 0 in annotations\[0\]"),
+        (spoiled("annotations", 0, bbox=[1, 2, float("nan"), 3]), r"bbox.*annotations\[0\]"),
+        (spoiled("annotations", 0, bbox="box"), r"bbox.*annotations\[0\]"),
+        (spoiled("annotations", 0, bbox=[90, 2, 5, 5]), r"boxes on the image.*000\.png.*64x64 in annotations\[0\]"),
+        (spoiled("annotations", 0, image_id=77), r"image_id.*annotations\[0\].*77"),
+        (spoiled("annotations", 0, category_id=9), r"category_id.*annotations\[0\].*9"),
+        (spoiled("images", 1, file_name="000.png"), r"second one of 000\.png in images\[1\]"),
+        (spoiled("images", 1, id=0), r"id that no other.*images\[1\].*actual 0;"),
         (spoiled("categories", 1, name="disc"), r"'disc' more than once"),
-        (spoiled("images", 0, file_name="none.png"), r"none\.png, actual none"),
-        (spoiled("images", 0, height=65), r"64x65, actual 64x64"),
-        (lambda record: record.pop("images"), r"images, annotations and categories.*actual no 'images'"),
-        (lambda record: record.update(images=[], annotations=[]), r"Expected images"),
+        (spoiled("images", 0, height=65), r"64x65 as in images\[0\].*actual 64x64"),
+        (lambda record: record.pop("images"), r"lists of images, annotations, categories.*actual none of images\."),
+        (lambda record: record.update(images=[], annotations=[]), r"Expected labelled images.*actual none of them"),
     ],
 )
 def test_faults_of_coco_are_named(folder, how, said):
@@ -87,7 +86,7 @@ def test_classes_that_differ_are_named_and_case_is(folder):
         DataError, match=r"Expected the classes Disc.*actual disc, square.*'disc' differs in case.*--classes"
     ):
         read_set(folder, ("Disc",))
-    with pytest.raises(DataError, match="actual neither"):
+    with pytest.raises(DataError, match="actual none of them"):
         read_set(folder / "images")
 
 

@@ -1,0 +1,52 @@
+"""How far the counts that a run reads in each real image are from that image's labels, as papers on counting report it:
+the mean absolute error, and Pearson's correlation. Axis letters: L images, C classes, R resamples.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probscene.inference.judging.tally import Interval, around, resamples
+
+from .structure_counts import Counts
+
+
+class CountErrors(NamedTuple):
+    """Of one class in L labelled images.
+
+    Attributes:
+        images: L.
+        mean_absolute: error, objects an image.
+        correlation: -1 to 1; None where the labels or the readings are the same in all images.
+    """
+
+    images: int
+    mean_absolute: Interval
+    correlation: Interval | None
+
+
+def count_errors(read: NDArray[np.float64], labelled: Counts, seed: int = 0) -> CountErrors:
+    """The errors of one class's counts, with 95 % bootstrap intervals over images.
+
+    Args:
+        read: ``(L,)``, not rounded.
+        labelled: ``(L,)``.
+    """
+    one, other = np.asarray(read, np.float64), labelled.astype(np.float64)
+    weight = resamples(len(one), seed=seed).astype(np.float64) / len(one)
+    every = np.full((1, len(one)), 1 / len(one))
+    error = np.abs(one - other)
+    whole, drawn = (_correlation(one, other, each) for each in (every, weight))
+    correlation = None if np.isnan(whole[0]) else around(float(whole[0]), drawn, least=-1.0)
+    if correlation is not None:
+        correlation = correlation._replace(high=min(correlation.high, 1.0))
+    return CountErrors(len(one), around(float(error.mean()), weight @ error, least=0.0), correlation)
+
+
+def _correlation(one: NDArray[np.float64], other: NDArray[np.float64], weight: NDArray[np.float64]):
+    """``(R,)`` correlations of images that weigh ``(R, L)``, each row 1 in all; NaN where a side does not vary."""
+    x, y = (side - (weight @ side)[:, None] for side in (one, other))
+    cross, *squares = ((weight * a * b).sum(1) for a, b in ((x, y), (x, x), (y, y)))
+    varies = (squares[0] > 1e-12) & (squares[1] > 1e-12)
+    return np.where(varies, cross / np.sqrt(np.where(varies, squares[0] * squares[1], 1.0)), np.nan)
