@@ -1,6 +1,6 @@
 """The baselines at their best: each guide and objective gets the same search over its settings, beside the default.
 
-    python benchmarks/baselines.py [--fits lstm pcfg grammar-vae mmd witness js] [--draws 9] [--seeds 0]
+    python benchmarks/baselines.py [--fits lstm pcfg grammar-vae mmd witness js] [--draws 24] [--seeds 0]
 
 Structures of Aerial 2D, with true counts of roads and of cars by road instead of images: what is compared is how a
 distribution is learnt, and not how images are read. The search draws step size, steps a batch, baseline and number of
@@ -48,7 +48,8 @@ GUIDES, OBJECTIVES = ("pcfg", "grammar-vae"), ("mmd", "witness", "js")
 ROADS, REAL = 4, 5000
 ROAD, CAR = GRAMMAR.kind("road"), GRAMMAR.kind("car")
 SCORE = ("roads", "first", "others")
-RATES, UPDATES, BATCHES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2), (1, 3), (60, 120, 240)
+RATES, UPDATES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2), (1, 3)
+SCENES, BATCH, VARIANCES = (30_000, 60_000, 120_000), (50, 150, 500), (1.0, 4.0, 20.0)
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,9 @@ class Settings:
     learning_rate: float
     updates: int
     baseline: str
-    batches: int
+    scenes: int  # in all batches together
+    num_scenes: int  # a batch
+    variance: float | None  # of the kernel
 
 
 def preset_of(fit: str) -> Preset:
@@ -69,11 +72,12 @@ def preset_of(fit: str) -> Preset:
 def drawn(fit: str, num: int) -> list[Settings]:
     """The default's settings, then others, in one order for all fits."""
     preset = preset_of(fit)
-    every = [Settings(*each) for each in product(RATES, UPDATES, BASELINES, BATCHES)]
+    every = [Settings(*each) for each in product(RATES, UPDATES, BASELINES, SCENES, BATCH, VARIANCES)]
     order = np.random.default_rng(7).permutation(len(every))
     # All scenes share the cost of MMD: without each one's own, the others' mean is all of it.
     useful = [every[i] for i in order if (fit, every[i].baseline) != ("mmd", "leave_one_out")]
-    own = Settings(preset.learning_rate, preset.updates, preset.baseline, preset.batches)
+    scenes = preset.batches * preset.num_scenes
+    own = Settings(preset.learning_rate, preset.updates, preset.baseline, scenes, preset.num_scenes, preset.variance)
     return [own, *(each for each in useful if each != own)][:num]
 
 
@@ -111,8 +115,11 @@ def learnt(fit: str, settings: Settings, truth: Truth, seed: int) -> Guide:
     def observe(scenes: Scenes) -> Tensor:
         return seen(scenes.derivation)
 
-    loss = ScoreFunction(observe, preset.divergence(), settings.baseline, updates=settings.updates)
-    Trainer(structures, guide, loss, real, settings.batches, learning_rate=settings.learning_rate, seed=seed).run()
+    divergence = replace(preset, variance=settings.variance).divergence()
+    loss = ScoreFunction(observe, divergence, settings.baseline, updates=settings.updates)
+    batches = max(1, settings.scenes // settings.num_scenes)
+    rate, num_scenes = settings.learning_rate, settings.num_scenes
+    Trainer(structures, guide, loss, real, batches, num_scenes, learning_rate=rate, seed=seed).run()
     return guide
 
 
@@ -165,7 +172,7 @@ class Search:
         """Successive halving on two targets."""
 
         def score(settings: Settings, target: int, share: float) -> float:
-            short = replace(settings, batches=max(1, round(share * settings.batches)))
+            short = replace(settings, scenes=round(share * settings.scenes))
             try:
                 row = self.row(fit, short, target, 0)
             except ProbsceneError as error:
@@ -182,7 +189,7 @@ def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     out_option(parser, __file__)
     parser.add_argument("--fits", nargs="+", default=["lstm", "pcfg"], choices=["lstm", *GUIDES, *OBJECTIVES])
-    parser.add_argument("--draws", type=int, default=9, help="settings that are tried")
+    parser.add_argument("--draws", type=int, default=24, help="settings that are tried")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     args = parser.parse_args()
     torch.set_num_threads(1)

@@ -1,7 +1,7 @@
 """Whether a fit to real street frames comes closer to them than the prior: numbers of cars, FID and KID, looks.
 
     python benchmarks/learn_street.py FRAMES/ LABELS [--out FOLDER] [--seeds 0] [--min-height 25]
-        [--learn structure,parameters] [--all COUNTS.csv]
+        [--model driving] [--learn structure,parameters] [--all COUNTS.csv]
 
 Fits see the images alone. ``LABELS`` is KITTI's ``label_2``, or a CSV of counts, of the same images. Cars of scenes are
 counted as the labels count them, of 2,000 rendered scenes (``probscene evaluate``). Printed for each seed: total
@@ -14,7 +14,12 @@ how bright they are, their contrast, saturation and noise, and the row of the ho
 of 95 % of bootstraps over images. Where parameters are learnt, too, so do these of learnt structures with the prior's
 parameters, as ``structure``. ``--all`` names a CSV with a column ``Car_ge25px``, the cars of 25 pixels and more in all
 of KITTI's label files: how far each source, and the labels of the frames, are from these follows as ``all``. FOLDER
-holds the runs, ``results.json`` and a histogram, ``cars.png``.
+holds the runs, ``results.json``, a histogram, ``cars.png``, and for each seed the paper's grid of images, prior,
+learnt and real from the left, ``images-SEED.png``.
+
+The rows of the paper's tables 1 and 2: the prior's figures are in every run; ``--learn parameters`` keeps the prior's
+structure and learns parameters (row 2 of table 1); ``--learn structure`` and ``structure,parameters`` are the others.
+The simple prior (table 2) is the model ``driving_simple``, the tuned one (table 1) ``driving``.
 """
 
 import argparse
@@ -25,6 +30,7 @@ import time
 from copy import copy
 from pathlib import Path
 
+import cv2
 import matplotlib
 import numpy as np
 import torch
@@ -55,6 +61,13 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import MaxNLocator
 
 DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
+PARAMETERS = "parameters"
+SETTINGS = {
+    STRUCTURE: [f"learn={STRUCTURE}"],
+    BOTH: [f"learn={BOTH}"],
+    PARAMETERS: [f"learn={BOTH}", "batches=0", "batches_again=0", "on_prior=true"],
+}
+GRID, GRID_WIDTH = (4, 2), 420  # rows and columns of a source's images; pixels of one
 MARKED, SCENES = 0.01, 2000  # of a frame; of which objects are counted
 
 
@@ -147,8 +160,8 @@ def said(images: Tensor) -> dict[str, list[float]]:
     return found
 
 
-def looks(run: RunFolder, frames: ImageFolder, num: int) -> dict:
-    """What is said of frames and of each source's images, and how far these are from the frames."""
+def looks(run: RunFolder, frames: ImageFolder, num: int, grid: Path) -> dict:
+    """What is said of frames and of each source's images, and how far these are from the frames; some as a picture."""
     real = frames.some(len(frames))
     policies = before(run.model)
     if run.parameters:
@@ -156,6 +169,7 @@ def looks(run: RunFolder, frames: ImageFolder, num: int) -> dict:
         policies["structure"].suits = None
     policies[LEARNT] = run.guide
     drawn_of = {name: drawn(run, policy, 1)[1][:num] for name, policy in policies.items()}
+    draw_grid([drawn_of["prior"], drawn_of[LEARNT], real], grid)
     look = EfficientNetLite()
     of_frames, apart = look.embed(real), {}
     for name, images in drawn_of.items():
@@ -163,6 +177,20 @@ def looks(run: RunFolder, frames: ImageFolder, num: int) -> dict:
         each = kid(of_frames, found, "efficientnet"), fid(of_frames, found, "efficientnet")
         apart[name] = {figure.name: [round(x, 4) for x in (figure.value, figure.low, figure.high)] for figure in each}
     return {"apart": apart, "looks": {"frames": said(real), **{name: said(x) for name, x in drawn_of.items()}}}
+
+
+def draw_grid(sources: list[Tensor], path: Path) -> None:
+    """A few images ``(N, 3, H, W)`` of each source, the sources beside one another."""
+    blocks = []
+    for images in sources:
+        rows, columns = GRID
+        some = images[:: max(1, len(images) // (rows * columns))][: rows * columns].permute(0, 2, 3, 1).numpy()
+        size = GRID_WIDTH, round(GRID_WIDTH * some.shape[1] / some.shape[2])
+        small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in some]
+        framed = [cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=(255,) * 3) for image in small]
+        block = np.concatenate([np.concatenate(framed[i::rows], 1) for i in range(rows)])
+        blocks.append(cv2.copyMakeBorder(block, 0, 0, 0, 16, cv2.BORDER_CONSTANT, value=(255,) * 3))
+    cv2.imwrite(str(path), cv2.cvtColor(np.concatenate(blocks, 1), cv2.COLOR_RGB2BGR))
 
 
 def picture(histograms: list[dict[str, np.ndarray]], path: Path) -> None:
@@ -189,7 +217,7 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--features", default="count=efficientnet", help="as of probscene fit")
     parser.add_argument("--set", action="append", default=[], dest="settings", help="as of probscene fit")
-    parser.add_argument("--learn", choices=(STRUCTURE, BOTH), default=STRUCTURE)
+    parser.add_argument("--learn", choices=SETTINGS, default=STRUCTURE)
     parser.add_argument("--min-height", type=float, default=0.0, help="of KITTI's boxes that are counted, pixels")
     parser.add_argument("--all", type=Path, help="a CSV of the number of cars in all of KITTI's label files")
     args = parser.parse_args()
@@ -199,7 +227,7 @@ def main():
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = override(preset("street").with_features(args.features), [*args.settings, f"learn={args.learn}"])
+        chosen = override(preset("street").with_features(args.features), [*args.settings, *SETTINGS[args.learn]])
         start = time.monotonic()
         run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False)
         seconds = round(time.monotonic() - start, 1)
@@ -212,7 +240,7 @@ def main():
             rows[-1] |= {"all": from_all(found, args.all)}
         if run.parameters:
             rows[-1] |= {"kept": run.parameters["kept"]}
-        rows[-1] |= looks(run, target, DRAWN)
+        rows[-1] |= looks(run, target, DRAWN, args.out / f"images-{seed}.png")
         histograms.append(cars(found))
         print(json.dumps(rows[-1]), flush=True)
         write_json(args.out / "results.json", rows)

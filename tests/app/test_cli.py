@@ -211,7 +211,7 @@ def test_what_typer_refuses_exits_with_2(call, discs, tmp_path):
     [("batches", "key=value"), ("batches=x", "batches=<int>"), ("speed=1", "among features,"), ("width=1,2", "width="),
      ("count=3", "count.steps"), ("count.speed=1", "of count among steps"), ("batches.x=1", "batches=..."),
      ("cosine=5", "cosine=<bool>"), ("count.steps=1.5", "count.steps=<int>"), ("num_scenes=1", "at least 2"),
-     ("batches=0", "at least 1"), ("learning_rate=0", "above 0"), ("count.whole=-1", "at least 0"),
+     ("batches=-1", "at least 0"), ("learning_rate=0", "above 0"), ("count.whole=-1", "at least 0"),
      ("variance=nan", "above 0"), ("objective=kl", "kde, js"), ("guide=hmm", "lstm, pcfg"),
      ("num_scenes=none", "num_scenes=<int>")],
 )  # fmt: skip

@@ -19,6 +19,7 @@ CHOICES = {
 LEAST = {
     "num_scenes": 2,
     "scenes": 2,
+    "batches": 0,
     "batches_again": 0,
     "rounds": 0,
     "energy_steps": 0,
@@ -60,6 +61,11 @@ def override(preset: Preset, settings: list[str], other: Preset | None = None) -
         raise ProbsceneError(
             "Expected a baseline of moving_average or none with objective=mmd, actual leave_one_out: all scenes share "
             "one cost, so that their advantages would all be 0."
+        )
+    if preset.batches == 0 and preset.learn == STRUCTURE:
+        raise ProbsceneError(
+            f"Expected batches of at least 1 where structure alone is learnt, actual 0; add learn={BOTH} to learn "
+            "parameters in the structures that guides are pretrained on."
         )
     return preset
 

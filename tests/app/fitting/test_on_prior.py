@@ -5,10 +5,15 @@ import dataclasses
 import torch
 
 from probscene import load_model
+from probscene.app.api.fit import fit
 from probscene.app.evaluation.sources import PRIOR, START, before
+from probscene.app.fitting.preset import BOTH
 from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL
 from probscene.app.fitting.run import RunFolder
 from probscene.derive import derive
+from probscene.inference.pretrain import pretrain
+from probscene.inference.training import batch_seed
+from probscene.sampling import seed_everything
 
 
 def begun(preset, folder):
@@ -37,3 +42,16 @@ def test_its_guide_reaches_lists_that_the_prior_never_has(tmp_path):
         drawn = derive(model.grammar, guide, 50, model.max_steps)
     longest = (drawn.kind == cars).sum(1).max()
     assert longest > 4 * 8  # on four roads at most
+
+
+def test_without_batches_structures_stay_the_pretrained_ones(discs, target, tmp_path):
+    """The paper's table 1, row 2: parameters are learnt in structures of the prior."""
+    settings = {**discs.short, "batches": 0, "batches_again": 0, "on_prior": True, "prior_if_worse": False}
+    learn = {"learn": BOTH, "threads": 1, "cache": False, "progress": False}
+    run = fit(str(discs.file), target.images, "quick", settings=settings, out=tmp_path / "run", **learn)
+    seed_everything(batch_seed(run.record["seed"], 2))
+    expected = run.new_guide()
+    pretrain(expected, run.model.prior, discs.short["pretrain_derivations"], discs.short["pretrain_epochs"])
+    assert run.is_finished and run.parameters["sites"]
+    found = run.guide.state_dict()
+    assert all(torch.equal(found[name], value) for name, value in expected.state_dict().items())
