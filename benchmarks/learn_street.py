@@ -114,7 +114,7 @@ def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) ->
     if labels.is_dir():
         found = [read_objects(labels / f"{path.stem}.txt") for path in frames.paths]
         covered = np.array([
-            sum((one.right - one.left) * (one.bottom - one.top) for one in objects if one.type == DONT_CARE)
+            sum((one.right - one.left) * (one.bottom - one.top) for one in objects if one.name == DONT_CARE)
             for objects in found
         ])  # fmt: skip
         marked = covered >= MARKED * np.prod(frames.sizes, 1)
