@@ -84,6 +84,8 @@ def read_rgb(path: Path, value_range: tuple[float, float] | None = None) -> np.n
     Raises:
         DataError: it is missing, is another file, or does not decode.
     """
+    if not Path(path).is_file():
+        raise DataError(f"Expected a PNG, JPEG or TIFF image at {path}, actual none.")
     try:
         with quiet():
             found = eight_bit(stored(read(Path(path)))[0], value_range)

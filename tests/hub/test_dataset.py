@@ -276,8 +276,8 @@ def test_bad_files_are_named_and_skipped_only_when_asked(tmp_path, noise):
     (tmp_path / "gone.png").symlink_to(tmp_path / "nowhere")
     with pytest.raises(DataError, match="5 of 6 bad.*--skip-bad") as error:
         ImageFolder(tmp_path, (40, 30), 3)
-    named = ("cut.png is truncated", "empty.jpg is empty", "text.jpeg is not a PNG or JPEG image",
-             "web.png is not a PNG or JPEG image", "gone.png cannot be read")  # fmt: skip
+    named = ("cut.png is truncated", "empty.jpg is empty", "text.jpeg is not a PNG, JPEG or TIFF image",
+             "web.png is a WebP file, whatever its name", "gone.png cannot be read")  # fmt: skip
     assert all(fault in str(error.value) for fault in named)
     images = ImageFolder(tmp_path, (40, 30), 3, skip_bad=True)
     assert len(images) == 1 and (images.load(0).permute(1, 2, 0).numpy() == noise).all()
