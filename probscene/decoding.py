@@ -180,7 +180,7 @@ def eight_bit(pixels: np.ndarray, value_range: tuple[float, float] | None = None
     if pixels.dtype == np.uint8:
         return pixels
     low, high = value_range or full_range(largest(pixels))
-    steps = np.floor((np.arange(2**16) - low) * 256 / (high - low + 1)).clip(0, 255).astype(np.uint8)
+    steps = np.floor((np.arange(2**16) - low) * 256 / (high - low)).clip(0, 255).astype(np.uint8)
     if pixels.shape[2:] != (4,):
         return steps[pixels]
     return opaque(Image.fromarray(np.dstack([steps[pixels[..., :3]], (pixels[..., 3:] >> 8).astype(np.uint8)])))

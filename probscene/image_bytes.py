@@ -214,8 +214,8 @@ def _tiff(data: bytes) -> PixelFile:
     if pages := _further_pages(data, order, after):
         raise Fault(f"is a TIFF of {1 + pages} pages; save each as a file of its own")
     if set(formats) - {1, 4} or len(set(bits)) > 1 or (bits[0] != 16 and bits[0] > 8):
-        kind = "floating point" if 3 in formats else f"{max(bits)} bits"
-        raise Fault(f"is a TIFF of {kind} a channel; save it with 8 or 16 bits, unsigned")
+        kind = "floating-point numbers" if 3 in formats else f"{max(bits)} bits"
+        raise Fault(f"is a TIFF with {kind} a channel; save it with 8 or 16 bits, unsigned")
     if bits[0] == 16 and light[0] not in (1, 2):
         raise Fault("is a TIFF of 16 bits that is neither grey, black being 0, nor RGB; save it as one of these")
     turned = orientation_of(data)
