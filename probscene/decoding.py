@@ -202,10 +202,10 @@ def largest_of_file(file: Path) -> int | None:
         with file.open("rb") as opened:
             if not may_have_16_bits(opened.read(26)):
                 return None
-        pixels, _ = stored(read(file))
+        data = read(file)
+        return largest(stored(data)[0]) if pixel_file(data).bits == 16 else None
     except (OSError, Fault):
         return None
-    return largest(pixels) if pixels.dtype == np.uint16 else None
 
 
 def checked_range(value_range: Sequence[float]) -> tuple[float, float]:

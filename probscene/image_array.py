@@ -13,10 +13,9 @@ from torch import Tensor
 from .dataset import Images, common_range, grey, part_of
 from .decoding import eight_bit, fitted, largest, opaque, quiet, stored, turned, window
 from .errors import DataError
-from .image_bytes import Fault, orientation_of
+from .image_bytes import ORIENTATION, Fault, orientation_of
 
-_READ = ("PNG", "JPEG", "MPO", "TIFF")  # formats of Pillow that are read as files are
-_ORIENTATION = 0x0112  # EXIF tag
+_READ_AS_FILES = ("PNG", "JPEG", "MPO", "TIFF")  # formats of Pillow
 
 
 class ImageArray(Images):
@@ -47,8 +46,8 @@ class ImageArray(Images):
             each = [_array(image, i) for i, image in enumerate(_items(images))]
         if not each:
             raise DataError("Expected images to learn from, actual none; give at least one.")
-        largest_of_each = [largest(image) if image.dtype == np.uint16 else None for image in each]
-        self.value_range, of_range = common_range(largest_of_each, value_range)
+        peaks = [largest(image) if image.dtype == np.uint16 else None for image in each]
+        self.value_range, of_range = common_range(peaks, value_range)
         each = [eight_bit(image, self.value_range) for image in each]
         self.sizes = [(image.shape[0], image.shape[1]) for image in each]
         self.windows = [window(size, self.canvas) for size in self.sizes]
@@ -143,7 +142,7 @@ def _of_pillow(image: Image.Image, i: int) -> np.ndarray:
     """
     try:
         file = getattr(image, "fp", None)
-        if file is not None and image.format in _READ and image.tile and not image.tell():
+        if file is not None and image.format in _READ_AS_FILES and image.tile and not image.tell():
             # Nothing of it is decoded, so nothing is changed: it is read as any other file is.
             place = file.tell()
             file.seek(0)
@@ -152,7 +151,7 @@ def _of_pillow(image: Image.Image, i: int) -> np.ndarray:
             return stored(data)[0]
         image.load()
         exif = image.info.get("exif")
-        orientation = orientation_of(exif) if isinstance(exif, bytes) else image.getexif().get(_ORIENTATION, 1)
+        orientation = orientation_of(exif) if isinstance(exif, bytes) else image.getexif().get(ORIENTATION, 1)
         orientation = orientation if orientation in range(1, 9) else 1
         if image.mode == "F":
             raise Fault("has floating-point values")

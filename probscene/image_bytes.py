@@ -22,7 +22,8 @@ _PIXELS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")  # chunks of a PNG
 _GREY, _RGB, _PALETTE = 0, 2, 3  # colour types of a PNG
 _RAW_PROFILE = b"Raw profile type exif"  # where older ImageMagick puts EXIF in a PNG
 _LARGEST_PROFILE = 2**20  # bytes; EXIF has at most 64 KiB in a JPEG
-_ORIENTATION = 0x0112  # EXIF tag
+_MARKER = re.compile(rb"\xff+([^\xff])", re.DOTALL)  # of a JPEG's segment
+ORIENTATION = 0x0112  # EXIF tag
 _INTEGERS = {1: "B", 3: "H", 4: "I"}  # EXIF's and TIFF's types
 _BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLE_FORMAT, _REDUCED = 258, 259, 262, 339, 254  # TIFF tags
 _PLACES = ((273, 279), (324, 325))  # of strips or tiles: their offsets and their lengths
@@ -92,7 +93,7 @@ def orientation_of(exif: bytes) -> int:
         (number,) = struct.unpack_from(order + "H", exif, at)
         for entry in range(at + 2, at + 2 + 12 * number, 12):  # one by one: what comes after may be cut
             tag, kind, number, value = struct.unpack_from(order + "HHI4s", exif, entry)
-            if tag == _ORIENTATION and kind in _INTEGERS and number == 1:
+            if tag == ORIENTATION and kind in _INTEGERS and number == 1:
                 (found,) = struct.unpack_from(order + _INTEGERS[kind], value)
                 return found if 1 <= found <= 8 else 1
     except struct.error:
@@ -162,7 +163,7 @@ def _jpeg(data: bytes) -> PixelFile:
     """Segments, each a marker, its length and contents, as far as the first scan; all from there on is pixels."""
     kept, exif, at = [b"\xff\xd8"], b"", 2
     while True:
-        found = re.compile(rb"\xff+([^\xff])", re.DOTALL).search(data, at)  # between segments anything else is skipped
+        found = _MARKER.search(data, at)  # between segments anything else is skipped
         if found is None:
             raise Fault("is truncated")
         marker, start = found[1][0], found.end()
