@@ -60,7 +60,7 @@ def folder(path: str) -> Scenery:
 
 
 def _pictures(path: Path, size: float) -> tuple[np.ndarray, ...]:
-    files = sorted(file for file in path.glob("[!.]*") if file.suffix.lower() == ".png")
+    files = sorted(p for p in path.glob("*") if p.suffix.lower() == ".png" and not p.name.startswith("."))
     if not files:
         raise DataError(f"Expected PNG files in {path}, actual none; make the folders car, tree and house there.")
     found = []
