@@ -181,17 +181,17 @@ def blood_smear(scene: ps.SceneGraph) -> ps.Drawing:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Photographs above, scenes of the prior below.")
-    parser.add_argument("photographs", type=Path, help="folder of PNG or JPEG images")
+    parser.add_argument("photographs", type=Path, help="folder of PNG, JPEG or TIFF images")
     parser.add_argument("--out", required=True, help="the PNG to write")
     options = parser.parse_args()
     ps.seed_everything(0)
-    read = [cv2.imread(str(path)) for path in sorted(options.photographs.glob("*"))]
-    read = [cv2.resize(pixels, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for pixels in read if pixels is not None]
+    read = ps.ImageFolder(options.photographs, (HEIGHT, WIDTH), 3, skip_bad=True)
     if len(read) < 8:
         parser.error(f"expected at least 8 images in {options.photographs}, actual {len(read)}")
-    drawn = ps.render(blood_smear, ps.sample(blood_smear, PRIOR, 8)).image.permute(0, 2, 3, 1).numpy()[..., ::-1]
-    rows = np.stack([*np.random.default_rng(0).choice(read, 8, replace=False), *drawn]).reshape(4, 4, HEIGHT, WIDTH, 3)
-    if not cv2.imwrite(options.out, rows.transpose(0, 2, 1, 3, 4).reshape(4 * HEIGHT, 4 * WIDTH, 3)):
+    photographs = [read.load(i) for i in np.random.default_rng(0).choice(len(read), 8, replace=False)]
+    drawn = ps.render(blood_smear, ps.sample(blood_smear, PRIOR, 8)).image
+    rows = torch.stack([*photographs, *drawn]).reshape(4, 4, 3, HEIGHT, WIDTH).permute(0, 3, 1, 4, 2)
+    if not cv2.imwrite(options.out, rows.reshape(4 * HEIGHT, 4 * WIDTH, 3).flip(-1).numpy()):
         parser.error(f"expected --out in a folder that can be written, actual {options.out}")
 
 

@@ -4,9 +4,9 @@
     probscene fit aerial2d --features efficientnet --target FOLDER/fit/images --out RUN
     probscene evaluate RUN --target FOLDER/fit/images --labels FOLDER/fit/counts.csv
 
-DATA holds frames (JPEG or PNG) with a YOLO file of the same name beside each, whose class 0 is car; nothing is fetched.
-A sequence is the frames of one size whose names count on. Its frames are near duplicates, so one sequence is held out
-whole, and the crops of the others say less than their number.
+DATA holds frames (PNG, JPEG or TIFF) with a YOLO file of the same name beside each, whose class 0 is car; nothing is
+fetched. A sequence is the frames of one size whose names count on. Its frames are near duplicates, so one sequence is
+held out whole, and the crops of the others say less than their number.
 
 Every sequence is scaled by one factor, so that its median car is as long as the model's, 18 pixels, or, where the frame
 would then be lower than a crop, so that it is just as high. Crops are 256 x 256, ``--stride`` pixels apart in both
@@ -26,6 +26,8 @@ from rich.console import Console
 
 from probscene.app.files import make_folder
 from probscene.app.labelling.counts import write_counts
+from probscene.dataset import is_image
+from probscene.decoding import read_rgb
 from probscene.errors import DataError, ProbsceneError
 
 CROP, CAR = 256, 18.0  # pixels: a crop's side and the length of the model's cars
@@ -59,9 +61,9 @@ def sequences(data: Path) -> list[tuple[str, list[Path]]]:
     Raises:
         DataError: no frames, or one that does not decode.
     """
-    frames = sorted(file for file in data.glob("*") if file.suffix.lower() in (".jpg", ".jpeg", ".png"))
+    frames = sorted(filter(is_image, data.glob("*")))
     if not frames:
-        raise DataError(f"Expected frames (JPEG or PNG) with YOLO labels in {data}, actual none.")
+        raise DataError(f"Expected frames (PNG, JPEG or TIFF) with YOLO labels in {data}, actual none.")
     found, last = [], None
     for key in sorted(map(_key, frames), key=lambda key: key[:3]):
         *place, number, frame = key
@@ -74,7 +76,7 @@ def sequences(data: Path) -> list[tuple[str, list[Path]]]:
 
 def crops(frames: list[Path], stride: int) -> tuple[float, Iterator[tuple[str, np.ndarray, int]]]:
     """The factor that a sequence is scaled by, and its crops ``(256, 256, 3)``: name, pixels and number of cars."""
-    first = _pixels(frames[0])
+    first = read_rgb(frames[0])
     height, width = first.shape[:2]
     labels = [boxes(frame, width, height) for frame in frames]
     every = np.concatenate(labels)
@@ -85,7 +87,7 @@ def crops(frames: list[Path], stride: int) -> tuple[float, Iterator[tuple[str, n
     def each():
         for frame, cars in zip(frames, labels, strict=True):
             how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-            whole = cv2.resize(_pixels(frame), size, interpolation=how)
+            whole = cv2.resize(read_rgb(frame), size, interpolation=how)
             middle = cars[:, :2] * (size[0] / width, size[1] / height)
             for y in range(0, size[1] - CROP + 1, stride):
                 for x in range(0, size[0] - CROP + 1, stride):
@@ -103,7 +105,7 @@ def write(folder: Path, parts: list[tuple[str, list[Path]]], stride: int) -> Non
         scale, each = crops(frames, stride)
         before = len(names)
         for name, pixels, cars in each:
-            if not cv2.imwrite(str(folder / "images" / name), pixels):
+            if not cv2.imwrite(str(folder / "images" / name), pixels[..., ::-1]):
                 raise DataError(f"Could not write {folder / 'images' / name}.")
             names.append(name)
             counts.append([cars])
@@ -115,15 +117,8 @@ def write(folder: Path, parts: list[tuple[str, list[Path]]], stride: int) -> Non
 def _key(frame: Path) -> tuple[tuple[int, int], str, int, Path]:
     prefix = frame.stem.rstrip("0123456789")
     digits = frame.stem.removeprefix(prefix)
-    height, width = _pixels(frame).shape[:2]
+    height, width = read_rgb(frame).shape[:2]
     return (height, width), prefix, int(digits or 0), frame
-
-
-def _pixels(frame: Path) -> np.ndarray:
-    pixels = cv2.imread(str(frame))
-    if pixels is None:
-        raise DataError(f"Expected an image in {frame}, actual a file that does not decode.")
-    return pixels
 
 
 def main():

@@ -5,10 +5,9 @@ Axis letters: L images of the folder, B images of a batch, C H W.
 
 import hashlib
 import os
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,11 +16,22 @@ import torch
 from torch import Tensor
 
 from .ahead import ahead
-from .decoding import Fault, Part, Window, decoded, read, window
+from .decoding import (
+    Part,
+    Window,
+    checked_range,
+    decoded,
+    full_range,
+    largest_of_file,
+    quiet,
+    read,
+    window,
+)
 from .errors import DataError
+from .image_bytes import Fault
 from .threads import cores
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 LEAST_PART = 0.75  # of either side of an image, in its further views
 
 
@@ -37,6 +47,8 @@ class Images:
         windows: of each of them, what is seen of it, see ``window``; None where that is all.
         distinct: how many of them are left without those that equal another one in every pixel.
         bad: the files left out, each with the fault.
+        value_range: the values of images of 16 bits that are read as 0 and 255, see ``decoding.eight_bit``; None where
+            there are none, and none was given.
         notes: what a person should know, one sentence each.
         fingerprint: SHA-256, hexadecimal: equal fingerprints mean equal tensors.
     """
@@ -49,6 +61,7 @@ class Images:
     windows: list[Window | None]
     distinct: int
     bad: dict[Path, str]
+    value_range: tuple[float, float] | None = None
     notes: tuple[str, ...]
     fingerprint: str
 
@@ -92,14 +105,15 @@ class Images:
 
 
 class ImageFolder(Images):
-    """The PNG and JPEG files that lie directly in a folder, sorted by name; hidden files and subfolders are not read.
+    """The PNG, JPEG and TIFF files that lie directly in a folder, sorted by name; hidden files and subfolders are not
+    read.
 
     Every file is decoded once when the folder is opened, so that nothing fails later; no image is kept. Truncated files
-    are always detected, altered bytes always in a PNG but not always in a JPEG, which has no checksum. Photos are
-    turned upright by their EXIF tag, transparent pixels are put on black, 16-bit channels keep their upper byte,
-    palettes and CMYK become RGB. An image of another size is resized to the canvas, by area where it shrinks and
-    linearly where it grows. If its shape is the canvas's to within 2 % it is stretched; from any other the largest part
-    in the middle that has the canvas's shape is cut out (``window``).
+    are always detected, altered pixels always in a PNG but not always in the others, which have no checksum. Photos are
+    turned upright by their EXIF tag, transparent pixels are put on black, palettes and CMYK become RGB; channels of 16
+    bits are read over one range of values for all images. An image of another size is resized to the canvas, by area
+    where it shrinks and linearly where it grows. If its shape is the canvas's to within 2 % it is stretched; from any
+    other the largest part in the middle that has the canvas's shape is cut out (``window``).
 
     Args:
         path: the folder; or several files, wherever they lie.
@@ -107,6 +121,8 @@ class ImageFolder(Images):
         channels: 1 for grey (``grey``), 3 for RGB.
         skip_bad: leave out files that do not decode.
         progress: called with the files checked so far and their number.
+        value_range: the values of images of 16 bits that are read as 0 and 255; where None, from 0 to the largest value
+            of as many bits as the largest one in the folder has.
 
     Attributes:
         paths: the L files.
@@ -117,12 +133,15 @@ class ImageFolder(Images):
         distinct: how many of them are left without those that equal another one in every pixel.
         bad: the files left out, each with the fault.
         listed: whether the files were named, and not their folder.
+        value_range: see ``Images``.
         notes: what a person should know, one sentence each.
-        fingerprint: SHA-256, hexadecimal, of the names, the bytes of the files, the canvas, the channels, and of what
-            is seen where that is not all: equal fingerprints mean equal tensors.
+        fingerprint: SHA-256, hexadecimal, of the names, the bytes of the files, the canvas, the channels, of what is
+            seen where that is not all, and of the range where images have 16 bits: equal fingerprints mean equal
+            tensors.
 
     Raises:
-        DataError: no such folder, one without images, or files that do not decode, each named with its fault.
+        DataError: no such folder, one without images, or files that do not decode, each named with its fault; a range
+            that is none.
     """
 
     def __init__(
@@ -132,20 +151,22 @@ class ImageFolder(Images):
         channels: int,
         skip_bad: bool = False,
         progress: Callable[[int, int], None] | None = None,
+        value_range: Sequence[float] | None = None,
     ):
         self.canvas, self.channels = (canvas[0], canvas[1]), channels
         if isinstance(path, str | os.PathLike):
             self.path = Path(path)
-            files, others = _listed(self.path)
+            files, others, below = _listed(self.path)
         else:
-            files, others = [Path(file) for file in path], []
+            files, others, below = [Path(file) for file in path], [], {}
             self.path = _place(files)
         self.listed = bool(isinstance(path, list | tuple))
+        self.value_range, of_range = range_of(files, value_range)
         digest = hashlib.sha256(repr((self.canvas, channels)).encode())
         self.paths, self.sizes, self.windows = [], [], []
         self.bad = {}
         pictures = set()
-        with _quiet(), closing(ahead(self._checked, files, cores())) as checked:
+        with quiet(), closing(ahead(self._checked, files, cores())) as checked:
             for i, (file, found) in enumerate(zip(files, checked, strict=True)):
                 if isinstance(found, Fault):
                     self.bad[file] = str(found)
@@ -161,13 +182,15 @@ class ImageFolder(Images):
                 if progress is not None:
                     progress(i + 1, len(files))
         self._judge(skip_bad)
+        if of_range:
+            digest.update(repr(self.value_range).encode())
         self.fingerprint = digest.hexdigest()
         self.distinct = len(pictures)
         sizes = Counter(self.sizes)
         cut = Counter((size, seen) for size, seen in zip(self.sizes, self.windows, strict=True) if seen is not None)
         sizes.pop(self.canvas, None)
         self.resized, self.cropped = sizes.total(), cut.total()
-        self.notes = self._notes(sizes, cut, others)
+        self.notes = (*self._notes(sizes, cut, others, below), *of_range)
 
     def load(self, i: int, view: int = 0) -> Tensor:
         """Image number ``i``, ``(C, H, W)`` uint8.
@@ -180,8 +203,9 @@ class ImageFolder(Images):
             DataError: the file has gone bad since the folder was opened.
         """
         try:
-            with _quiet():
-                image, _ = decoded(read(self.paths[i]), self.canvas, self.channels, part_of(i, view) if view else None)
+            with quiet():
+                part = part_of(i, view) if view else None
+                image, _ = decoded(read(self.paths[i]), self.canvas, self.channels, part, self.value_range)
         except Fault as fault:
             raise DataError(f"Expected the image {self.paths[i]} as it was, actual a file that {fault}.") from fault
         return torch.from_numpy(image)
@@ -189,7 +213,7 @@ class ImageFolder(Images):
     def _checked(self, file: Path) -> "_Checked | Fault":
         try:
             data = read(file)
-            picture, size = decoded(data, self.canvas, self.channels)
+            picture, size = decoded(data, self.canvas, self.channels, value_range=self.value_range)
         except Fault as fault:
             return fault
         return _Checked(size, hashlib.sha256(data).digest(), hashlib.blake2b(picture.data, digest_size=16).digest())
@@ -204,7 +228,7 @@ class ImageFolder(Images):
                 f"{' with --skip-bad' if self.paths else ''}."
             )
 
-    def _notes(self, sizes: Counter, cut: Counter, others: list[str]) -> tuple[str, ...]:
+    def _notes(self, sizes: Counter, cut: Counter, others: list[str], below: dict[str, int]) -> tuple[str, ...]:
         notes = []
         if self.resized:
             height, width = sizes.most_common(1)[0][0]
@@ -222,7 +246,13 @@ class ImageFolder(Images):
             faults = _first(f"{file.name} {fault}" for file, fault in self.bad.items())
             notes.append(f"{len(self.bad)} bad files in {self.path} are left out: {faults}.")
         if others:
-            notes.append(f"{len(others)} files in {self.path} are neither PNG nor JPEG and not read: {_first(others)}.")
+            notes.append(f"{len(others)} files in {self.path} are no PNG, JPEG or TIFF and not read: {_first(others)}.")
+        if below:
+            named = _first(f"{name}/ ({number})" for name, number in below.items())
+            notes.append(
+                f"{sum(below.values())} images in subfolders of {self.path} are not read: {named}; name a subfolder, "
+                "or put all images in one folder."
+            )
         return tuple(notes)
 
 
@@ -246,20 +276,49 @@ class _Checked(NamedTuple):
     picture: bytes
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without Pillow's warnings about odd metadata; they are the whole process's, so no thread can do it alone."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+def range_of(
+    files: Sequence[Path], value_range: Sequence[float] | None
+) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
+    """The range over which files of 16 bits are read, the one that is given or the one that is found in them; and what
+    a person should know, where there are such files.
+
+    Raises:
+        DataError: what is given is none.
+    """
+    with quiet(), closing(ahead(largest_of_file, files, cores())) as found:
+        return common_range(list(found), value_range)
 
 
-def _listed(folder: Path) -> tuple[list[Path], list[str]]:
-    """The image files of a folder, sorted by name, and the names of its other files."""
+def common_range(
+    values: Sequence[int | None], value_range: Sequence[float] | None
+) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
+    """See ``range_of``; ``values`` are the largest of each image, None of one that has not 16 bits."""
+    given = None if value_range is None else checked_range(value_range)
+    largest = [value for value in values if value is not None]
+    if not largest:
+        return given, ()
+    low, high = given or full_range(max(largest))
+    note = (
+        f"{len(largest)} of {len(values)} images have 16 bits a channel and values up to {max(largest)}; "
+        f"{low:g} to {high:g} are read as black to white. Give another range with --range LOW,HIGH."
+    )
+    return (low, high), (note,)
+
+
+def is_image(file: Path) -> bool:
+    """Whether a file counts as an image by its name; hidden files do not."""
+    return file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
+
+
+def _listed(folder: Path) -> tuple[list[Path], list[str], dict[str, int]]:
+    """The image files of a folder, sorted by name; the names of its other files; and by name of its subfolders how many
+    images are in them."""
     if not folder.exists():
-        raise DataError(f"Expected a folder of PNG or JPEG images, actual {folder}, which is not there.")
+        raise DataError(f"Expected a folder of PNG, JPEG or TIFF images, actual {folder}, which is not there.")
     if not folder.is_dir():
-        raise DataError(f"Expected a folder of PNG or JPEG images, actual {folder}, which is a file; name its folder.")
+        raise DataError(
+            f"Expected a folder of PNG, JPEG or TIFF images, actual {folder}, which is a file; name its folder."
+        )
     try:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
@@ -267,19 +326,28 @@ def _listed(folder: Path) -> tuple[list[Path], list[str]]:
     entries.sort(key=lambda entry: entry.name)  # paths of Windows would be sorted without regard to case
     folders = [entry.name + "/" for entry in entries if entry.is_dir()]
     files = [entry for entry in entries if not entry.is_dir()]
-    images = [entry for entry in files if entry.suffix.lower() in SUFFIXES]
-    others = [entry.name for entry in files if entry.suffix.lower() not in SUFFIXES]
+    images = [entry for entry in files if is_image(entry)]
+    others = [entry.name for entry in files if not is_image(entry)]
     if not images:
         there = f"only {_first(folders + others)}" if folders or others else "an empty folder"
         remedy = "; images in subfolders are not read, name the subfolder" if folders else ""
-        raise DataError(f"Expected PNG or JPEG images in {folder}, actual {there}{remedy}.")
-    return images, others
+        raise DataError(f"Expected PNG, JPEG or TIFF images in {folder}, actual {there}{remedy}.")
+    below = {entry.name: _images_below(entry) for entry in entries if entry.is_dir()}
+    return images, others, {name: number for name, number in below.items() if number}
+
+
+def _images_below(folder: Path) -> int:
+    number = 0
+    for _, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        number += sum(is_image(Path(name)) for name in files)
+    return number
 
 
 def _place(files: list[Path]) -> Path:
     """The folder of a list of files, or the one that has all of theirs."""
     if not files:
-        raise DataError("Expected PNG or JPEG images, actual an empty list of files.")
+        raise DataError("Expected PNG, JPEG or TIFF images, actual an empty list of files.")
     return Path(os.path.commonpath([file.resolve().parent for file in files]))
 
 

@@ -42,3 +42,18 @@ def number_or_all(text: str, what: str) -> int | None:
     if not text.isascii() or not text.isdigit():
         raise ProbsceneError(f"Expected a number of {what}, or all, actual {text!r}.")
     return int(text)
+
+
+def range_given(text: str | None) -> tuple[float, float] | None:
+    """Two numbers that were typed with a comma between them; None where nothing was.
+
+    Raises:
+        ProbsceneError: it is something else.
+    """
+    if text is None:
+        return None
+    try:
+        low, high = map(float, text.split(","))
+    except ValueError:
+        raise ProbsceneError(f"Expected --range LOW,HIGH such as 0,4095, actual {text!r}.") from None
+    return low, high

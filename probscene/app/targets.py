@@ -16,11 +16,18 @@ Target = Path | str | Sequence[Path | str] | Any
 """A folder, a list of files, an array or a dataset of images, see ``open_images``."""
 
 
-def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display) -> Images:
+def open_images(
+    target: Target,
+    model: SceneModel,
+    skip_bad: bool,
+    show: Display,
+    value_range: Sequence[float] | None = None,
+) -> Images:
     """Images as a model reads them; what a person should know about them is said.
 
     Args:
         target: a folder, a list of files, or images in memory, see ``ImageArray``; images that are open already.
+        value_range: of images of 16 bits, see ``ImageFolder``.
 
     Raises:
         DataError: see ``ImageFolder`` and ``ImageArray``.
@@ -28,9 +35,10 @@ def open_images(target: Target, model: SceneModel, skip_bad: bool, show: Display
     if isinstance(target, Images):
         return target
     if _is_folder(target) or _is_list_of_files(target):
-        images: Images = ImageFolder(target, model.canvas, model.channels, skip_bad, show.stage("reading"))
+        reading = show.stage("reading")
+        images: Images = ImageFolder(target, model.canvas, model.channels, skip_bad, reading, value_range)
     else:
-        images = ImageArray(target, model.canvas, model.channels)
+        images = ImageArray(target, model.canvas, model.channels, value_range)
     say_notes(images, show)
     return images
 

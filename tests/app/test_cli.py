@@ -171,7 +171,7 @@ def test_resume_takes_the_settings_of_the_run_or_none(call, discs, fitted, targe
     assert call(*words, *same).code == 0
     for other, *parts in (
         (["multi_mnist"], "Expected the model"),
-        (["--target", tmp_path], "Expected PNG or JPEG images in", "an empty folder"),
+        (["--target", tmp_path], "Expected PNG, JPEG or TIFF images in", "an empty folder"),
         (["--seed", 1], "(0), actual 1"),
         (["--threads", 7], "threads"),
         (["--skip-bad"], "skip_bad"),

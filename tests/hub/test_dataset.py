@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from probscene.dataset import ImageFolder, grey
-from probscene.decoding import window
+from probscene.decoding import eight_bit, full_range, window
 from probscene.errors import DataError
 
 
@@ -276,8 +276,8 @@ def test_bad_files_are_named_and_skipped_only_when_asked(tmp_path, noise):
     (tmp_path / "gone.png").symlink_to(tmp_path / "nowhere")
     with pytest.raises(DataError, match="5 of 6 bad.*--skip-bad") as error:
         ImageFolder(tmp_path, (40, 30), 3)
-    named = ("cut.png is truncated", "empty.jpg is empty", "text.jpeg is not a PNG or JPEG image",
-             "web.png is not a PNG or JPEG image", "gone.png cannot be read")  # fmt: skip
+    named = ("cut.png is truncated", "empty.jpg is empty", "text.jpeg is not a PNG, JPEG or TIFF image",
+             "web.png is a WebP file, whatever its name", "gone.png cannot be read")  # fmt: skip
     assert all(fault in str(error.value) for fault in named)
     images = ImageFolder(tmp_path, (40, 30), 3, skip_bad=True)
     assert len(images) == 1 and (images.load(0).permute(1, 2, 0).numpy() == noise).all()
@@ -327,3 +327,71 @@ def test_progress_is_told_of_every_file(tmp_path, noise):
     seen = []
     ImageFolder(tmp_path, (4, 4), 3, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def sixteen(values: np.ndarray) -> bytes:
+    return cv2.imencode(".png", values.astype(np.uint16))[1].tobytes()
+
+
+def test_images_of_16_bits_are_read_over_one_range(tmp_path, noise):
+    wide = noise[..., 0].astype(np.uint16) * 16  # of 12 bits
+    (tmp_path / "bright.png").write_bytes(sixteen(wide))
+    (tmp_path / "dim.TIF").write_bytes(cv2.imencode(".tif", wide // 16)[1].tobytes())
+    (tmp_path / "black.png").write_bytes(sixteen(wide * 0))
+    (tmp_path / "plain.png").write_bytes(encoded(noise))
+    images = ImageFolder(tmp_path, (40, 30), 3)
+    black, bright, dim, plain = (image.permute(1, 2, 0).numpy() for image in next(images.batches(4)))
+    assert images.value_range == (0, 4095)
+    assert "3 of 4 images have 16 bits a channel and values up to 4080; 0 to 4095 are read" in images.notes[0]
+    assert (bright == noise[..., :1]).all() and (dim == noise[..., :1] // 16).all()
+    assert not black.any() and (plain == noise).all()
+    again = ImageFolder(tmp_path, (40, 30), 3, value_range=[0, 4095])
+    other = ImageFolder(tmp_path, (40, 30), 3, value_range=(160, 2000.0))
+    assert images.fingerprint == again.fingerprint != other.fingerprint and "160 to 2000 are read" in other.notes[0]
+    seen = other.load(1)[0].numpy()
+    assert not seen[wide <= 160].any() and (seen[wide >= 2000] == 255).all() and (other.load(3) == images.load(3)).all()
+    assert (np.diff(seen.reshape(-1)[wide.reshape(-1).argsort()].astype(int)) >= 0).all()
+
+
+@given(st.integers(0, 2**16 - 1), st.integers(8, 16))
+def test_a_full_range_leaves_the_upper_bits(value, bits):
+    pixels = np.full((1, 1), value, np.uint16)
+    seen = int(eight_bit(pixels, (0, 2**bits - 1))[0, 0])
+    assert seen == min(value >> (bits - 8), 255)
+    low, high = full_range(value)
+    assert low == 0 and value <= high and (high == 255 or value > high / 2) and int(high) & int(high) + 1 == 0
+
+
+@given(st.data())
+def test_any_range_rises_from_black_to_white(data):
+    low = data.draw(st.integers(0, 2**16 - 2))
+    high = data.draw(st.integers(low + 1, 2**16 - 1))
+    seen = eight_bit(np.arange(2**16, dtype=np.uint16)[None], (low, high))[0]
+    assert (np.diff(seen.astype(int)) >= 0).all() and seen[low] == 0 and seen[high] == 255
+    steps = np.bincount(seen[low:high], minlength=256)
+    assert steps.max() - steps.min() <= 1
+
+
+@pytest.mark.parametrize("wrong", [(5, 5), (7, 3), (-1, 9), (0, 65536), (0, float("nan")), (1,), "ab", 7])
+def test_ranges_that_are_none(tmp_path, noise, wrong):
+    (tmp_path / "a.png").write_bytes(encoded(noise))
+    with pytest.raises(DataError, match="two values from 0 to 65535, the lower first"):
+        ImageFolder(tmp_path, (4, 4), 3, value_range=wrong)
+
+
+def test_a_range_leaves_images_of_8_bits_as_they_are(tmp_path, noise):
+    (tmp_path / "a.png").write_bytes(encoded(noise))
+    plain, given_one = ImageFolder(tmp_path, (40, 30), 3), ImageFolder(tmp_path, (40, 30), 3, value_range=(3, 9))
+    assert plain.fingerprint == given_one.fingerprint and plain.value_range is None and not given_one.notes
+    assert (plain.load(0) == given_one.load(0)).all() and given_one.value_range == (3, 9)
+
+
+def test_images_in_subfolders_are_said_to_be_left_out(tmp_path, noise):
+    for name in ("a.png", "._a.png", "one/b.PNG", "one/._b.png", "two/deep/c.jpg", "two/d.tiff", ".three/e.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(encoded(noise))
+    (tmp_path / "four").mkdir()
+    (tmp_path / "four" / "notes.txt").touch()
+    images = ImageFolder(tmp_path, (40, 30), 3)
+    assert [file.name for file in images.paths] == ["a.png"] and len(images.notes) == 1
+    assert f"3 images in subfolders of {tmp_path} are not read: one/ (1), two/ (2)" in images.notes[0]

@@ -158,6 +158,14 @@ def test_a_folder_of_pictures(tmp_path, monkeypatch):
     assert (scenes.drawing.layers[LAYERS["car"]].tint == 1).all()
 
 
+def test_hidden_files_are_no_pictures(tmp_path):
+    path = pictures(tmp_path)
+    (path / "car" / "one.png").rename(path / "car" / "ONE.PNG")
+    for name in ("._ONE.PNG", "._two.png", ".three.png"):
+        (path / "car" / name).write_bytes(b"\0\5\x16\7")
+    assert len(folder(str(path)).cars.sprites) == 1
+
+
 @pytest.mark.parametrize("wrong", ["missing", "no alpha", "no picture"])
 def test_a_folder_that_is_no_folder_of_pictures(wrong, tmp_path):
     path = pictures(tmp_path)

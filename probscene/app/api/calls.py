@@ -105,6 +105,7 @@ def evaluate(
     min_height: float = 0.0,
     progress: bool = True,
     visible: Visible | None = None,
+    value_range: Sequence[float] | None = None,
 ) -> Evaluation:
     """Count what the prior and the guide derive, beside the labels and what the run's network sees in the target.
 
@@ -118,6 +119,7 @@ def evaluate(
         min_height: of objects that labels with boxes count, pixels.
         visible: least visible share of objects that are counted in rendered scenes, 0 to 1: one, or one for each class
             by name; where None, the run's, if its labels were read so.
+        value_range: of a target's images of 16 bits, see ``ImageFolder``; the run's, if it has one, where None.
 
     Raises:
         ProbsceneError: see ``evaluation.evaluate`` and ``read_labels``.
@@ -125,7 +127,7 @@ def evaluate(
     opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
     opened.check_finished()
     with display(progress) as show:
-        seen = _images(opened, target, show)
+        seen = _images(opened, target, show, value_range)
         truth = _truth(labels, opened.model, seen, some_labels, min_height)
         return evaluating.evaluate(opened, seen, truth, show, num, features=features, images=images, visible=visible)
 
@@ -218,6 +220,7 @@ def trial(
     resamples: int = 1000,
     workers: int = 1,
     progress: bool = True,
+    value_range: Sequence[float] | None = None,
 ) -> Results:
     """What is a labelled set worth? Train one detector, from one start and with one budget, on each of several sets,
     and test it on labelled real images; the same call goes on after an interruption.
@@ -243,6 +246,7 @@ def trial(
         resamples: of test images and seeds, for intervals.
         workers: processes; the results do not depend on their number. More than one are spawned: a script calls this
             under ``if __name__ == "__main__":``.
+        value_range: of photographs of 16 bits, see ``trial.trial``.
 
     Raises:
         ProbsceneError: see ``trial.trial``.
@@ -270,6 +274,7 @@ def trial(
             baselines=baselines,
             resamples=resamples,
             workers=workers,
+            value_range=value_range,
             say=show.say,
         )
 
@@ -279,9 +284,10 @@ def display(progress: bool) -> Display:
     return Display() if progress else Display(Console(quiet=True))
 
 
-def _images(run: RunFolder, target: Target | None, show: Display) -> Images:
+def _images(run: RunFolder, target: Target | None, show: Display, value_range: Sequence[float] | None = None) -> Images:
     if target is not None:
-        return open_images(target, run.model, run.record["skip_bad"], show)
+        value_range = run.record.get("value_range") if value_range is None else value_range
+        return open_images(target, run.model, run.record["skip_bad"], show, value_range)
     return open_target(run, show)
 
 

@@ -50,13 +50,14 @@ def fit(
     resume: bool = False,
     progress: bool = True,
     cluster: str | None = None,
+    value_range: Sequence[float] | None = None,
 ) -> Run:
     """Learn which structures occur in unlabelled images.
 
     Args:
         model: a scene model, the name of a built-in one, or a Python file.
-        target: a folder of PNG or JPEG files, a list of files, an array ``(L, H, W)`` or ``(L, H, W, 1 or 3)`` uint8,
-            or a torch dataset of images; see ``ImageFolder`` and ``ImageArray``.
+        target: a folder of PNG, JPEG or TIFF files, a list of files or of Pillow images, an array ``(L, H, W)`` or
+            ``(L, H, W, 1 or 3)``, or a torch dataset of images; see ``ImageFolder`` and ``ImageArray``.
         preset: how long and how to learn: ``"quick"``, ``"default"``, ``"street"``, ``"paper"``, ``"paper-aerial"``,
             ``"paper-driving"``, or a ``Preset``.
         seed: of everything random.
@@ -86,6 +87,8 @@ def fit(
         progress: show it, on stderr.
         cluster: the address of a Ray cluster whose nodes render scenes and read them while structure is learnt, see
             ``Cluster``. They have to see the run's folder by the same path.
+        value_range: the values of images of 16 bits that are read as black and white, such as ``(0, 4095)``; where
+            None, what is found in the images, see ``ImageFolder``. The run keeps it.
 
     Raises:
         ProbsceneError: an input is at fault; the message says which and how to mend it. What was finished of the run
@@ -109,6 +112,7 @@ def fit(
             with connected(cluster, show.say) as nodes:  # first, so that a wrong address leaves no run behind
                 if resume and (folder / "run.json").exists():
                     begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
+                    begun["value_range"] = value_range
                     run, images = session.resume(
                         folder, show, given, target, chosen, assets_folder, parts, Run, photographs=other, **begun
                     )
@@ -127,6 +131,7 @@ def fit(
                         Run,
                         labels,
                         other,
+                        value_range,
                     )
                 if not run.is_finished:
                     session.carry_out(run, images, show, *_cache(cache), nodes)

@@ -1,5 +1,6 @@
 """``probscene label``: which images to label next, and the sheet to count in."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -35,6 +36,7 @@ def label(
     skip_bad: bool = False,
     assets: Path | str | None = None,
     progress: bool = True,
+    value_range: Sequence[float] | None = None,
 ) -> Sheet:
     """Propose which images to label next, see ``labelling.choosing``, and write the sheet to count in.
 
@@ -48,6 +50,7 @@ def label(
         seed: of the first image.
         skip_bad: leave out files that do not decode.
         assets: a folder that a model is drawn with.
+        value_range: of images of 16 bits, see ``ImageFolder``; the run's, if it has one, where None.
 
     Raises:
         ProbsceneError: the folder holds files already, or all images are labelled; see ``read_few`` and
@@ -59,7 +62,9 @@ def label(
     check_empty(out)
     run, model = _source(source, None if assets is None else Path(assets))
     with display(progress) as show:
-        images = open_images(target, model, skip_bad, show)
+        if value_range is None and run is not None:
+            value_range = run.record.get("value_range")
+        images = open_images(target, model, skip_bad, show, value_range)
         few = None if labels is None else read_few(Path(labels), model, images, least=1)
         rows = _proposed(run, model, images, number, few, seed, show)
     if not rows:

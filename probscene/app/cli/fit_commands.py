@@ -9,9 +9,9 @@ import typer
 import probscene
 from probscene.errors import ProbsceneError
 
-from ..arguments import checked_seed
+from ..arguments import checked_seed, range_given
 from .application import app
-from .options import Assets, Cache, ClusterAddress, NoCache, PresetName, Seed
+from .options import Assets, Cache, ClusterAddress, NoCache, PresetName, Seed, ValueRange
 
 
 @app.command()
@@ -19,7 +19,7 @@ def fit(
     ctx: typer.Context,
     out: Annotated[Path, typer.Option(metavar="RUN", help="The run folder to write.")],
     model: Annotated[str | None, typer.Argument(metavar="MODEL", help="A built-in model or a .py file.")] = None,
-    target: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of PNG or JPEG images.")] = None,
+    target: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of PNG, JPEG or TIFF images.")] = None,
     preset: Annotated[PresetName | None, typer.Option(help="How long to learn; 'default' if not given.")] = None,
     objective: Annotated[
         str | None, typer.Option(metavar="NAME", help="The divergence: kde, js, witness, mmd, or FILE.py:NAME.")
@@ -68,6 +68,7 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
     no_verdict: Annotated[bool, typer.Option("--no-verdict", help="Do not judge the fit at its end.")] = False,
     cluster: ClusterAddress = None,
+    value_range: ValueRange = None,
 ) -> None:
     """Learn which structures occur in a folder of unlabelled images, and say how near that came."""
     from rich.console import Console
@@ -84,6 +85,7 @@ def fit(
 
     if seed is not None:
         checked_seed(seed)
+    chosen_range = range_given(value_range)
     name = str(preset or PresetName.default)
     settings = with_learn(settings or [], learn, parameters)
     chosen, parts = chosen_preset(name, features, objective, guide, settings)
@@ -100,6 +102,7 @@ def fit(
             if resume:
                 given = chosen if preset or objective or guide or features or settings else None
                 begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
+                begun["value_range"] = chosen_range
                 run, images = session.resume(out, show, model, target, given, assets, parts, photographs=other, **begun)
             elif model is None or target is None:
                 raise ProbsceneError(
@@ -119,6 +122,7 @@ def fit(
                     parts,
                     labels=labels,
                     photographs=other,
+                    value_range=chosen_range,
                 )
                 ctx.obj.words.append("--resume")
             unfinished = not run.is_finished

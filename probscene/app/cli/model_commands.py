@@ -9,7 +9,7 @@ from probscene.errors import ModelError
 
 from ..arguments import checked_seed
 from .application import app
-from .options import Assets, Model, Seed
+from .options import Assets, Model, Seed, ValueRange
 
 
 @app.command()
@@ -70,7 +70,7 @@ def label(
     model_or_run: Annotated[
         str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a run: one that counts proposes better.")
     ],
-    target: Annotated[Path, typer.Argument(metavar="TARGET", help="A folder of PNG or JPEG images.")],
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="A folder of PNG, JPEG or TIFF images.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write: a sheet, a CSV, the pictures.")],
     number: Annotated[int, typer.Option(metavar="N", help="How many images to label.")] = 10,
     labels: Annotated[
@@ -79,9 +79,12 @@ def label(
     seed: Seed = 0,
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = False,
     assets: Assets = None,
+    value_range: ValueRange = None,
 ) -> None:
     """Propose which images to label next, and write the sheet in which to count."""
     from ..api import label
+    from ..arguments import range_given
 
-    sheet = label.label(model_or_run, target, out, number, labels, seed, skip_bad, assets)
+    chosen = range_given(value_range)
+    sheet = label.label(model_or_run, target, out, number, labels, seed, skip_bad, assets, value_range=chosen)
     print(f"Count in {len(sheet.names)} pictures: open {sheet.page} in a browser, or fill in {sheet.table}")

@@ -29,6 +29,14 @@ Visible = Annotated[
 BoxMargin = Annotated[
     int, typer.Option(min=0, metavar="PIXELS", help="By which labelled boxes are wider on each side.")
 ]
+ValueRange = Annotated[
+    str | None,
+    typer.Option(
+        "--range",
+        metavar="LOW,HIGH",
+        help="Values of 16-bit images that are black and white; if not given, the run's, or as found in the images.",
+    ),
+]
 PresetName = StrEnum("PresetName", ["quick", "default", "street", "paper", "paper-aerial", "paper-driving"])
 ClusterAddress = Annotated[
     str | None,

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from .application import app
-from .options import BoxMargin, ClusterAddress, MinHeight, RunPath, Seed, SomeLabels, Visible
+from .options import BoxMargin, ClusterAddress, MinHeight, RunPath, Seed, SomeLabels, ValueRange, Visible
 
 
 @app.command()
@@ -76,11 +76,12 @@ def evaluate(
     some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
     visible: Visible = None,
+    value_range: ValueRange = None,
 ) -> None:
     """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
     from rich.console import Console
 
-    from ..arguments import number_or_all
+    from ..arguments import number_or_all, range_given
     from ..evaluation import judge as verdict
     from ..evaluation.evaluate import evaluate
     from ..evaluation.labels import read_labels
@@ -95,8 +96,9 @@ def evaluate(
     most = number_or_all(num_images, "images to compare")
     if json is not None:
         make_folder(json.parent)
+    chosen = range_given(value_range) or opened.record.get("value_range")
     with Display() as show:
-        images = open_images(target, opened.model, opened.record["skip_bad"], show)
+        images = open_images(target, opened.model, opened.record["skip_bad"], show, chosen)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
         found = evaluate(opened, images, truth, show, num, features=features or (), images=most, visible=visible)
         judged = verdict.judge(opened, images, show, scenes, found) if scenes else None

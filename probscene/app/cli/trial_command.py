@@ -8,7 +8,7 @@ import typer
 from probscene.errors import ProbsceneError
 
 from .application import app
-from .options import BoxMargin, Seed
+from .options import BoxMargin, Seed, ValueRange
 
 
 @app.command()
@@ -66,11 +66,13 @@ def trial(
     ] = None,
     resamples: Annotated[int, typer.Option(metavar="N", help="Of test images and seeds, for intervals.")] = 1000,
     workers: Annotated[int, typer.Option(metavar="W", help="Processes; the results do not depend on it.")] = 1,
+    value_range: ValueRange = None,
 ) -> None:
     """Say what labelled sets are worth: train one detector on each, test it on labelled real images."""
     from rich.console import Console
 
     from ..api import calls
+    from ..arguments import range_given
     from ..trial.tables import show
     from ..trial.trial import Budget
 
@@ -103,6 +105,7 @@ def trial(
         baselines=baseline or (),
         resamples=resamples,
         workers=workers,
+        value_range=range_given(value_range),
     )
     show(found, Console(highlight=False))
     print(f"All figures are in {out / 'results.json'}, the picture is {out / 'results.png'}")

@@ -257,4 +257,5 @@ def open_target(run: RunFolder, progress: Progress) -> Images:
         model.channels,
         run.record["skip_bad"],
         lambda done, total: progress("reading", done, total, ""),
+        run.record.get("value_range"),
     )

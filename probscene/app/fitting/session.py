@@ -5,11 +5,13 @@
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import probscene
 from probscene.dataset import Images
+from probscene.decoding import checked_range
 from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.inference.features.base import Features
 from probscene.inference.training import batch_seed
@@ -65,6 +67,7 @@ def begin(
     make: type[RunFolder] = RunFolder,
     labels: Path | None = None,
     photographs: Preset | None = None,
+    value_range: Sequence[float] | None = None,
 ) -> tuple[RunFolder, Images]:
     """A new run; nothing is written before the model, the target and every image in it are found to be good.
 
@@ -75,6 +78,7 @@ def begin(
         make: the class of the run.
         labels: of some of the target's images, see ``read_few``.
         photographs: the preset to take instead where there are labels, or the target looks unlike renders.
+        value_range: of images of 16 bits, see ``ImageFolder``.
 
     Raises:
         ProbsceneError: a number of threads that is not positive, labels for features that take none; see also
@@ -84,7 +88,7 @@ def begin(
         raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
     check_free(out)
     loaded = checked_model(model, assets)
-    images = open_images(target, loaded, skip_bad, show)
+    images = open_images(target, loaded, skip_bad, show, value_range)
     check_target(images)
     if photographs is not None:
         preset = _suited(preset, photographs, loaded, images, labels is not None, show)
@@ -101,6 +105,8 @@ def begin(
         "preset": dataclasses.asdict(preset),
         "guide": preset.guide_settings(),
     }
+    if images.value_range is not None:
+        record["value_range"] = list(images.value_range)
     if files:
         record["parts"] = {str(file): file_digest(file) for file in sorted(files)}
     # Built before the folder is, so that a wrong one leaves none behind.
@@ -137,8 +143,9 @@ def resume(
 
     Args:
         model, target, preset, assets, settings: what the run must have been begun with, where it is not None; the
-            settings are ``seed``, ``skip_bad`` and ``threads``. A model and images in memory are taken as they are;
-            files may lie elsewhere by now, as may a folder of assets, and the run then knows them by their new place.
+            settings are ``seed``, ``skip_bad``, ``threads`` and ``value_range``. A model and images in memory are taken
+            as they are; files may lie elsewhere by now, as may a folder of assets, and the run then knows them by their
+            new place.
         parts: what the user brought as objects.
         make: the class of the run.
         labels: those that it was begun with, where they are not None; they, too, may lie elsewhere.
@@ -158,6 +165,8 @@ def resume(
         "labels": None if labels is None else str(Path(labels).resolve()),
         **settings,
     }
+    if given.get("value_range") is not None:
+        given["value_range"] = list(checked_range(given["value_range"]))
     given = {key: value for key, value in given.items() if value is not None}
     begun = {**run.record, "labels": run.record.get("labels", {}).get("path")}
     known = {key: begun.get(key) for key in given}
@@ -180,7 +189,7 @@ def resume(
     if run.is_finished:
         return run, None
     if images is None and run.record["target"] is None and target is not None:
-        images = open_images(target, run.model, run.record["skip_bad"], show)
+        images = open_images(target, run.model, run.record["skip_bad"], show, run.record.get("value_range"))
     elif images is None:
         if isinstance(place := run.record["target"], str) and not Path(place).exists():
             raise RunError(
@@ -278,7 +287,7 @@ def _relocate(
     place = None if target is None else lasting_target(target)
     if target is None or place is None or place == record["target"] or "target_sha256" not in record:
         return None
-    images = open_images(target, run.model, record["skip_bad"], show)
+    images = open_images(target, run.model, record["skip_bad"], show, record.get("value_range"))
     if images.fingerprint == record["target_sha256"]:
         record["target"] = place
     return images

@@ -16,10 +16,10 @@ from pathlib import Path
 from string import Template
 from typing import NamedTuple
 
-from PIL import Image, ImageOps
+from PIL import Image
 
 from probscene.dataset import Images
-from probscene.decoding import eight_bit
+from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
 from ..files import make_folder, write_text, write_whole
@@ -143,8 +143,7 @@ def _picture(target: Images, row: int) -> bytes:
     """What a model sees of an image, as sharp as its file is, as JPEG."""
     file, seen = target.paths[row], target.windows[row]
     if file.is_file():
-        with Image.open(file) as opened:
-            picture = eight_bit(ImageOps.exif_transpose(opened))
+        picture = Image.fromarray(read_rgb(file, target.value_range))
     else:
         picture, seen = Image.fromarray(target.load(row).permute(1, 2, 0).squeeze(2).numpy()), None
     if seen is not None:

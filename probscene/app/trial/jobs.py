@@ -43,6 +43,7 @@ class Job(NamedTuple):
         digests: by row, what its trainings depend on.
         last: the share of the presentations that the last of several stages has.
         chain: every row goes on from the detector of the row before.
+        value_range: of images of 16 bits, see ``decoding.read_rgb``.
     """
 
     out: Path
@@ -57,6 +58,7 @@ class Job(NamedTuple):
     seed: int
     last: float
     chain: bool
+    value_range: tuple[float, float] | None = None
 
     def run(self, workers: int, progress: Callable[[int, int], None]) -> None:
         """Do what is missing; ``progress`` hears of presentations done, and of all.
@@ -101,8 +103,10 @@ class Job(NamedTuple):
                     if row:
                         before = self._weights(names[row - 1], s)
                         detector.load_state_dict(safetensors.torch.load_file(before))
-                train(detector, self.stages(name, s, rate), self.recipe, self.size, (self.seed, s), shown)
-            found = [detect(detector, example.path, self.size, self.recipe.first) for example in self.test]
+                stages = self.stages(name, s, rate)
+                train(detector, stages, self.recipe, self.size, (self.seed, s), shown, self.value_range)
+            like = self.size, self.recipe.first, self.value_range
+            found = [detect(detector, example.path, *like) for example in self.test]
             if self.chain and row + 1 < len(names):
                 state = {key: value.contiguous() for key, value in detector.state_dict().items()}
                 write_whole(self._weights(name, s), partial(safetensors.torch.save_file, state))

@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from probscene.dataset import SUFFIXES
+from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
 from ..labelling.annotations import Annotated, Annotation
@@ -132,16 +132,12 @@ def read_set(
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Its pixels ``(H, W, 3)``, RGB, as they are in the file.
+    """Its pixels ``(H, W, 3)``, see ``decoding.read_rgb``.
 
     Raises:
         DataError: it is missing or cannot be decoded.
     """
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        reason = "a file that cannot be decoded" if path.is_file() else "none"
-        raise DataError(f"Expected a PNG or JPEG image at {path}, actual {reason}.")
-    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    return read_rgb(path)
 
 
 def digest_of(found: LabelledSet) -> str:

@@ -15,10 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from probscene.decoding import read_rgb
 from probscene.errors import ProbsceneError
 
 from .detector import Recipe, pretrained_part
-from .sets import Example, read_image
+from .sets import Example
 
 SCALES = (0.75, 1.33)  # images are shown at
 SHIFT = 0.1  # of the image's sides
@@ -60,6 +61,7 @@ def train(
     size: tuple[int, int],
     seed: Sequence[int],
     shown: Callable[[int], None] = lambda number: None,
+    value_range: tuple[float, float] | None = None,
 ) -> None:
     """Train in place, stage after stage, each with an optimiser and a schedule of its own.
 
@@ -67,19 +69,31 @@ def train(
         size: height and width at which images come.
         seed: words of it.
         shown: called with the number of presentations of each step.
+        value_range: of images of 16 bits, see ``read_rgb``.
 
     Raises:
         ProbsceneError: the loss is not finite.
     """
-    pictures = Pictures(size)
+    pictures = Pictures(size, value_range)
     for number, stage in enumerate(stages):
         random = np.random.default_rng([*seed, number])
         _run_stage(detector, stage, recipe, pictures, random, shown)
 
 
-def detect(detector: nn.Module, path: Path, size: tuple[int, int], first: int) -> Detections:
-    """What a trained detector finds in an image's file; ``first`` as of its ``Recipe``."""
-    image = read_image(path)
+def detect(
+    detector: nn.Module,
+    path: Path,
+    size: tuple[int, int],
+    first: int,
+    value_range: tuple[float, float] | None = None,
+) -> Detections:
+    """What a trained detector finds in an image's file.
+
+    Args:
+        first: see ``Recipe``.
+        value_range: see ``read_rgb``.
+    """
+    image = read_rgb(path, value_range)
     small, scale = fitted(image, size)
     with torch.no_grad():
         found = detector.eval()([_tensor(small)])[0]
@@ -101,14 +115,14 @@ def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> tuple[NDArray[np.
 class Pictures:
     """Images as they are shown: each is read once, as far as memory goes."""
 
-    def __init__(self, size: tuple[int, int]):
-        self.size, self._kept = size, {}
+    def __init__(self, size: tuple[int, int], value_range: tuple[float, float] | None = None):
+        self.size, self.value_range, self._kept = size, value_range, {}
         self._room = KEPT // (3 * math.prod(size))
 
     def __call__(self, example: Example) -> tuple[NDArray[np.uint8], float]:
         """See ``fitted``."""
         if example.path not in self._kept:
-            found = fitted(read_image(example.path), self.size)
+            found = fitted(read_rgb(example.path, self.value_range), self.size)
             if len(self._kept) >= self._room:
                 return found
             self._kept[example.path] = found

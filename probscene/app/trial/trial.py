@@ -10,12 +10,13 @@ on labelled real images; see ``trial``.
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from probscene.dataset import range_of
 from probscene.errors import DataError, ProbsceneError, RunError
 
 from ..arguments import checked_seed, positive
@@ -86,6 +87,7 @@ def trial(
     baselines: Iterable[str] = (),
     resamples: int = 1000,
     workers: int = 1,
+    value_range: Sequence[float] | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Results:
     """Train, test, compare; the same call goes on after an interruption. Nothing is trained before all is checked.
@@ -103,6 +105,8 @@ def trial(
         baselines: rows that the others are compared with; the first where there is none.
         resamples: of the bootstrap.
         workers: processes; the results do not depend on their number.
+        value_range: of photographs of 16 bits, see ``ImageFolder``; the run's, else what is found in all of them, where
+            None.
         say: hears a note on the sets, before anything is trained.
 
     Raises:
@@ -144,7 +148,15 @@ def trial(
         "format": FORMAT, "classes": list(names), "detector": fingerprint(choice), "recipe": list(recipe),
         "last": budget.last, "chain": budget.chain, "size": list(size), "seed": seed, "test": digest_of(tested),
     }  # fmt: skip
+    if value_range is None and generated is not None:
+        value_range = generated.run.record.get("value_range")
+    files = dict.fromkeys(example.path for found in (tested, *loaded.values()) for example in found.examples)
+    used, notes = range_of(list(files), value_range)
+    if used is not None:
+        shared["value_range"] = list(used)
     _bind(out, shared)
+    for note in notes:
+        say(f"Note: {note}")
     if generated is not None:
         for key, path in _generate(generated, out / "sets", seed, workers, show).items():
             loaded[key] = _read(path, names, show)
@@ -156,7 +168,9 @@ def trial(
         row.name: tuple(tuple((loaded[p.source], p) for p in stage) for stage in row.stages) for row in planned.rows
     }
     digests = _digests(planned, loaded, shared)
-    job = Job(out, choice, recipe, size, names, rows, digests, tested.examples, seeds, seed, budget.last, budget.chain)
+    job = Job(
+        out, choice, recipe, size, names, rows, digests, tested.examples, seeds, seed, budget.last, budget.chain, used
+    )
     for row in planned.rows:
         for s in range(seeds):
             job.is_done(row.name, s)

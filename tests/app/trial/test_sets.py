@@ -77,7 +77,7 @@ def test_faults_of_coco_are_named(folder, how, said):
 
 def test_an_image_that_does_not_decode_is_named(folder):
     (folder / "images" / "001.png").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"001\.png, actual a file that cannot be decoded"):
+    with pytest.raises(DataError, match=r"001\.png, actual a file that is not a PNG, JPEG or TIFF"):
         read_set(folder)
 
 
