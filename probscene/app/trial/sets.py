@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.dataset import SUFFIXES
+from probscene.dataset import is_image
 from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
@@ -176,8 +176,7 @@ def _images(labels: Annotated) -> list[Path]:
 
 def _pictures(folders: Sequence[Path]) -> list[Path]:
     """The image files of folders; hidden ones are none."""
-    files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
-    return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
+    return [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir()) if is_image(file)]
 
 
 def _entries(one: Annotation, of_name: Mapping[str, str | None], kitti: bool) -> Iterable[_Object]:
