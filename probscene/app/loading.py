@@ -147,9 +147,14 @@ def drawn_alike(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def folder_digest(folder: str) -> str:
-    """SHA-256 of the names and bytes in a folder, or of a file's bytes, hexadecimal; of nothing where there is none."""
+    """SHA-256 of the names and bytes in a folder, or of a file's bytes, hexadecimal; of nothing where there is none.
+
+    Hidden files, such as a file manager leaves, are not in it.
+    """
     digest, root = hashlib.sha256(), Path(folder)
     for file in sorted(path for path in (root, *root.rglob("*")) if path.is_file()) if folder else ():
+        if file.name.startswith("."):
+            continue
         digest.update(repr(file.relative_to(folder).parts).encode() + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 

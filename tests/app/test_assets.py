@@ -161,6 +161,13 @@ def test_assets_may_be_a_file(tmp_path):
     assert digests[0] == digests[2] != digests[1]
 
 
+def test_hidden_files_are_no_assets(tmp_path):
+    pictures(tmp_path / "mine")
+    before = folder_digest(str(tmp_path / "mine"))
+    (tmp_path / "mine" / "car" / ".DS_Store").write_bytes(b"left by a file manager")
+    assert folder_digest(str(tmp_path / "mine")) == before
+
+
 def test_a_variable_may_name_another_folder_that_holds_the_same(tmp_path, monkeypatch):
     folder = pictures(tmp_path / "mine")
     monkeypatch.setenv("PROBSCENE_SPRITES", str(folder))

@@ -356,11 +356,14 @@ def test_polygons_without_dents_are_filled(tmp_path):
 def test_a_folder_is_described_by_all_that_it_holds(tmp_path):
     for name in "ab":
         write(tmp_path / name, "car", "a.obj", CAR_OBJ)
+    write(tmp_path / "a", "car", "._a.obj", "left by an archive")
     write(tmp_path / "b", "car", "a.png", "another")
     a, b = (described(tmp_path / name) for name in "ab")
     assert a.startswith(f"meshes in {tmp_path / 'a'} (") and a.split("(")[1] != b.split("(")[1]
+    write(tmp_path / "c", "car", "a.obj", CAR_OBJ)
+    assert described(tmp_path / "c").split("(")[1] == a.split("(")[1]
     with pytest.raises(DataError, match="Expected a folder of meshes"):
-        described(tmp_path / "c")
+        described(tmp_path / "d")
 
 
 def test_a_gltf_that_is_whole_is_read(tmp_path):

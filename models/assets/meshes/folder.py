@@ -102,7 +102,7 @@ def described(path: str | Path) -> str:
     """
     folder(path)
     digest, root = hashlib.sha256(), Path(path)
-    for file in sorted(p for p in root.rglob("*") if p.is_file()):
+    for file in sorted(p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".")):
         data = hashlib.sha256(file.read_bytes()).digest()
         digest.update(file.relative_to(root).as_posix().encode("utf-8", "surrogateescape") + b"\0" + data)
     return f"meshes in {root} ({digest.hexdigest()[:12]})"
