@@ -140,9 +140,17 @@ def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> No
 
 
 def derive_complete(
-    grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int, attempts: int = 100
+    grammar: Grammar,
+    policy: Policy,
+    num_scenes: int,
+    max_steps: int,
+    attempts: int = 100,
+    failed: list[Derivation] | None = None,
 ) -> tuple[Derivation, Tensor]:
     """Derivations that are all complete: what is longer than ``max_steps`` is redrawn (section 3.3). No Pyro sites.
+
+    Args:
+        failed: takes the derivations of the failed attempts, which are not complete.
 
     Returns:
         The derivations, and the failed attempts of each scene ``(N,)`` int64.
@@ -158,6 +166,8 @@ def derive_complete(
                 break
             drawn = _effect(grammar, Choice(grammar, policy, len(todo)), len(todo), max_steps, name=_message(RULE))
             parts.append((todo[drawn.complete], drawn[drawn.complete]))
+            if failed is not None and not drawn.complete.all():
+                failed.append(drawn[~drawn.complete])
             todo = todo[~drawn.complete]
             failures[todo] += 1
     if len(todo):
