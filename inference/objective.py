@@ -9,10 +9,16 @@ divergence between the features of the rendered batch and those of real images [
     sum_i (c_i - b_i) grad log q(T_i) / N,
 
 with the exact marginal over latent vectors in log q; parameters keep their prior, so log q(alpha | T) has no gradient.
-A derivation longer than T_max is redrawn, and the probability that a scene takes more than ``reject_threshold`` failed
-attempts costs ``reject_weight``. How often a scene failed says nothing of the derivation that was accepted, so a term
-in its cost would have no gradient, and the paper's supplement adds it outside the score function, where it has none
-either. But with Z the probability to end, grad Z is Z E grad log q(T) over the derivations that do. So the gradient of
+A derivation longer than T_max is redrawn, so that scenes are samples of q(T) / Z, with Z the probability to end, and
+the gradient of their mean cost is E c (grad log q - grad log Z). A baseline that is the mean of the costs, as with
+leave-one-out, leaves nothing of grad log Z, for Z E grad log q(T) is grad Z; any other leaves E(c - b) grad log Z.
+With those, failed attempts are scored as well, each with the mean of c - b: as there are (1 - Z) / Z of them a scene,
+``sum grad log q(failed) / N`` estimates -grad log Z, whatever scenes cost. The paper takes a moving average and leaves
+the term out: what it descends is another gradient while the average lags behind the costs.
+
+The probability that a scene takes more than ``reject_threshold`` failed attempts costs ``reject_weight``. How often a
+scene failed says nothing of the derivation that was accepted, so a term in its cost would have no gradient, and the
+paper's supplement adds it outside the score function, where it has none either. But the gradient of
 P(failures >= k) = (1 - Z)^k is ``-k (1 - Z)^(k - 1) Z E grad log q(T)``: all advantages less the same number.
 
 That term hardly moves where nearly all scenes end in time. Half the squared number f = (1 - Z) / Z of failed attempts
@@ -61,6 +67,8 @@ class SceneBatch(NamedTuple):
         cost: ``(N,)``.
         advantage: ``(N,)`` cost less baseline, scaled, and what failed attempts cost.
         rejections: mean failed attempts a scene.
+        failed: the F derivations of failed attempts, where the baseline asks for their scores; None for none.
+        failed_advantage: ``(F,)``.
     """
 
     derivation: Derivation
@@ -68,6 +76,8 @@ class SceneBatch(NamedTuple):
     cost: Tensor
     advantage: Tensor
     rejections: float
+    failed: Derivation | None
+    failed_advantage: Tensor
 
 
 def _check(guide: object) -> None:
@@ -100,7 +110,7 @@ class ScoreFunction:
             most ``FAR``, are added to the cost of a scene (not in the paper). Without it, whatever images do not show
             drifts freely, such as the number of cars that are hidden behind others.
         strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
-            several guides learn together; all have one where None.
+            several guides learn together, so that the gradient is that of their own mean cost; all have one where None.
 
     Attributes:
         batch: the last ``SceneBatch``, for logging.
@@ -161,14 +171,17 @@ class ScoreFunction:
         if self.batch is None or self._used == self.updates or not self._drawn_for(self.batch, num_scenes, real):
             self.batch, self._used, self._real = self._draw(model, guide, num_scenes, real), 0, real
         batch = self.batch
-        log_prob = guide.log_prob(batch.derivation)
+        log_prob, advantage = guide.log_prob(batch.derivation), batch.advantage
+        if batch.failed is not None:
+            log_prob = torch.cat([log_prob, guide.log_prob(batch.failed)])
+            advantage = torch.cat([advantage, batch.failed_advantage])
         if self._used == 0:
             self._drawn_with = log_prob.detach()
         self._used += 1
         assert self._drawn_with is not None
         ratio = torch.exp(log_prob - self._drawn_with)
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
-        surrogate = torch.maximum(batch.advantage * ratio, batch.advantage * clipped).mean()
+        surrogate = torch.maximum(advantage * ratio, advantage * clipped).sum() / num_scenes
         return batch.cost.mean() + surrogate - surrogate.detach()
 
     def _drawn_for(self, batch: SceneBatch, num_scenes: int, real: Tensor) -> bool:
@@ -178,10 +191,16 @@ class ScoreFunction:
         return before is real or torch.equal(before, real)  # pyright: ignore[reportArgumentType]
 
     def _costs(
-        self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor
+        self,
+        model: Callable[[int], Any],
+        guide: Guide,
+        num_scenes: int,
+        real: Tensor,
+        failed: list[Derivation] | None = None,
     ) -> tuple[Derivation, Tensor, Tensor, float]:
-        """Scenes of the guide, their features and costs, and the mean number of failed attempts."""
-        derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps)
+        """Scenes of the guide, their features and costs, and the mean number of failed attempts; ``failed`` takes
+        those."""
+        derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps, failed=failed)
         features = self.observe(run_program(model, derivation, failures=failures, density=False))
         cost = self.divergence(features, real)
         if self.prior is not None and self.prior_kl_weight:
@@ -191,10 +210,20 @@ class ScoreFunction:
 
     def _draw(self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor) -> SceneBatch:
         with torch.no_grad():
-            derivation, features, cost, failed = self._costs(model, guide, num_scenes, real)
-            strata = torch.zeros(len(cost), dtype=torch.int64) if self.strata is None else self.strata(derivation)
-            advantage = self.scale * (cost - self._baseline(cost, strata)) - self._failing(failed)
-            return SceneBatch(derivation, features, cost, advantage, failed)
+            attempts: list[Derivation] | None = None if self.baseline == "leave_one_out" else []
+            derivation, features, cost, rejections = self._costs(model, guide, num_scenes, real, attempts)
+            strata = self._strata(derivation)
+            above = self.scale * (cost - self._baseline(cost, strata))
+            failed, of_failed = None, above[:0]
+            if attempts:
+                places = torch.arange(sum(map(len, attempts))).split([len(some) for some in attempts])
+                failed = Derivation.merged(guide.grammar, list(zip(places, attempts, strict=True)))
+                of_failed = _means(above, strata, self._strata(failed))
+            advantage = above - self._failing(rejections)
+            return SceneBatch(derivation, features, cost, advantage, rejections, failed, of_failed)
+
+    def _strata(self, derivation: Derivation) -> Tensor:
+        return torch.zeros(len(derivation), dtype=torch.int64) if self.strata is None else self.strata(derivation)
 
     def _failing(self, failed: float) -> float:
         """What is taken off all advantages where scenes failed so often in the mean."""
@@ -220,3 +249,10 @@ class ScoreFunction:
         before = self.averages.get(stratum)
         self.averages[stratum] = new if before is None else self.decay * new + (1 - self.decay) * before
         return self.averages[stratum]
+
+
+def _means(values: Tensor, strata: Tensor, wanted: Tensor) -> Tensor:
+    """The mean of ``values (N,)`` in each of the ``wanted (F,)`` strata; 0 where there is none."""
+    size = 1 + int(torch.maximum(strata.max(), wanted.max()))
+    total = values.new_zeros(size).index_add(0, strata, values)
+    return (total / strata.bincount(minlength=size).clamp(min=1))[wanted]

@@ -12,6 +12,7 @@ import pyro
 import torch
 from pyro.ops.provenance import detach_provenance, get_provenance, track_provenance
 from pyro.poutine.indep_messenger import IndepMessenger
+from pyro.poutine.mask_messenger import MaskMessenger
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.runtime import _PYRO_STACK, effectful
 from torch import Tensor
@@ -78,11 +79,12 @@ def derive(
         name: of its sites, before ``_0``. A program that derives several times names all but one, which is that of the
             ``SceneModel``.
         static: make ``max_steps`` sites in every call, masked after the last rule, for what needs the same sites in
-            every call: ``Predictive`` and autoguides.
+            every call, such as autoguides. Where no density is asked for, as in ``Predictive``, it is so without
+            asking, and there are columns for the most nodes that such a derivation can have.
 
     Raises:
-        ModelError: it is called under a plate of another shape, for vectorised particles or enumeration in parallel; a
-            handler gives a rule that does not expand the nonterminal.
+        ModelError: it is called under a plate of another shape, for vectorised particles or enumeration; a handler
+            gives a rule that does not expand the nonterminal.
     """
     if _unheard() and not static:
         return _effect(grammar, Choice(grammar, policy, num_scenes), num_scenes, max_steps, name=_message(name))
@@ -95,13 +97,18 @@ def derive(
         active, done = frontier.symbol < len(grammar.nonterminals), t + 1
         allowed = track_provenance(masked(grammar, logits, frontier, policy.support), before)
         rule = RuleCategorical(logits=allowed.unsqueeze(-2), validate_args=False)
-        value = pyro.sample(f"{name}_{t}", rule.mask(active.unsqueeze(-1)))
+        with _Sampled():
+            value = pyro.sample(f"{name}_{t}", rule.mask(active.unsqueeze(-1)))
         before |= get_provenance(value)
         value = detach_provenance(value)
         _check(grammar, f"{name}_{t}", value, frontier)
         return value.squeeze(-1)
 
     derivation = _effect(grammar, of_tensors(choose), num_scenes, max_steps, name=_message(name))
+    given = done == 0  # by a handler
+    if _without_density():
+        static = not given
+        derivation = derivation.padded(grammar, 0, max_steps * grammar.objects.shape[1])
     for t in range(done, max_steps if static else done):
         nothing = RuleCategorical(logits=torch.zeros(num_scenes, 1, len(grammar.rules)), validate_args=False)
         pyro.sample(f"{name}_{t}", nothing.mask(torch.zeros(num_scenes, 1, dtype=torch.bool)))
@@ -116,6 +123,24 @@ def _message(name: str) -> str:
 def _unheard() -> bool:
     """Whether nothing but plates would hear of a site."""
     return all(isinstance(handler, IndepMessenger) for handler in _PYRO_STACK)
+
+
+def _without_density() -> bool:
+    """Whether all densities are masked, as in ``Predictive``, which stacks the values of many calls."""
+    return any(isinstance(handler, MaskMessenger) and handler.mask is False for handler in _PYRO_STACK)
+
+
+class _Sampled(Messenger):
+    """Sees that a rule's site is not to be enumerated one value after the other, which Pyro does with one value in all
+    scenes."""
+
+    def _pyro_post_sample(self, msg):
+        if msg["infer"].get("enumerate") == "sequential":
+            raise ModelError(
+                f"Expected site {msg['name']!r} to be sampled, actual sequential enumeration; for a sum over "
+                "structures take enumerate_derivations(grammar, max_steps), and to enumerate other sites name them "
+                "alone: pyro.sample(..., infer={'enumerate': 'parallel'})."
+            )
 
 
 def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> None:
@@ -140,9 +165,17 @@ def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> No
 
 
 def derive_complete(
-    grammar: Grammar, policy: Policy, num_scenes: int, max_steps: int, attempts: int = 100
+    grammar: Grammar,
+    policy: Policy,
+    num_scenes: int,
+    max_steps: int,
+    attempts: int = 100,
+    failed: list[Derivation] | None = None,
 ) -> tuple[Derivation, Tensor]:
     """Derivations that are all complete: what is longer than ``max_steps`` is redrawn (section 3.3). No Pyro sites.
+
+    Args:
+        failed: takes the derivations of the failed attempts, which are not complete.
 
     Returns:
         The derivations, and the failed attempts of each scene ``(N,)`` int64.
@@ -158,6 +191,8 @@ def derive_complete(
                 break
             drawn = _effect(grammar, Choice(grammar, policy, len(todo)), len(todo), max_steps, name=_message(RULE))
             parts.append((todo[drawn.complete], drawn[drawn.complete]))
+            if failed is not None and not drawn.complete.all():
+                failed.append(drawn[~drawn.complete])
             todo = todo[~drawn.complete]
             failures[todo] += 1
     if len(todo):

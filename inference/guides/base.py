@@ -5,6 +5,8 @@ score function nor maximum likelihood needs a bound (Meta-Sim2, section 3.3).
 """
 
 import math
+from collections.abc import Callable
+from typing import Any, Self
 
 import pyro
 import pyro.distributions as dist
@@ -13,12 +15,39 @@ from torch import Tensor, nn
 
 from probscene.derivation import Derivation
 from probscene.derive import derive
+from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.policy import Policy, rule_log_probs
 from probscene.support import Support
 
 
-class Guide(nn.Module, Policy):
+class GuideModule(nn.Module):
+    """A module that Pyro learns: it is pickled, saved and copied as any other, and stays on the CPU."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        for parameter in self.parameters():  # Pyro's weak references cannot be pickled; it makes them when it reads
+            vars(parameter).pop("unconstrained", None)
+        return self.__dict__
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What ``to``, ``cuda`` and ``double`` do to all tensors.
+
+        Raises:
+            ModelError: it moves them to another device.
+        """
+        try:
+            device = fn(torch.zeros(0)).device.type
+        except (RuntimeError, AssertionError):  # there is no such device
+            device = "another device, which this machine lacks"
+        if device != "cpu":
+            raise ModelError(
+                f"Expected a guide on the CPU, where structures are derived and learnt, actual {device}; leave the "
+                "guide there."
+            )
+        return super()._apply(fn, recurse)
+
+
+class Guide(GuideModule, Policy):
     """A policy that learns, and a Pyro program: ``guide(num_scenes)`` derives scenes inside the plate ``"scenes"``.
 
     Args:

@@ -24,12 +24,13 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.request import Renderable
 
+from ..guides.base import GuideModule
 from .graph import Graph, Seen
 from .net import ParameterNet
 from .sites import NEAR, Site, site_name
 
 
-class ParameterGuide(nn.Module):
+class ParameterGuide(GuideModule):
     """Parameters of a model's sites, learnt; also a Pyro program, ``guide(num_scenes)``, over structure and parameters.
 
     Args:

@@ -1,7 +1,9 @@
 """What a Pyro user does with a program that derives: traces, inference, inspection, saving."""
 
+import copy
 import io
 import pickle
+from functools import partial
 
 import pyro
 import pyro.distributions as dist
@@ -18,7 +20,14 @@ from probscene.enumeration import enumerate_derivations
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.inference.guides.lstm import make_guide
+from probscene.inference.guides.scenario import ScenarioGuide
+from probscene.inference.objective import ScoreFunction
+from probscene.inference.parameters.guide import ParameterGuide
+from probscene.inference.parameters.meta_sim.transform import ParameterTransform
+from probscene.inference.parameters.sites import find_sites
+from probscene.models.multi_mnist import MODEL
 from probscene.policy import Policy
+from probscene.scenarios import JointGrammar, join
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, weights
 
@@ -59,6 +68,27 @@ def test_predictive_draws_one_program_many_times():
     number = ((rules == 1).cumprod(1) if rules[0, 0] == 1 else (rules[:, 1:] == 1).long().cumprod(1)).sum(1)
     share = number.bincount(minlength=4) / 600
     assert (share - 0.25).abs().max() < 0.08
+
+
+def drawn_often(model, *args):
+    found = Predictive(model, num_samples=40)(*args)
+    assert all(len(values) == 40 for values in found.values())
+    return {name: tuple(values.shape[1:]) for name, values in found.items()}
+
+
+def test_predictive_needs_no_static():
+    """Of what derives, of a guide, of parameters on nodes; of a scene model, and of one of several scenarios."""
+    pyro.clear_param_store()
+    torch.manual_seed(0)
+    rules = {f"rule_{t}": (N, 1) for t in range(MAX_STEPS)}
+    assert drawn_often(structure) == rules
+    assert drawn_often(make_guide("lstm", GRAMMAR, MAX_STEPS), N) == rules
+    assert drawn_often(measured) == rules | {"left": (1, 1), "plate.x": (N, MAX_STEPS), "read": (N, MAX_STEPS)}
+    assert drawn_often(measured, None, True, MAX_NODES)["plate.x"] == (N, MAX_NODES)
+    found = drawn_often(MODEL, 2)
+    assert sum(name.startswith("rule_") for name in found) == MODEL.max_steps
+    two = join("two", {"one": MODEL, "other": MODEL})
+    assert {f"{scenario}/digit.x" for scenario in ("one", "other")} <= set(drawn_often(two, 2))
 
 
 def test_static_sites_after_the_end_count_nothing():
@@ -137,6 +167,26 @@ def without_its_dim():
         derive(GRAMMAR, PRIOR, N, MAX_STEPS)
 
 
+@pytest.mark.parametrize("num_scenes", [1, N])
+@pytest.mark.parametrize("static", [False, True])
+def test_sequential_enumeration_says_what_to_do(num_scenes, static):
+    loss, enumerated = TraceEnum_ELBO(max_plate_nesting=2), config_enumerate(structure, "sequential")
+    for model, guide in ((enumerated, lambda *_: None), (structure, enumerated)):
+        with pytest.raises(ModelError, match="'rule_0' to be sampled, actual sequential .*enumerate_derivations"):
+            loss.loss(model, guide, num_scenes, static)
+
+
+def test_other_sites_are_enumerated_beside_rules():
+    def program():
+        structure()
+        side = pyro.sample("side", dist.Categorical(torch.tensor([0.3, 0.7])), infer={"enumerate": "parallel"})
+        pyro.sample("seen", dist.Normal(side.float(), 1.0), obs=torch.tensor(0.2))
+
+    found = TraceEnum_ELBO(max_plate_nesting=2).loss(program, lambda: structure())
+    normal = dist.Normal(torch.tensor([0.0, 1.0]), 1.0).log_prob(torch.tensor(0.2))
+    assert found == pytest.approx(-float((torch.tensor([0.3, 0.7]).log() + normal).logsumexp(0)))
+
+
 @pytest.mark.parametrize("run", [particles, enumerated, in_parallel, without_its_dim])
 def test_what_has_no_one_rule_a_scene_says_what_to_do(run):
     with pytest.raises(ModelError, match=r"one rule a scene, actual .*dim=-2.*enumerate_derivations") as caught:
@@ -201,16 +251,78 @@ def test_what_depends_on_what_can_be_drawn():
     assert found["plate_sample"]["nodes"] == ["plate.x", "read"]
 
 
-@pytest.mark.parametrize("kind", ["lstm", "pcfg", "grammar-vae"])
-def test_guides_are_saved_by_pickle_and_torch(kind):
-    guide = make_guide(kind, GRAMMAR, MAX_STEPS)
-    copies = [pickle.loads(pickle.dumps(guide))]
+def pickled(guide):
+    return pickle.loads(pickle.dumps(guide))
+
+
+def saved(guide):
     with io.BytesIO() as file:
         torch.save(guide, file)
         file.seek(0)
-        copies.append(torch.load(file, weights_only=False))
-    for copy in copies:
-        assert torch.equal(copy.log_prob(GIVEN), guide.log_prob(GIVEN))
+        return torch.load(file, weights_only=False)
+
+
+def joint_guide():
+    return ScenarioGuide(JointGrammar({"tables": GRAMMAR, "skies": OTHER.grammar}), MAX_STEPS + 1, hidden=4)
+
+
+GUIDES = {kind: partial(make_guide, kind, GRAMMAR, MAX_STEPS) for kind in ("lstm", "pcfg", "grammar-vae")}
+GUIDES["scenarios"] = joint_guide
+
+
+@pytest.mark.parametrize("keep", [pickled, saved, copy.deepcopy])
+@pytest.mark.parametrize("make", GUIDES.values(), ids=GUIDES)
+def test_a_guide_that_svi_has_learnt_is_saved_and_goes_on(make, keep):
+    pyro.clear_param_store()
+    guide = make()
+
+    def program(num_scenes):
+        with pyro.plate("scenes", num_scenes, dim=-2):
+            derivation = derive(guide.grammar, StructurePrior(guide.grammar), num_scenes, guide.max_steps)
+            return SceneGraph(guide.grammar, derivation).draw()
+
+    derivations = enumerate_derivations(guide.grammar, guide.max_steps)
+    objective = ScoreFunction(lambda scenes: scenes.derivation.lengths.unsqueeze(1).float(), lambda g, _: g.sum(1))
+    learn = SVI(program, guide, pyro.optim.Adam({"lr": 0.1}), objective)
+    untrained = guide.log_prob(derivations)
+    for _ in range(2):
+        learn.step(8, real=None)
+        kept = keep(guide)
+        assert torch.equal(kept.log_prob(derivations), guide.log_prob(derivations))
+    assert not torch.allclose(untrained, guide.log_prob(derivations))
+    before = kept.log_prob(derivations)
+    learn.step(8, real=None)
+    assert torch.equal(kept.log_prob(derivations), before)
+
+
+@pytest.mark.parametrize("make", [ParameterGuide, ParameterTransform])
+@pytest.mark.parametrize("keep", [pickled, saved, copy.deepcopy])
+def test_a_guide_of_parameters_is_saved_after_a_step(make, keep):
+    pyro.clear_param_store()
+    torch.manual_seed(0)
+    structure = make_guide("pcfg", MODEL.grammar, MODEL.max_steps)
+    guide = make(MODEL, tuple(site for site in find_sites(MODEL) if not site.keeps), structure)
+    svi = SVI(lambda n: MODEL.program(n, MODEL.prior), guide, pyro.optim.Adam({"lr": 0.1}), Trace_ELBO())
+    svi.step(4)
+    kept = keep(guide)
+    assert all(torch.equal(*pair) for pair in zip(kept.parameters(), guide.parameters(), strict=True))
+    drawn = []
+    for each in (guide, kept):
+        torch.manual_seed(1)
+        drawn.append(poutine.trace(each.program).get_trace(4, each.structure).log_prob_sum())
+    assert torch.equal(*drawn)
+
+
+@pytest.mark.parametrize("move", [lambda guide: guide.to("meta"), lambda guide: guide.cuda(),
+                                  lambda guide: torch.nn.Sequential(guide).to("cuda")])  # fmt: skip
+@pytest.mark.parametrize("kind", ["lstm", "pcfg"])
+def test_guides_stay_on_the_cpu(kind, move):
+    guide = make_guide(kind, GRAMMAR, MAX_STEPS)
+    with pytest.raises(
+        ModelError, match=r"Expected a guide on the CPU, .*, actual (meta|cuda|another device.*); leave"
+    ):
+        move(guide)
+    guide.double().to("cpu").log_prob(GIVEN)
 
 
 def test_a_prior_is_saved_by_pickle():

@@ -13,18 +13,19 @@ from typing import Any
 import pyro
 import torch
 from pyro.poutine.messenger import Messenger
-from torch import Tensor, nn
+from torch import Tensor
 
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.request import Renderable
 
+from ...guides.base import GuideModule
 from ..graph import Graph, Seen
 from ..sites import NEAR, Site, of_scenes
 from .network import GraphNetwork
 
 
-class ParameterTransform(nn.Module):
+class ParameterTransform(GuideModule):
     """Parameters of a model's sites, moved; also a Pyro program, ``transform(num_scenes)``, over structure and
     parameters.
 

@@ -30,6 +30,7 @@ from ..trial.results import Results
 from ..views import comparison as comparison_picture
 from ..views import report as reporting
 from ..workers.cluster import connected
+from ..workers.processes import end_if_starting
 
 
 def render(model: SceneModel, scenes: Scenes, threads: int | None = None) -> RenderBatch:
@@ -79,6 +80,7 @@ def generate(
     Raises:
         ProbsceneError: see ``generate_run``.
     """
+    end_if_starting()
     with display(progress) as show:
         said = show.stage("generating")
         if not isinstance(source, RunFolder | SceneModel) and not is_run(str(source)):
@@ -251,6 +253,7 @@ def trial(
     Raises:
         ProbsceneError: see ``trial.trial``.
     """
+    end_if_starting()
     made = None
     if run is not None:
         opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))

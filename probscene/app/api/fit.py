@@ -24,6 +24,7 @@ from ..loading import load_model
 from ..targets import Target
 from ..walls.warn import tell
 from ..workers.cluster import connected
+from ..workers.processes import end_if_starting
 from .calls import display
 from .run import Run, parts_of
 
@@ -95,6 +96,7 @@ def fit(
             stays, and ``resume=True`` goes on with it.
     """
     settings = with_learn(settings, learn, parameters)
+    end_if_starting()
     chosen, parts = chosen_preset(preset, features, divergence, guide, settings)
     other = preset_for_photographs(preset, features, divergence, guide, settings)
     if renderer is not None:

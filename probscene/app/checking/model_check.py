@@ -11,7 +11,7 @@ import pyro
 import torch
 from torch import Tensor
 
-from probscene.batch import RenderBatch
+from probscene.batch import RenderBatch, Renderer
 from probscene.checks import Report, check
 from probscene.errors import MachineError, ProbsceneError
 from probscene.inference.features.counting.net import CountNet
@@ -21,6 +21,7 @@ from probscene.sampling import Scenes, run_program, sample
 
 from ..chunks import chunk_randomness
 from ..loading import renderer_for
+from . import randomness
 from .watch import Watch, longer, lookups, shorter, watched
 
 SCENES, RENDERED = 256, 32  # how many scenes the program is run on, and how many of them are rendered
@@ -79,13 +80,17 @@ def check_program(model: SceneModel, scenes: int, rendered: int) -> Findings:
             wrong = [*_not_finite(drawn), *_parameters(set(store.keys()) - known)]
             if wrong:
                 return Findings(wrong, [], {})
-            batches = _rendered(model, drawn, rendered)
+            with told(f"the renderer of model {model.name!r}", model.renderer):
+                render = renderer_for(model)
+                batches = _rendered(model, render, drawn, rendered)
+                few = drawn[0].derivation[_telling(model, drawn[0], randomness.SCENES)]
+                random = randomness.beside_sites(model, few, render)
         except MachineError:
             raise
         except ProbsceneError as error:
             return Findings(shorter(model, watch) or [str(error)], [], {})
     faults, warnings = _seen(model, batches)
-    faults += shorter(model, watch)
+    faults += [*shorter(model, watch), *random]
     warnings += [*longer(model, watch), *lookups(model, watch, drawn[0]), *_colours(model, drawn[0])]
     return Findings(faults, warnings, {name: _sizes(model.grammar.kind(name), batches) for name in model.classes})
 
@@ -113,14 +118,14 @@ def _parameters(names: set[str]) -> list[str]:
     ]
 
 
-def _rendered(model: SceneModel, drawn: list[Scenes], rendered: int) -> list[tuple[Tensor, RenderBatch]]:
+def _rendered(
+    model: SceneModel, render: Renderer, drawn: list[Scenes], rendered: int
+) -> list[tuple[Tensor, RenderBatch]]:
     """The kinds ``(N, M)`` that were derived and what is seen of them, for a part of each policy's scenes."""
-    with told(f"the renderer of model {model.name!r}", model.renderer):
-        render = renderer_for(model)
-        found = []
-        for scenes in drawn:
-            some = scenes.derivation[_telling(model, scenes, -(-rendered // len(drawn)))].trimmed()
-            found.append((some.kind, render(run_program(model, some).drawing)))
+    found = []
+    for scenes in drawn:
+        some = scenes.derivation[_telling(model, scenes, -(-rendered // len(drawn)))].trimmed()
+        found.append((some.kind, render(run_program(model, some).drawing)))
     return found
 
 

@@ -144,6 +144,7 @@ def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
         same = {
             "": run.record["model"] == first.record["model"],
             " as another file": run.record["model_sha256"] == first.record["model_sha256"],
+            " with other modules beside it": run.record.get("modules") == first.record.get("modules"),
             " with other assets": drawn_alike(run.record, first.record),
         }
         if not all(same.values()):

@@ -57,6 +57,7 @@ class NetworkCache:
             "torch": torch.__version__,
             "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability(), record["threads"]],
             "model": [record["model"], record["model_sha256"], record["assets"], list(run.model.canvas)],
+            **({"modules": record["modules"]} if "modules" in record else {}),
             "assets": folder_digest(assets_folder(run.model, record.get("assets_folder"))),
             "features": [words[1], repr(run.features) if self.usable and not is_file_part(words[1]) else ""],
             "weights": _digest(state_of(net)),

@@ -3,7 +3,7 @@
 import os
 import shutil
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,6 +19,7 @@ from ..files import make_folder, write_json, write_whole
 from ..labelling.few import FewLabels
 from ..loading import BUILT_IN, assets_record, lasting_reference, load_model, recorded_model, split_reference
 from ..modules import file_digest
+from ..neighbours import neighbours
 from .learnt.parameters import apart, with_parameters
 from .parts import (
     IN_MEMORY,
@@ -35,6 +36,7 @@ from .parts import (
 from .preset import Preset
 from .storage import FORMAT, Storage, check_free, load_state, read_record
 
+WHOLE_MODEL = "model"  # folder
 PRIOR_KEPT = "prior_kept"  # the only tensor of a guide that was given up
 
 
@@ -84,19 +86,26 @@ class RunFolder(Storage):
         check_free(path := Path(path))
         if isinstance(model, SceneModel):
             reference, file, digest, loaded = f"{IN_MEMORY}{model.name}", None, None, model
+            beside = {}
         else:
             loaded = loaded or load_model(model, assets)
             reference, name = lasting_reference(model), split_reference(model)[0]
             file = None if name in BUILT_IN else Path(name)
             digest = None if file is None else file_digest(file)
+            beside = {} if file is None else neighbours(file)
         make_folder(path)
         about: dict[str, Any] = {"format": FORMAT, "model": reference, "model_sha256": digest}
+        if beside:
+            about["modules"] = {name: file_digest(each) for name, each in beside.items()}
         about |= assets_record(loaded, assets)
         about |= {"within_support": not record.get("preset", {}).get("on_prior")}
         run = cls(path, record | about, loaded, parts)
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
         if file is not None:
             write_whole(path / "model.py", lambda temporary: shutil.copyfile(file, temporary))
+            for name, each in {file.name: file, **beside}.items() if beside else ():
+                make_folder((path / WHOLE_MODEL / name).parent)
+                write_whole(path / WHOLE_MODEL / name, partial(shutil.copyfile, each))
         return run
 
     @classmethod
@@ -122,7 +131,10 @@ class RunFolder(Storage):
         if self._model is None:
             reference = self.record["model"]
             self.check_objects("model")
-            self._unchanged(Path(split_reference(reference)[0]), self.record["model_sha256"], "model")
+            file = Path(split_reference(reference)[0])
+            self._unchanged(file, self.record["model_sha256"], "model")
+            for name, digest in self.record.get("modules", {}).items():
+                self._unchanged(file.parent / name, digest, "model's")
             self._model = recorded_model(self.record, self.path)
         if self.record.get("preset", {}).get("on_prior") and self._model.pretraining is not None:
             self._model = replace(self._model, pretraining=None)
@@ -265,14 +277,17 @@ class RunFolder(Storage):
 
     def _unchanged_part(self, word: str) -> None:
         if is_file_part(word):
-            self._unchanged(part_file(word), self.record.get("parts", {}).get(str(part_file(word))), "part's")
+            parts = self.record.get("parts", {})
+            for file in (part_file(word), *neighbours(part_file(word)).values()):
+                self._unchanged(file, parts.get(str(file)), "part's")
 
     def _unchanged(self, file: Path, digest: str | None, what: str) -> None:
         if digest is not None and (not file.is_file() or file_digest(file) != digest):
+            copy = self.path / (WHOLE_MODEL if self.record.get("modules") else "model.py")
             kept = (
-                f"A copy is in {self.path / 'model.py'}: put it back, or fit again. Where the file only lies elsewhere "
+                f"A copy is in {copy}: put it back, or fit again. Where the file only lies elsewhere "
                 f"by now, probscene fit FILE --out {self.path} --resume tells the run so."
-                if what == "model"
+                if what.startswith("model")
                 else ""
             )
             raise RunError(

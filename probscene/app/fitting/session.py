@@ -24,7 +24,8 @@ from ..checking.model_check import QUICK, check_model
 from ..files import write_json
 from ..labelling.few import FewLabels, labels_record, read_few
 from ..loading import drawn_with, folder_digest, lasting_reference, load_model, split_reference
-from ..modules import file_digest
+from ..modules import file_digest, module_digests
+from ..neighbours import neighbours
 from ..progress import Display
 from ..targets import Target, lasting_target, open_images, say_notes
 from ..workers.cluster import Cluster
@@ -108,6 +109,7 @@ def begin(
     if images.value_range is not None:
         record["value_range"] = list(images.value_range)
     if files:
+        files |= {each for file in files for each in neighbours(file).values()}
         record["parts"] = {str(file): file_digest(file) for file in sorted(files)}
     # Built before the folder is, so that a wrong one leaves none behind.
     run = make(out, record, loaded, parts)
@@ -275,6 +277,8 @@ def _relocate(
     if isinstance(model, str) and lasting_reference(model) != record["model"]:
         (file, names), (_, begun) = split_reference(model), split_reference(record["model"])
         if names != begun or not Path(file).is_file() or file_digest(Path(file)) != record["model_sha256"]:
+            return None
+        if module_digests(Path(file)) != record.get("modules", {}):
             return None
         record["model"] = lasting_reference(model)
     if assets is not None and folder_digest(os.path.abspath(assets)) == record.get("assets_sha256"):

@@ -2,6 +2,7 @@
 
     run.json               the configuration, the model, the target, the version that wrote it
     model.py               a copy of the model's file, where it is not a built-in one
+    model/                 the same under its own name with the modules that it imports from beside it, where it does
     guide.safetensors      the learnt guide; there once the fit is finished
     guide-first.safetensors
                            the guide before parameters were learnt, where they are

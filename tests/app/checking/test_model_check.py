@@ -8,14 +8,20 @@ import pyro.distributions as dist
 import pytest
 import torch
 
-from probscene.app.checking.model_check import check_model
+from probscene.app.checking.model_check import QUICK, check_model
+from probscene.app.checking.randomness import beside_sites
 from probscene.app.loading import load_model
 from probscene.drawing import Sprites
+from probscene.generator import Command
 from probscene.grammar import Grammar
 from probscene.model import Groups, scene_model
+from probscene.renderers.sprites import SpriteRenderer
+from probscene.request import Objects
+from probscene.sampling import sample
 from probscene.structure import StructurePrior, counts
 
-GOOD = (Path(__file__).parents[1] / "discs.py").read_text(encoding="utf-8")
+DISCS = Path(__file__).parents[1] / "discs.py"
+GOOD = DISCS.read_text(encoding="utf-8")
 X = 'x = pyro.sample("x", dist.Uniform(8.0, 56.0))'
 BLUE = 'Sprites.disc("blue", x, y, radius=6.0, tint=(0.2, 0.2, 1.0)),'
 FAULTS = {
@@ -84,6 +90,67 @@ def test_a_fault_of_the_program_is_found_before_anything_is_written(fault, call,
     assert not (tmp_path / "run").exists()
     for part in parts:
         assert part in told and part in fitted, (told, fitted)
+
+
+TWICE, RECORDED = "actual other ones where it runs twice with the same seed", "where its sites have the recorded values"
+RANDOM = {  # beside pyro.sample: how far a disc is moved, what says so, and whether one seed still gives one drawing
+    "torch": ("torch.rand(x.shape)", False),
+    "torch's own generator": ("torch.rand(x.shape, generator=OWN)", True),
+    "a distribution": ("dist.Uniform(0.0, 1.0).sample(x.shape)", False),
+    "random": ("random.random()", False),
+    "random of the system": ("random.SystemRandom().random()", True),
+    "numpy": ("np.random.rand()", False),
+    "numpy, fresh": ("torch.tensor(np.random.default_rng().random(x.shape), dtype=x.dtype)", True),
+    "numpy, kept": ("RNG.random()", True),
+    "kept from call to call": ("len(CALLS.append(0) or CALLS) % 7 / 7", True),
+    "the clock": ("time.perf_counter() % 1e-3 * 1e3", True),
+}
+HEAD = """import random, time
+import numpy as np
+import torch
+OWN, RNG, CALLS = torch.Generator(), np.random.default_rng(0), []
+"""
+
+
+@pytest.mark.parametrize("how", RANDOM)
+def test_what_is_random_beside_sites_is_a_fault(how, tmp_path):
+    moved, twice = RANDOM[how]
+    file = written(tmp_path, 'Sprites.disc("red", x,', f'Sprites.disc("red", x + 20 * {moved},')
+    file.write_text(HEAD + file.read_text())
+    faults = check_model(load_model(str(file)), *QUICK).faults
+    (fault,) = [fault for fault in faults if "something random is no site" in fault]
+    assert (TWICE in fault) == twice and RECORDED in fault and "pyro.sample('shift'" in fault
+
+
+def noisy(canvas, threads):
+    inner = SpriteRenderer(canvas, threads)
+
+    def render(drawing):
+        batch = inner(drawing)
+        return batch._replace(image=batch.image + torch.randint_like(batch.image, 3))
+
+    return render
+
+
+def asks_for(chance):
+    grammar = Grammar("Scene -> plate")
+
+    @scene_model(grammar, StructurePrior(grammar), canvas=(32, 32), max_steps=3, classes=("plate",),
+                 generator=Command(["nothing"]))  # fmt: skip
+    def model(scene):
+        return scene.request(Objects("plate", x=torch.rand(scene.kind.shape) if chance else 0.5))
+
+    return model
+
+
+@pytest.mark.parametrize("random", [False, True])
+@pytest.mark.parametrize("who", ["renderer", "request"])
+def test_so_is_what_a_renderer_draws_and_what_a_generator_is_asked_for(who, random):
+    model = asks_for(random) if who == "request" else load_model(str(DISCS))
+    render = noisy(model.canvas, 1) if random else SpriteRenderer(model.canvas, 1)
+    faults = beside_sites(model, sample(model, model.prior, 4).derivation, render)
+    assert [RECORDED in fault for fault in faults] == [True] * random
+    assert [TWICE in fault for fault in faults] == [who == "renderer"] * random
 
 
 IMPORTS = {
