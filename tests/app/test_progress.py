@@ -90,8 +90,9 @@ def logged(reports) -> tuple[list[tuple[float, str]], Display]:
 def test_a_log_file_gets_a_line_every_half_minute(gaps):
     lines, _ = logged([(gap, "structure", i + 1, 1000, "") for i, gap in enumerate(gaps)])
     times = [0.0, *(at for at, _ in lines), sum(gaps)]
-    assert all(later - at < EVERY + max(gaps) for at, later in pairwise(times))
-    assert len(lines) <= sum(gaps) / EVERY  # and no more than that
+    rounded = 1e-6  # of the clock's sums
+    assert all(later - at < EVERY + max(gaps) + rounded for at, later in pairwise(times))
+    assert len(lines) <= (sum(gaps) + rounded) / EVERY  # and no more than that
 
 
 def test_a_line_says_stage_done_of_total_rate_and_time_left():
@@ -127,7 +128,8 @@ def test_a_stages_clock_leaves_out_what_was_loaded_before_it(loading, first, mor
     reports += [(each, "target", first + i, total, "") for i in range(1, more + 1)]
     lines, display = logged(reports)
     assert display.seconds["target"] == pytest.approx(total * each, rel=1e-6)
-    assert lines[-1][1].startswith(f"Target's features: {total} images in {total * each:.1f} s, ")
+    seconds = re.match(rf"Target's features: {total} images in (\d+\.\d) s, ", lines[-1][1])
+    assert seconds is not None and float(seconds[1]) == pytest.approx(total * each, abs=0.051)
 
 
 def test_a_thread_says_it_while_nothing_is_reported(monkeypatch):
@@ -135,7 +137,7 @@ def test_a_thread_says_it_while_nothing_is_reported(monkeypatch):
     out = io.StringIO()
     with Display(Console(file=out, width=80)) as display:
         display("generating", 0, 10)
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while out.getvalue().count("Generating: 0 of 10 images") < 3 and time.monotonic() < deadline:
             time.sleep(0.01)
     said = out.getvalue()

@@ -74,7 +74,7 @@ def test_the_same_bytes_where_names_are_absent(tmp_path):
         run = subprocess.run(
             [sys.executable, script, ROOT / "tests" / "app" / "discs.py", tmp_path / f"out{number}"],
             env={**os.environ, "PYTHONPATH": str(Path(probscene.__file__).parents[1])},
-            capture_output=True, text=True, timeout=300,
+            capture_output=True, text=True,
         )  # fmt: skip
         assert run.returncode == 0, run.stderr
         said.append(run.stdout)

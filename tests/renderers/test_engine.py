@@ -29,7 +29,7 @@ def child(expected):
 
 def _run(code, **environment):
     command = [sys.executable, "-W", "error", "-c", ENGINE + code]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment}, timeout=600)
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment})
     assert done.returncode == 0, done.stderr
     return done.stdout
 

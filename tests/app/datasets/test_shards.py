@@ -52,14 +52,17 @@ def test_shards_at_once_two_of_them_killed_and_run_again(run, tmp_path):
         return subprocess.Popen(shard, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     crew = [start(number) for number in range(shards)]
-    for number in (2, 5):
-        while crew[number].poll() is None and not list(out.glob(f"images/{64 * number:06d}.png")):
-            time.sleep(0.01)
-        crew[number].send_signal(signal.SIGKILL)
+    killed, waiting = (2, 5), {2, 5}
+    while waiting:
+        for number in sorted(waiting):
+            if crew[number].poll() is not None or list(out.glob(f"images/{64 * number:06d}.png")):
+                crew[number].send_signal(signal.SIGKILL)
+                waiting.remove(number)
+        time.sleep(0.01)
     for number, process in enumerate(crew):
-        said, _ = process.communicate(timeout=300)
-        assert process.returncode == (-signal.SIGKILL if number in (2, 5) else 0), said
-    again = [start(number) for number in (2, 5)]
+        said, _ = process.communicate(timeout=300)  # on a busy machine one may end before it is killed
+        assert process.returncode == 0 or (number in killed and process.returncode == -signal.SIGKILL), said
+    again = [start(number) for number in killed]
     for process in again:
         said, _ = process.communicate(timeout=300)
         assert process.returncode == 0 and "without --shard" in said

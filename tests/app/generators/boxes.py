@@ -27,7 +27,7 @@ DRAW = Path(__file__).with_name("draw_boxes.py")
     canvas=(32, 40),
     max_steps=40,
     classes=("plate", "mug"),
-    generator=Command([sys.executable, str(DRAW)], timeout=20.0, start_timeout=20.0),
+    generator=Command([sys.executable, str(DRAW)], timeout=120.0, start_timeout=120.0),
 )
 def boxes(scene):
     """Plates with mugs; pixels."""

@@ -184,9 +184,9 @@ drawing.join(1.5)
 """
     environment = {**os.environ, "TEST_FAULT": program, "TEST_MARK": str(tmp_path)}
     told = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300, check=False
     )
-    folder, until = told.stdout.strip(), time.monotonic() + 10
+    folder, until = told.stdout.strip(), time.monotonic() + 60
     while (left := processes_with(str(tmp_path)) + processes_with(folder)) and time.monotonic() < until:
         time.sleep(0.1)
     for process in left:
@@ -215,11 +215,11 @@ def test_a_program_starts_no_more_once_its_pool_is_closed(command, fault, runnin
 
     drawing = threading.Thread(target=draw)
     drawing.start()
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60
     while len(groups := pool.processes()) < 2 and time.monotonic() < end:
         time.sleep(0.01)
     pool.close()
-    drawing.join(10)
+    drawing.join(60)
     assert said == ["The generator draw_boxes.py was ended while it drew."]
     assert len(groups) == 2 and not any(running(group) for group in groups)
     assert set(pool.processes()) <= set(groups)
@@ -274,6 +274,6 @@ def test_a_process_of_multiprocessing_leaves_nothing(method, command, running):
     out = context.Queue()
     child = context.Process(target=pool_of_a_child, args=(command().argv, out))
     child.start()
-    group, folder = out.get(timeout=60)
+    group, folder = out.get(timeout=300)
     child.join()
     assert child.exitcode == 0 and not running(group) and not os.path.exists(folder)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sklearn.neighbors import NearestNeighbors
@@ -62,14 +62,15 @@ def test_an_outlier_holds_nothing_that_is_far():
     assert outside(images, others, 3).all() and fidelity(images, others, 3).precision == 1
 
 
-@settings(max_examples=10)
-@given(st.integers(0, 2**16), st.sampled_from([1.0, 0.3, 0.1]))
-def test_balls_are_empty_as_often_as_theory_says(seed, density):
-    rng = np.random.default_rng(seed)
-    k, real = 5, rng.random((1000, 2))
-    others = rng.random((1000, 2))
-    others[rng.random(1000) > density] += 10  # only a share of them is where the real ones are
-    assert 1 - likeness(real, others, k).like.mean() == pytest.approx((1 + density) ** -k, abs=0.07)
+@pytest.mark.parametrize("density", [1.0, 0.3, 0.1])
+def test_balls_are_empty_as_often_as_theory_says(density):
+    k, empty = 5, []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        real, others = rng.random((1000, 2)), rng.random((1000, 2))
+        others[rng.random(1000) > density] += 10  # only a share of them is where the real ones are
+        empty.append(1 - likeness(real, others, k).like.mean())
+    assert abs(np.mean(empty) - (1 + density) ** -k) < 5 * np.std(empty, ddof=1) / len(empty) ** 0.5
 
 
 def test_a_gap_is_found_and_nothing_else():

@@ -47,7 +47,9 @@ def test_zero_weights_are_the_prior(model, seed):
     for name, value in one.parameters.items():
         if site_name(model.grammar, name) not in NAMES:
             assert torch.equal(value, other.parameters[name]), name
-    assert torch.allclose(one.log_prob, other.log_prob, atol=0.1)  # u of float32 near 0 and 1
+    # Near 0 and 1 a step of u in float32 is a large one of the value.
+    inner = torch.stack([(value.isnan() | ((value - 0.5).abs() < 0.499)).all(1) for value in u[0].values()]).all(0)
+    assert torch.allclose(one.log_prob[inner], other.log_prob[inner], atol=1e-2)
     assert float((one.log_prob - other.log_prob).abs().median()) < 1e-3
 
 

@@ -64,8 +64,13 @@ def test_it_begins_as_the_identity(trays, seed, all_zero):
         torch.nn.init.zeros_(parameter)
     one, other = drawn(trays, seed=seed), drawn(transform.suited(trays), seed=seed)
     assert torch.equal(one.derivation.rules, other.derivation.rules)
+    quantiles, again = quantiles_of(trays, one), quantiles_of(trays, other)
     for name, value in one.parameters.items():
-        assert torch.allclose(value, other.parameters[name], atol=2e-3), name  # there and back through u in float32
+        # There and back through u in float32: near 0 and 1 one step of it is a large one of the value.
+        u = quantiles.get(name, torch.full_like(value, 0.5))
+        assert torch.allclose(u, again.get(name, u), atol=3e-6, equal_nan=True), name
+        inner = u.isnan() | ((u > 1e-3) & (u < 1 - 1e-3))
+        assert torch.allclose(value[inner], other.parameters[name][inner], atol=2e-3), name
 
 
 def test_sites_that_are_not_learnt_draw_the_priors_very_numbers(trays):
