@@ -31,6 +31,7 @@ from ..fitting.observer import Observer
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..judging import looked
+from ..judging.advice import label
 from ..judging.aspects import Aspects, aspects
 from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
@@ -75,7 +76,9 @@ class Judged:
         more: dict[str, Any] = {"unlike_images": list(self.names)} | ({"usable": self.usable} if self.usable else {})
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
-        return self.trust.record() | self.aspects.record() | more
+        parts = self.aspects.record()
+        parts = parts if self.agreement is None else self.agreement.corrected(parts)
+        return self.trust.record() | parts | more
 
 
 def judge(
@@ -142,7 +145,8 @@ def judge(
     names = tuple(target.paths[i].name for i in real_unmatched)
     by_labels = None
     if evaluation is not None and "truth" in evaluation.sources:
-        by_labels = agreement(evaluation.sources["learnt"], evaluation.sources["truth"], evaluation.classes)
+        sources = evaluation.sources
+        by_labels = agreement(sources["learnt"], sources["truth"], evaluation.classes, label(run))
     walls = "" if evaluation is None else evaluation.walls
     features = {looked.LEARNT: scenes[0], looked.PRIOR: scenes[1], looked.TARGET: real}
     parts = aspects(run, found, features, seen, seed)

@@ -234,7 +234,7 @@ def _picture(images: list[Pixels], caption: str, columns: int | None = None) -> 
 
 
 def _note(evaluation: Evaluation) -> str:
-    notes = [f"Labels: {html.escape(note)}" for note in evaluation.notes]
+    notes = [f"Note: {html.escape(note)}" for note in evaluation.notes]
     notes += [f"Read: {html.escape(line)}" for line in evaluation.readings]
     if "estimate" in evaluation.sources:
         notes.append(

@@ -45,7 +45,7 @@ def show(evaluation: Evaluation, console: Console) -> None:
     if evaluation.images:
         console.print(FLOOR, style="dim", soft_wrap=True)
     for note in evaluation.notes:
-        console.print(f"Labels: {note}", style="dim", soft_wrap=True)
+        console.print(f"Note: {note}", style="dim", soft_wrap=True)
     for note in sorted(notes):
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
     for warning in (*evaluation.kept, *evaluation.warnings):
@@ -269,7 +269,7 @@ def show_comparison(comparison: Comparison, console: Console) -> None:
     if comparison.reference == ESTIMATE:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
     for note in comparison.notes:
-        console.print(f"Labels: {note}", style="dim", soft_wrap=True)
+        console.print(f"Note: {note}", style="dim", soft_wrap=True)
 
 
 def comparison_table(comparison: Comparison) -> Table:

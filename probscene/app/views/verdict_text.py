@@ -157,7 +157,8 @@ def _sentences(judged: Judged) -> list[str]:
     """What else is known: which classes can be read, what labels say, what the model is too narrow for."""
     found = [judged.usable] if judged.usable else []
     if judged.agreement is not None and judged.trust is not None:
-        found.append(judged.agreement.sentence(judged.trust.verdict))
+        said = judged.agreement.sentence(judged.trust.verdict)
+        found += [] if said.startswith(judged.record()["because"]) else [said]
     return [*found, judged.walls] if judged.walls else found
 
 
