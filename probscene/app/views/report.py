@@ -18,7 +18,7 @@ from probscene.errors import DataError, RunError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.judge import SCENES, Judged, judge
 from ..evaluation.labels import read_labels
-from ..evaluation.sources import START
+from ..evaluation.sources import ESTIMATE, READ, START
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
 from ..fitting.fit import open_target
@@ -36,7 +36,7 @@ SITES = (
     "prior, 0 to 1. Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt "
     "from; the floor is that of two halves of it."
 )
-READ = {
+OF_SITES = {
     "prior": "read in renders with the prior's parameters",
     "learnt": "with learnt parameters",
     "truth": "in the target",
@@ -46,7 +46,8 @@ LEGEND = {
     "start": "start: where the fit set out",
     "learnt": "learnt",
     "truth": "truth (labels)",
-    "estimate": "estimate: what the feature network counts in the target's images, without labels",
+    READ: "read: what the feature network counts in learnt renders",
+    ESTIMATE: "estimate: what it counts in the target's images, without labels",
 }
 
 
@@ -117,7 +118,7 @@ def write(
             headline=_headline(evaluation),
             samples=_samples(run, images, absent),
             sites=_sites(run),
-            legend=_legend({name: LEGEND[name] for name in evaluation.sources}),
+            legend=_legend({name: LEGEND[name] for name in evaluation.shown}),
             numbers=charts.numbers(evaluation),
             classes=charts.classes(evaluation),
             nested=_nested(evaluation),
@@ -206,7 +207,7 @@ def _sites(run: RunFolder) -> str:
     learnt = any(site["learnt"] for site in record["sites"])
     kept = _not_kept(record) if learnt and record["kept"] != "learnt" else ""
     return (
-        f'{kept}<p class="legend">{_legend(READ)}</p><div class="chart"><table><tr>{first}</tr>{body}</table></div>'
+        f'{kept}<p class="legend">{_legend(OF_SITES)}</p><div class="chart"><table><tr>{first}</tr>{body}</table></div>'
         f'<p class="soft">{SITES}</p>'
     )
 
@@ -236,10 +237,10 @@ def _picture(images: list[Pixels], caption: str, columns: int | None = None) -> 
 def _note(evaluation: Evaluation) -> str:
     notes = [f"Note: {html.escape(note)}" for note in evaluation.notes]
     notes += [f"Read: {html.escape(line)}" for line in evaluation.readings]
-    if "estimate" in evaluation.sources:
+    if ESTIMATE in evaluation.sources:
         notes.append(
             "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; "
-            "its counts are rounded."
+            "its counts are rounded. It is compared with what the same network reads in renders."
         )
     return " ".join(notes)
 
