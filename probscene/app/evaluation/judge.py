@@ -8,7 +8,7 @@ what can be read in them: those are another domain, and were read as such.
 Axis letters: N scenes, L images, D features.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,8 +37,7 @@ from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement
 
-SCENES = 1000  # of the guide, and as many of the prior
-AFTER_A_FIT = 256  # where they are judged at once
+SCENES = 1000  # of the guide, and as many of the prior, whoever judges: a run has one verdict
 SHOWN = 8  # images in each picture
 THUMB = 128  # pixels
 
@@ -57,6 +56,7 @@ class Judged:
         walls: what the model is too narrow for, one sentence, where that is known.
         usable: which classes can be read, in a sentence, where the features say so.
         aspects: structure, layout and looks; None where there is no verdict.
+        basis: what it was made from, see ``_basis``.
     """
 
     trust: Trust | None
@@ -68,12 +68,14 @@ class Judged:
     walls: str = ""
     usable: str = ""
     aspects: Aspects | None = None
+    basis: dict[str, Any] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
         if self.trust is None or self.aspects is None:
             return {"verdict": None, "because": self.absent}
-        more: dict[str, Any] = {"unlike_images": list(self.names)} | ({"usable": self.usable} if self.usable else {})
+        more: dict[str, Any] = {"basis": self.basis, "unlike_images": list(self.names)}
+        more |= {"usable": self.usable} if self.usable else {}
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
         parts = self.aspects.record()
@@ -85,20 +87,21 @@ def judge(
     run: RunFolder,
     target: Images,
     progress: Progress,
-    num: int = SCENES,
+    num: int | None = None,
     evaluation: Evaluation | None = None,
     seed: int = 0,
 ) -> Judged:
     """Judge a finished run by a folder of real images.
 
     Args:
-        num: scenes of the guide, and as many of the prior.
+        num: scenes of the guide, and as many of the prior; ``SCENES`` where None.
         evaluation: with labels, what to hold the verdict against.
 
     Raises:
         ProbsceneError: fewer scenes than a verdict needs.
         RunError: see ``RunFolder.guide`` and ``own_net``.
     """
+    num = SCENES if num is None else num
     if num < NEEDED:
         raise ProbsceneError(f"Expected at least {NEEDED} scenes to judge by, actual {num}; or 0 for no verdict.")
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
@@ -149,8 +152,14 @@ def judge(
         by_labels = agreement(sources["learnt"], sources["truth"], evaluation.classes, label(run))
     walls = "" if evaluation is None else evaluation.walls
     features = {looked.LEARNT: scenes[0], looked.PRIOR: scenes[1], looked.TARGET: real}
-    parts = aspects(run, found, features, seen, seed)
-    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls, usable(run), parts)
+    parts, basis = aspects(run, found, features, seen, seed), _basis(run, target, num)
+    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls, usable(run), parts, basis)
+
+
+def _basis(run: RunFolder, target: Images, num: int) -> dict[str, Any]:
+    """The images, whether the run was fitted to them, and the scenes of each side."""
+    own = kept_features(run, target) is not None
+    return {"images": len(target), "folder": str(target.path), "fitted_to": own, "scenes": num}
 
 
 def usable(run: RunFolder) -> str:

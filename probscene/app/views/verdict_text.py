@@ -53,7 +53,7 @@ def show_parts(record: dict[str, Any], console: Console) -> None:
         console.print()
         return
     console.print(f"Verdict: {record['verdict']}.", style="bold", soft_wrap=True)
-    for text in (record["because"], record["remedy"]):
+    for text in (record["because"], record["remedy"], *judged_by(record)):
         console.print(text, soft_wrap=True)
     if "parts" not in record:  # of a run of before
         return
@@ -74,13 +74,26 @@ def section(judged: Judged, real: str, generated: str) -> str:
     record = judged.record()
     if judged.trust is None or record["verdict"] is None:
         return f"<p>No verdict. {html.escape(judged.absent)}</p>"
-    said = (record["because"], record["remedy"])
+    said = (record["because"], record["remedy"], *judged_by(record))
     more = (*what_to_do(record), *by_class(record), *sites(record), *_sentences(judged))
     return (
         f'<div class="card">Verdict<b>{html.escape(record["verdict"])}</b></div>{_paragraphs(said)}'
         f'{_table(PARTS, parts(record))}<p class="soft">{OVERALL}</p>{_paragraphs(more)}'
         f'<div class="row two">{real}{generated}</div><h3>Structure</h3>{_table(HEAD, rows(judged.trust))}'
     )
+
+
+def judged_by(record: dict[str, Any]) -> list[str]:
+    """Which images a verdict is about; nothing for those of before."""
+    if not (basis := record.get("basis")):
+        return []
+    images, folder, scenes = basis["images"], basis["folder"], basis["scenes"]
+    which = (
+        f"the {images} images that it was fitted to"
+        if basis["fitted_to"]
+        else f"{images} images that it was not fitted to, in {folder}"
+    )
+    return [f"Judged by {which}, {scenes} scenes of the fit and as many of the prior."]
 
 
 def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:

@@ -1,6 +1,7 @@
 """The verdict on real renders: right where one knows it, held against labels, shown by both commands."""
 
 import functools
+import html
 import json
 import re
 from types import SimpleNamespace
@@ -199,13 +200,22 @@ def test_both_commands_say_it(call, seeing, drawn, tmp_path):
     assert "Can this fit be trusted?" in page and "Target images least like any generated scene: 000" in page
 
 
-def test_a_fit_ends_with_its_verdict(call, drawn, discs, tmp_path):
+def test_a_fit_ends_with_its_verdict_which_is_that_of_every_command_on_the_same_images(call, drawn, discs, tmp_path):
     words = [word for word in discs.settings if word != "--no-verdict"]
     done = call("fit", discs.file, "--target", drawn.target.path, "--out", tmp_path / "run", *words)
     assert done.code == 0, done.err
     assert re.match(r"Verdict: [\w ]+\.\n", done.out) and "\nLearnt." in done.out
     for part in ("structure", "layout", "looks"):
         assert re.search(rf"│ {part} +│", done.out)
+    said = done.out[: done.out.index("\nLearnt.")]
+    assert "Judged by the 200 images that it was fitted to, 60 scenes of the fit" in said
+    evaluated = call("evaluate", tmp_path / "run", "--target", drawn.target.path, "--num", 100)
+    shown = call("report", tmp_path / "run", "--num", 100, "--out", tmp_path / "r.html")
+    assert evaluated.out.startswith(said) and shown.code == 0
+    page = html.unescape((tmp_path / "r.html").read_text(encoding="utf-8"))
+    assert all(cell in page for cell in re.findall(r"\d+\.\d+", said)) and said.split("\n")[1] in page
+    others = call("evaluate", tmp_path / "run", "--target", drawn.crowd.path, "--num", 100, "--scenes", 50)
+    assert "Judged by 200 images that it was not fitted to, in " in others.out and "50 scenes of the fit" in others.out
     again = call("fit", "--resume", "--out", tmp_path / "run")
     assert again.code == 0 and "Verdict" not in again.out  # it was finished
 
