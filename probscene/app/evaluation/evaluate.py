@@ -29,6 +29,7 @@ from probscene.policy import Policy
 from ..fitting.fit import Progress
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, features_of, kept_features, own_net
+from ..labelling.boxes import Boxes
 from ..walls.inexpressible import Inexpressible, inexpressible
 from ..walls.piled import Piled, piled, sentences
 from .estimate import estimated
@@ -57,6 +58,7 @@ class Evaluation:
         piled: the lists that are too short for what was learnt.
         inexpressible: the images that the model cannot have, by the labels, else by the estimate.
         read: what the network that makes the estimate reads in renders of ``FITTED``; empty without an estimate.
+        boxes: of the labels.
     """
 
     run: RunFolder
@@ -69,6 +71,7 @@ class Evaluation:
     piled: tuple[Piled, ...] = ()
     inexpressible: tuple[Inexpressible, ...] = ()
     read: dict[str, Source] = field(default_factory=dict)
+    boxes: Boxes | None = None
 
     def beside(self, b: str) -> dict[str, Source]:
         """Source ``b``, and the others as they are compared with it: with the estimate, as the same network reads them
@@ -254,7 +257,8 @@ def evaluate(
     notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
     short = piled(run.model, run.guide, None if run.unread else estimate, seed)
     beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
-    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, read)
+    boxes = None if truth is None else truth.boxes
+    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, read, boxes)
 
 
 def _inexpressible(

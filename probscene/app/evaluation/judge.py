@@ -31,8 +31,10 @@ from ..fitting.observer import Observer
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..judging import looked
+from ..judging import sizes as size_figures
 from ..judging.advice import label
 from ..judging.aspects import Aspects, aspects
+from ..judging.sizes import Sizes, given_boxes, sizes, with_sizes
 from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement
@@ -56,7 +58,8 @@ class Judged:
         walls: what the model is too narrow for, one sentence, where that is known.
         usable: which classes can be read, in a sentence, where the features say so.
         aspects: structure, layout and looks; None where there is no verdict.
-        basis: what it was made from, see ``_basis``.
+        basis: the images, their folder, whether the run was fitted to them, and the scenes of each side.
+        sizes: of the objects of each class of which boxes were given.
     """
 
     trust: Trust | None
@@ -69,6 +72,7 @@ class Judged:
     usable: str = ""
     aspects: Aspects | None = None
     basis: dict[str, Any] = field(default_factory=dict)
+    sizes: dict[str, Sizes] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
@@ -76,6 +80,7 @@ class Judged:
             return {"verdict": None, "because": self.absent}
         more: dict[str, Any] = {"basis": self.basis, "unlike_images": list(self.names)}
         more |= {"usable": self.usable} if self.usable else {}
+        more |= {"sizes": size_figures.record(self.sizes)} if self.sizes else {}
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
         parts = self.aspects.record()
@@ -114,7 +119,12 @@ def judge(
         )
     preset, model, net = run.preset, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)
-    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
+    own = kept_features(run, target) is not None
+    boxes = None if evaluation is None else evaluation.boxes
+    boxes = given_boxes(run, target) if boxes is None and own else boxes
+    total = 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
+    total += 0 if boxes is None else 2 * size_figures.SCENES
+    done = 0
 
     def each(images: int) -> None:
         nonlocal done
@@ -152,14 +162,11 @@ def judge(
         by_labels = agreement(sources["learnt"], sources["truth"], evaluation.classes, label(run))
     walls = "" if evaluation is None else evaluation.walls
     features = {looked.LEARNT: scenes[0], looked.PRIOR: scenes[1], looked.TARGET: real}
-    parts, basis = aspects(run, found, features, seen, seed), _basis(run, target, num)
-    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls, usable(run), parts, basis)
-
-
-def _basis(run: RunFolder, target: Images, num: int) -> dict[str, Any]:
-    """The images, whether the run was fitted to them, and the scenes of each side."""
-    own = kept_features(run, target) is not None
-    return {"images": len(target), "folder": str(target.path), "fitted_to": own, "scenes": num}
+    found_sizes = {} if boxes is None else sizes(run, boxes, each, seed)
+    parts = with_sizes(aspects(run, found, features, seen, seed), found_sizes)
+    basis = {"images": len(target), "folder": str(target.path), "fitted_to": own, "scenes": num}
+    shown = real_unmatched, generated_unmatched, names
+    return Judged(found, "", *shown, by_labels, walls, usable(run), parts, basis, found_sizes)
 
 
 def usable(run: RunFolder) -> str:

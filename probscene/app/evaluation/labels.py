@@ -21,6 +21,7 @@ from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
+from ..labelling.boxes import Boxes
 from ..labelling.coco import read_coco
 from ..labelling.counts import read_table, text_of
 from ..labelling.kitti import read_kitti
@@ -40,6 +41,7 @@ class Labels(NamedTuple):
         notes: what a person should know, one sentence each.
         min_height: where objects are labelled that can be seen, and not all that a structure has: that of a box which
             is counted, pixels of the canvas.
+        boxes: of the objects, where labels have such and none is left out.
     """
 
     structures: StructureCounts
@@ -47,6 +49,7 @@ class Labels(NamedTuple):
     classes: tuple[str, ...] | None = None
     notes: tuple[str, ...] = ()
     min_height: float | None = None
+    boxes: Boxes | None = None
 
     def columns(self, model: SceneModel) -> list[int]:
         """Of the model's classes, the C that are labelled, by number."""
@@ -73,7 +76,8 @@ def read_labels(path: Path, model: SceneModel, target: Images, some: bool = Fals
         boxes = read(path, model, target, some, min_height)
         low = min_height * float(np.median(target.scales))
         notes = (SEEN, *boxes.notes)
-        return Labels(StructureCounts(boxes.counts, {}), classes=boxes.classes, notes=notes, min_height=low)
+        whole = None if min_height else boxes
+        return Labels(StructureCounts(boxes.counts, {}), None, boxes.classes, notes, low, whole)
     if min_height:
         raise DataError(
             f"Expected a folder of KITTI's labels or COCO's JSON for a least height of objects, actual the file {path}."

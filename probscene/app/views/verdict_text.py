@@ -108,11 +108,12 @@ def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def what_to_do(record: dict[str, Any]) -> list[str]:
-    """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said."""
+    """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said.
+    Sizes have their figures in any case."""
     return [
         f"{name.capitalize()}: {part['because']} {part['remedy'].removeprefix(record['remedy']).strip()}".strip()
         for name, part in record["parts"].items()
-        if part["word"] != "good" and part["because"] != record["because"]
+        if (part["word"] != "good" or name == "sizes") and part["because"] != record["because"]
     ]
 
 
