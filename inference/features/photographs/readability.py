@@ -169,9 +169,9 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     others = ((np.delete(seen, i, 0), np.delete(y, i), drawn, first) for i in range(len(y)))
     chosen = [_choose(*some) for some in others]
     left_out = np.array([seen[(i, *each)] for i, each in enumerate(chosen)])
-    error, histogram = float(np.abs(left_out - y).mean()), _histogram_error(y)
+    error, histogram = float(np.abs(left_out - y).mean()), float(histogram_scores(y).mean())
     of_all = read.photographs[..., c].double().numpy()  # (L, S, R)
-    score = float(np.mean([_score(of_all[:, s, r], y[i]) for i, (s, r) in enumerate(chosen)]))
+    score = float(np.mean([scores(of_all[:, s, r], y[i : i + 1]) for i, (s, r) in enumerate(chosen)]))
     of_free = read.labelled[:, free.scope, :, c][:, list(free.rules)].quantile(0.5, 1)
     all_of_free = read.photographs[:, free.scope, :, c][:, list(free.rules)].quantile(0.5, 1).double().numpy()
     with_free, seen_mean, mean = _correlation(of_free, labels), float(of_free.mean()), float(y.mean())
@@ -180,7 +180,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     off = (of_free - labels).double().numpy()
     without, surely = float(np.abs(off).mean()), BIASED * float(off.std(ddof=1)) / math.sqrt(len(y))
     as_by_labels = without <= MUCH * error + LITTLE and abs(off.mean()) <= surely + LITTLE
-    if free.readable and as_by_labels and _no_worse(without, _score(all_of_free, y), histogram):
+    if free.readable and as_by_labels and _no_worse(without, scores(all_of_free, y).mean(), histogram):
         because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image, {of_histogram})"
         return free._replace(by="labels", error=without, because=because)
     found = of_all[:, scope, rule]
@@ -252,21 +252,21 @@ def _errors(read: Array, true: Array) -> Array:
     return np.abs(read - true).mean(0) + np.abs(np.sort(read, 0) - np.sort(true, 0)).mean(0)
 
 
-def _histogram_error(labels: Array) -> float:
-    """How far a label is from the histogram of the others: the mean continuous ranked probability score, which is the
-    absolute error where something predicts a single count."""
+def histogram_scores(labels: Array) -> Array:
+    """``(K,)`` how far each label is from the histogram of the others: the continuous ranked probability score, which
+    is the absolute error where something predicts a single count."""
     K = len(labels)
     apart = np.abs(labels[:, None] - labels[None])
     to_others = apart.sum(1) / (K - 1)
     among_others = (apart.sum() - 2 * apart.sum(1)) / (K - 1) ** 2
-    return float((to_others - among_others / 2).mean())
+    return to_others - among_others / 2
 
 
-def _score(read: Array, labels: Array | float) -> float:
-    """How far labels are from the histogram of what is read ``(L,)``, by the same score."""
-    ranked, L = np.sort(read), len(read)
+def scores(counts: Array, labels: Array) -> Array:
+    """``(K,)`` how far each label is from the histogram of ``counts (L,)``, by the same score."""
+    ranked, L = np.sort(counts), len(counts)
     among = 2 * float(((2 * np.arange(L) - L + 1) * ranked).sum()) / L**2  # mean |a - b|
-    return float(np.abs(read[:, None] - labels).mean()) - among / 2
+    return np.abs(counts[:, None] - labels).mean(0) - among / 2
 
 
 def _steps(read: Array, labels: Array) -> tuple[float, ...]:

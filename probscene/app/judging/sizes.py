@@ -43,7 +43,8 @@ class Sizes(NamedTuple):
     Attributes:
         given: of the boxes that were given; ``low`` and ``high`` their 95 % limits.
         prior, learnt: of boxes in scenes.
-        off: the learnt medians' relative error, the larger one of both; ``off_low`` and ``off_high`` its 95 % limits.
+        off: how far the learnt medians are off, as the logarithm of their ratio to those given, the larger of both;
+            ``off_low`` and ``off_high`` its 95 % limits.
         word: None where the boxes are too few to say.
         worse: whether learnt sizes are surely farther from those given than the prior's.
         boxes: that were given.
@@ -109,6 +110,8 @@ def with_sizes(found: Aspects, each: dict[str, Sizes]) -> Aspects:
         f"Sizes of {', '.join(wrong)} are wrong: set the priors of the sites that they hang on by these figures, and "
         "leave those sites out of learning (infer={'learn': False})."
         if wrong
+        else "More boxes would tell."
+        if word is None
         else ""
     )
     parts = found.parts | {"sizes": Aspect(word, because, remedy, None, UNSURE if word is None else str(word))}

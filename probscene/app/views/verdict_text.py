@@ -21,7 +21,8 @@ PARTS = ("", "verdict", "this fit", "structure alone", "prior", "the floor")
 DISTANCES = (LEARNT, STRUCTURE, PRIOR, "floor")
 OVERALL = (
     "Energy distances from the target: of the run's features, of where objects stand in images with as many of them, "
-    f"and of EfficientNet's features. The whole is as good as its worst part. {FLOOR}"
+    "and of EfficientNet's features; sizes are medians of boxes. The whole is as good as its worst part. "
+    f"{FLOOR}"
 )
 
 
