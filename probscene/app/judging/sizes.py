@@ -33,8 +33,20 @@ TOLERATED = 0.1  # by which a median may be off and sizes are still good
 SURE = 0.975  # of resamples
 
 Array = NDArray[np.float64]
-Side = dict[str, tuple[Array, NDArray[np.int64], int]]
-"""By class, widths and heights ``(n, 2)`` in pixels, the image of each ``(n,)``, and N."""
+
+
+class Boxed(NamedTuple):
+    """The boxes of one class.
+
+    Attributes:
+        size: ``(n, 2)`` widths and heights, pixels.
+        image: ``(n,)`` the image of each.
+        images: N.
+    """
+
+    size: Array
+    image: NDArray[np.int64]
+    images: int
 
 
 class Sizes(NamedTuple):
@@ -93,7 +105,7 @@ def sizes(run: RunFolder, boxes: Boxes, each: Callable[[int], None], seed: int =
     return {
         name: compared(found, prior[name], learnt[name], seed)
         for name, found in _of_boxes(boxes).items()
-        if min(len(side[name][0]) for side in (prior, learnt)) >= ENOUGH <= len(found[0])
+        if min(len(each.size) for each in (found, prior[name], learnt[name])) >= ENOUGH
     }
 
 
@@ -130,10 +142,10 @@ def record(each: dict[str, Sizes]) -> dict[str, Any]:
     }
 
 
-def compared(given: Any, prior: Any, learnt: Any, seed: int = 0) -> Sizes:
-    """One class; arguments as of ``Side``."""
+def compared(given: Boxed, prior: Boxed, learnt: Boxed, seed: int = 0) -> Sizes:
+    """One class."""
     rng = np.random.default_rng(seed)
-    real, before, after = (_medians(*side, rng) for side in (given, prior, learnt))  # each (1 + R, 2), the first of all
+    real, before, after = (_medians(boxed, rng) for boxed in (given, prior, learnt))
     off_before, off = (np.abs(np.log(side / real)).max(1) for side in (before, after))
     low, high = np.quantile(real[1:], [1 - SURE, SURE], axis=0)
     off_low, off_high = np.quantile(off[1:], [1 - SURE, SURE])
@@ -146,12 +158,24 @@ def compared(given: Any, prior: Any, learnt: Any, seed: int = 0) -> Sizes:
         word = Word.BETTER
     elif worse or off_low > TOLERATED:
         word = Word.NO_BETTER
-    medians = (_pair(side) for side in (real[0], low, high, before[0], after[0]))
-    return Sizes(*medians, float(off[0]), float(off_low), float(off_high), word, worse, len(given[0]))
+    return Sizes(
+        given=_pair(real[0]),
+        low=_pair(low),
+        high=_pair(high),
+        prior=_pair(before[0]),
+        learnt=_pair(after[0]),
+        off=float(off[0]),
+        off_low=float(off_low),
+        off_high=float(off_high),
+        word=word,
+        worse=worse,
+        boxes=len(given.size),
+    )
 
 
-def _medians(size: Array, image: NDArray[np.int64], N: int, rng: np.random.Generator) -> Array:
-    """``(1 + R, 2)`` medians of ``size (n, 2)``: of all, and of resamples of the images."""
+def _medians(boxed: Boxed, rng: np.random.Generator) -> Array:
+    """``(1 + R, 2)`` medians of width and height: of all boxes, and of resamples of the images."""
+    size, image, N = boxed
     weight = np.concatenate([np.ones((1, N)), rng.multinomial(N, np.full(N, 1 / N), RESAMPLES)])[:, image]
     weight[weight.sum(1) == 0] = 1  # no image of a resample has a box
     found = np.empty((len(weight), 2))
@@ -163,14 +187,14 @@ def _medians(size: Array, image: NDArray[np.int64], N: int, rng: np.random.Gener
     return found
 
 
-def _of_boxes(boxes: Boxes) -> Side:
+def _of_boxes(boxes: Boxes) -> dict[str, Boxed]:
     of_class = torch.cat([found[:, 0] for found in boxes.boxes]).long().numpy()
     corners = torch.cat([found[:, 1:] for found in boxes.boxes]).double().numpy()
     image = np.repeat(np.arange(len(boxes.boxes)), [len(found) for found in boxes.boxes])
     return _by_class(boxes.classes, of_class, corners, image, len(boxes.boxes))
 
 
-def _of_scenes(run: RunFolder, policy: Policy, each: Callable[[int], None], seed: int) -> Side:
+def _of_scenes(run: RunFolder, policy: Policy, each: Callable[[int], None], seed: int) -> dict[str, Boxed]:
     """Of the first scenes that ``generate`` would render, the boxes of what labels count."""
     model, shares = run.model, run.visible_shares()
     render, parts = renderer_for(model), []
@@ -185,10 +209,10 @@ def _of_scenes(run: RunFolder, policy: Policy, each: Callable[[int], None], seed
     return _by_class(model.classes, c, corners, image, SCENES)
 
 
-def _by_class(names: tuple[str, ...], c: Any, corners: Array, image: Any, N: int) -> Side:
+def _by_class(names: tuple[str, ...], c: Any, corners: Array, image: Any, N: int) -> dict[str, Boxed]:
     size = corners[:, 2:] - corners[:, :2]
     kept = (size > 0).all(1)
-    return {name: (size[kept & (c == i)], image[kept & (c == i)], N) for i, name in enumerate(names)}
+    return {name: Boxed(size[kept & (c == i)], image[kept & (c == i)], N) for i, name in enumerate(names)}
 
 
 def _pair(values: Any) -> tuple[float, float]:

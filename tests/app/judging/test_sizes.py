@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.judging.aspects import KINDS, Aspect, Aspects
-from probscene.app.judging.sizes import SCENES, _medians, compared, given_boxes, sizes, with_sizes
+from probscene.app.judging.sizes import SCENES, Boxed, _medians, compared, given_boxes, sizes, with_sizes
 from probscene.dataset import ImageFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
@@ -28,7 +28,7 @@ def side(number: int, scale: float = 1.0, seed: int = 0):
     """Boxes of about 20 x 30 pixels, some in each of 50 images."""
     rng = np.random.default_rng(seed)
     size = scale * np.array([20.0, 30.0]) * np.exp(0.2 * rng.normal(size=(number, 2)))
-    return size, rng.integers(0, 50, number), 50
+    return Boxed(size, rng.integers(0, 50, number), 50)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_the_word_for_sizes_is_right_where_they_are_known(number, prior, learnt,
 @given(st.lists(st.tuples(st.integers(1, 9), st.integers(0, 3)), min_size=1, max_size=20))
 def test_medians_are_those_of_the_boxes_and_a_resample_has_whole_images(rows):
     size, image = np.array([[a, 10.0 - a] for a, _ in rows]), np.array([i for _, i in rows])
-    found = _medians(size, image, 4, np.random.default_rng(0))
+    found = _medians(Boxed(size, image, 4), np.random.default_rng(0))
     assert found.shape == (1 + RESAMPLES, 2)
     assert found[0].tolist() == [np.quantile(size[:, k], 0.5, method="inverted_cdf") for k in (0, 1)]
     if len(set(image.tolist())) == 1:  # its boxes are then all that a resample has
