@@ -112,7 +112,7 @@ class Display(AbstractContextManager):
         self.seconds: dict[str, float] = {}
         self._stage: _Stage | None = None
         self._clock, self._lock = clock, threading.RLock()
-        self._last = self._said = clock()
+        self._start = self._last = self._said = clock()
         self._over = threading.Event()
         self._beats: threading.Thread | None = None
         self._bars = Bars(
@@ -124,6 +124,11 @@ class Display(AbstractContextManager):
             TextColumn("{task.fields[note]}", style="dim", table_column=Column(no_wrap=True, overflow="ellipsis")),
             console=self.console,
         )
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since it was made, of stages and of what is none."""
+        return self._clock() - self._start
 
     def __enter__(self) -> "Display":
         if self.console.is_terminal:

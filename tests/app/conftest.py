@@ -59,7 +59,7 @@ def _few_images_are_looked_at():
     """By a verdict."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("probscene.app.judging.looked.IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.judge.AFTER_A_FIT", 60)
+        patch.setattr("probscene.app.evaluation.judge.SCENES", 60)
         yield
 
 

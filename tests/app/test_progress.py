@@ -2,8 +2,11 @@
 
 import io
 import re
+import tempfile
 import time
 from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -11,6 +14,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from probscene.app import progress
+from probscene.app.fitting import session
+from probscene.app.fitting.storage import OTHER, timing
 from probscene.app.progress import EVERY, STAGES, Display
 
 
@@ -153,3 +158,28 @@ def test_terminals_and_quiet_consoles_have_no_such_lines():
         clock.now += 100
         display.beat()
         assert console.file.getvalue() == ""
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(list(STAGES)), st.integers(0, 3), st.floats(0, 9)), max_size=12), st.booleans()
+)
+def test_the_times_of_a_fits_stages_and_of_what_is_none_add_up_to_the_whole(reports, again):
+    """Also over two sittings; what is no stage of a fit, such as the drawing of a target, is none of its times."""
+    now = 0.0
+
+    def fit(run, show, *_):
+        nonlocal now
+        for name, done, seconds in reports:
+            now += seconds
+            show(name, done, 3)
+        now += 1.5
+
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "fit", fit)
+        run, beside = SimpleNamespace(path=Path(folder), few=None), 0.0
+        for _ in range(1 + again):
+            with Display(Console(quiet=True), lambda: now) as show:
+                session.carry_out(run, None, show)
+            beside += sum(seconds for name, seconds in show.seconds.items() if name not in session.STAGES)
+        assert sum(timing(run).values()) == pytest.approx(now - beside, abs=1e-6)
+        assert timing(run)[OTHER] >= 1.5 * (1 + again) - 1e-6

@@ -6,10 +6,16 @@ counts right on renders that nothing was trained on, where those rules read abou
 objects are large: what heads take for a small object, dirt or a speck, all of them take for one. With labels
 the rule is that with the least error on them, a little held by its error on renders, as ten labels alone would choose
 among many rules by luck; where they bear out what is read without them, nothing changes. Where the other labels'
-histogram predicts a label better than any rule does, that histogram is what is learnt; as well where the rule reads
-another number in the images without labels, as in those of another place, where it may not hold.
+histogram predicts a label better than what is read, that histogram is what is learnt; as well where the rule reads
+another number in the images without labels, as in those of another place, where it may not hold. What is read of one
+image errs more than what is read of all of them, so both are asked: how far it is from the label of its image, and how
+well the histogram of all that is read, which is what would be learnt, predicts the labels [1].
 
 Axis letters: L photographs, V renders, K labelled images, S scopes, R rules, C classes.
+
+References:
+    [1] Gneiting, Raftery, *Strictly proper scoring rules, prediction, and estimation*, 2007: the continuous ranked
+        probability score.
 """
 
 import math
@@ -24,7 +30,7 @@ from .reading import LARGE, RULES, SCOPES, SMALL
 
 AGREE = 0.25  # largest disagreement of heads, a mean difference over the mean count and ``BASE``
 CLOSE = 0.7  # largest difference of the means that rules read, over their own mean and ``BASE``
-AS_WELL, NEARLY = 1.1, 0.02  # by which factor, and how many objects, errors on renders may exceed the least
+AS_WELL, NEARLY = 1.1, 0.02  # by which factor, and how many objects, errors that are as good may exceed the least
 MOSTLY = 0.7  # of a class's objects must be in the scope of large ones for this to be read
 SKILL = 0.8  # least correlation with the true counts of renders
 BASE = 0.3  # objects
@@ -161,21 +167,27 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     first = free.scope  # where most objects are small, the few large ones that go with the labels are not the labelled
     scope, rule = _choose(seen, y, drawn, first)
     others = ((np.delete(seen, i, 0), np.delete(y, i), drawn, first) for i in range(len(y)))
-    left_out = np.array([seen[(i, *_choose(*some))] for i, some in enumerate(others)])
-    error, histogram = float(np.abs(left_out - y).mean()), _histogram_error(y)
+    chosen = [_choose(*some) for some in others]
+    left_out = np.array([seen[(i, *each)] for i, each in enumerate(chosen)])
+    error, histogram = float(np.abs(left_out - y).mean()), float(histogram_scores(y).mean())
+    of_all = read.photographs[..., c].double().numpy()  # (L, S, R)
+    score = float(np.mean([scores(of_all[:, s, r], y[i : i + 1]) for i, (s, r) in enumerate(chosen)]))
     of_free = read.labelled[:, free.scope, :, c][:, list(free.rules)].quantile(0.5, 1)
+    all_of_free = read.photographs[:, free.scope, :, c][:, list(free.rules)].quantile(0.5, 1).double().numpy()
     with_free, seen_mean, mean = _correlation(of_free, labels), float(of_free.mean()), float(y.mean())
-    figures = f"leave-one-out error {error:.2f} an image, of the labels' histogram {histogram:.2f}"
+    of_histogram = f"of the labels' histogram {histogram:.2f}"
+    figures = f"leave-one-out error {error:.2f} an image, {of_histogram}"
     off = (of_free - labels).double().numpy()
     without, surely = float(np.abs(off).mean()), BIASED * float(off.std(ddof=1)) / math.sqrt(len(y))
-    if free.readable and without <= MUCH * min(error, histogram) + LITTLE and abs(off.mean()) <= surely + LITTLE:
-        because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image; {figures})"
+    as_by_labels = without <= MUCH * error + LITTLE and abs(off.mean()) <= surely + LITTLE
+    if free.readable and as_by_labels and _no_worse(without, scores(all_of_free, y).mean(), histogram):
+        because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image, {of_histogram})"
         return free._replace(by="labels", error=without, because=because)
-    unlike = _unlike(seen[:, scope, rule], read.photographs[:, scope, rule, c].double().numpy())
-    if error <= MUCH * histogram + LITTLE and unlike is None:
-        found = read.photographs[:, scope, rule, c]
+    found = of_all[:, scope, rule]
+    unlike = _unlike(seen[:, scope, rule], found)
+    if _no_worse(error, score, histogram) and unlike is None:
         because = (
-            f"readable by {len(y)} labels, {float(found.mean()):.1f} an image by {RULES[rule]}, of objects from "
+            f"readable by {len(y)} labels, {found.mean():.1f} an image by {RULES[rule]}, of objects from "
             f"{SCOPES[scope].pixels:.0f} pixels visible by {SCOPES[scope].visible:g} ({figures})"
         )
         return free._replace(
@@ -193,7 +205,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
             f"{seen_mean:.1f} read) and are not used; see whether all objects of this class are labelled"
         )
         return free._replace(error=error, because=because)
-    steps = _steps(read.photographs[:, scope, 0, c].double().numpy(), y)
+    steps = _steps(of_all[:, scope, 0], y)
     why = f"no rule reads them better ({figures})"
     if unlike is not None:
         here, there = unlike
@@ -202,6 +214,18 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     return free._replace(
         readable=True, by="histogram", rules=(0,), scope=scope, mean=mean, error=error, steps=steps, because=because
     )
+
+
+def _no_worse(error: float, score: float, histogram: float) -> bool:
+    """Whether what is read serves as well as the labels' histogram, which predicts a label with an error ``histogram``.
+
+    Args:
+        error: of what is read in an image, from its label.
+        score: with which the histogram of all that is read predicts a label.
+    """
+    if error <= histogram + NEARLY:
+        return True
+    return error <= MUCH * histogram + LITTLE and score <= histogram + NEARLY
 
 
 def _unlike(labelled: Array, photographs: Array) -> tuple[float, float] | None:
@@ -228,14 +252,21 @@ def _errors(read: Array, true: Array) -> Array:
     return np.abs(read - true).mean(0) + np.abs(np.sort(read, 0) - np.sort(true, 0)).mean(0)
 
 
-def _histogram_error(labels: Array) -> float:
-    """How far a label is from the histogram of the others: the mean continuous ranked probability score, which is the
-    absolute error where something predicts a single count."""
+def histogram_scores(labels: Array) -> Array:
+    """``(K,)`` how far each label is from the histogram of the others: the continuous ranked probability score, which
+    is the absolute error where something predicts a single count."""
     K = len(labels)
     apart = np.abs(labels[:, None] - labels[None])
     to_others = apart.sum(1) / (K - 1)
     among_others = (apart.sum() - 2 * apart.sum(1)) / (K - 1) ** 2
-    return float((to_others - among_others / 2).mean())
+    return to_others - among_others / 2
+
+
+def scores(counts: Array, labels: Array) -> Array:
+    """``(K,)`` how far each label is from the histogram of ``counts (L,)``, by the same score."""
+    ranked, L = np.sort(counts), len(counts)
+    among = 2 * float(((2 * np.arange(L) - L + 1) * ranked).sum()) / L**2  # mean |a - b|
+    return np.abs(counts[:, None] - labels).mean(0) - among / 2
 
 
 def _steps(read: Array, labels: Array) -> tuple[float, ...]:

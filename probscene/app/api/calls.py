@@ -176,7 +176,7 @@ def report(
     out: Path | str | None = None,
     labels: Path | str | None = None,
     num: int = 10000,
-    scenes: int = reporting.SCENES,
+    scenes: int | None = None,
     progress: bool = True,
     visible: Visible | None = None,
     some_labels: bool = False,
@@ -187,7 +187,7 @@ def report(
         out: the file; ``report.html`` in the run's folder where None.
         labels: of the run's target, see ``evaluate``.
         num: structures a source.
-        scenes: rendered of prior and guide for the verdict; 0 for none.
+        scenes: rendered of prior and guide for the verdict, 1,000 where None; 0 for none.
         visible, some_labels: see ``evaluate``.
 
     Raises:

@@ -26,6 +26,12 @@ Visible = Annotated[
         help="Count objects of rendered scenes of which at least this is visible, 0 to 1; many.",
     ),
 ]
+JudgedScenes = Annotated[
+    int | None,
+    typer.Option(
+        help="Rendered of prior and guide for the verdict, 1000 if not given as at the end of fit; 0 for none."
+    ),
+]
 BoxMargin = Annotated[
     int, typer.Option(min=0, metavar="PIXELS", help="By which labelled boxes are wider on each side.")
 ]

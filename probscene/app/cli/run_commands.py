@@ -6,7 +6,17 @@ from typing import Annotated
 import typer
 
 from .application import app
-from .options import BoxMargin, ClusterAddress, MinHeight, RunPath, Seed, SomeLabels, ValueRange, Visible
+from .options import (
+    BoxMargin,
+    ClusterAddress,
+    JudgedScenes,
+    MinHeight,
+    RunPath,
+    Seed,
+    SomeLabels,
+    ValueRange,
+    Visible,
+)
 
 
 @app.command()
@@ -72,7 +82,7 @@ def evaluate(
     num_images: Annotated[
         str, typer.Option("--images", metavar="N", help="At most so many a side for KID and FID, or all.")
     ] = "1000",
-    scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
+    scenes: JudgedScenes = None,
     some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
     visible: Visible = None,
@@ -101,7 +111,7 @@ def evaluate(
         images = open_images(target, opened.model, opened.record["skip_bad"], show, chosen)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
         found = evaluate(opened, images, truth, show, num, features=features or (), images=most, visible=visible)
-        judged = verdict.judge(opened, images, show, scenes, found) if scenes else None
+        judged = verdict.judge(opened, images, show, scenes, found) if scenes != 0 else None
     console = Console(highlight=False)
     if judged is not None:
         verdict_text.show(judged, console)
@@ -118,7 +128,7 @@ def report(
     ] = None,
     labels: Annotated[Path | None, typer.Option(metavar="PATH", help="Of the run's target, as of evaluate.")] = None,
     num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
-    scenes: Annotated[int, typer.Option(help="Rendered of prior and guide for the verdict; 0 for none.")] = 1000,
+    scenes: JudgedScenes = None,
     some_labels: SomeLabels = False,
     visible: Visible = None,
 ) -> None:

@@ -2,7 +2,7 @@
 
 The sources are those of ``evaluate`` (see there), with one for each run, under the name of its folder, instead of the
 one that is learnt. The reference is the truth where there are labels, else what the feature network of the first run
-that counts sees in the target.
+that counts reads in the target; all sources are then what it reads in renders, of the classes that it can count.
 """
 
 from collections.abc import Sequence
@@ -21,14 +21,14 @@ from probscene.inference.judging.tally import Tally
 from ..fitting.fit import Progress
 from ..fitting.run import RunFolder
 from ..loading import drawn_alike
-from .evaluate import Evaluation, network_counts
+from .evaluate import Evaluation, network_counts, renders_read
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
-from .sources import PRIOR, START, Source, before
+from .sources import ESTIMATE, PRIOR, START, Source, before
 from .structure_counts import GROUPS, PARENTS, label
 from .visible import Visible, counted, number_of, seen_by, whole_note
 
-TRUTH, ESTIMATE = "truth", "estimate"
+TRUTH = "truth"
 
 
 class Row(NamedTuple):
@@ -174,7 +174,8 @@ def compare(
         target: its images; without them, what the first run's network saw in the images that it was fitted to.
         truth: the labels of the target's images.
         num: structures a source.
-        visible: see ``evaluate``; those of the first run, where it has some and this is None.
+        visible: see ``evaluate``; those of the first run, where it has some and this is None. For structures that are
+            counted and not read.
 
     Raises:
         ProbsceneError: a number that is not positive; see ``seen_by``.
@@ -199,22 +200,31 @@ def compare(
         done += scenes
         progress("counting", done, len(policies) * number_of(seen, num), "")
 
-    sources: dict[str, Source] = {}
     likelihoods: dict[str, Likelihood] = {}
-    for name, policy in policies.items():
-        found = counted(model, policy, num, seed, seen, each)
-        sources[name] = Source.of(found.counts, found.children).only(columns)
-        if truth is not None and truth.derivation is not None:
-            likelihoods[name] = likelihood(policy, truth.derivation)
+    reader, estimate = None, None
+    if truth is None:
+        estimates = ((run, network_counts(run, target, progress)) for run in runs.values() if _counted_by(run))
+        reader, estimate = next(((run, found) for run, found in estimates if found is not None), (None, None))
+    if reader is not None and estimate is not None:
+        columns, name = _counted_by(reader), reader.path.resolve().name
+        notes = (f"All counts are of what the network of {name} reads, in renders as in the target's images.",)
+        sources = renders_read(reader, policies, progress, num, seed) | {ESTIMATE: estimate}
+    else:
+        found = {name: counted(model, policy, num, seed, seen, each) for name, policy in policies.items()}
+        sources = {name: Source.of(some.counts, some.children) for name, some in found.items()}
+    sources = {name: source.only(columns) for name, source in sources.items()}
     if truth is not None:
         sources[TRUTH] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
-    else:
-        estimates = (network_counts(run, target, progress) for run in runs.values())
-        if (estimate := next((source for source in estimates if source is not None), None)) is not None:
-            sources[ESTIMATE] = estimate
+        if truth.derivation is not None:
+            likelihoods = {name: likelihood(policy, truth.derivation) for name, policy in policies.items()}
     classes = tuple(model.classes[c] for c in columns)
     notes += whole_note(model, first.guide, truth, seen) + (() if truth is None else truth.notes)
     return Comparison(first, path, classes, sources, likelihoods, notes=notes, runs=runs)
+
+
+def _counted_by(run: RunFolder) -> list[int]:
+    """The classes that a run's network can count in its images, by number."""
+    return [c for c, name in enumerate(run.model.classes) if name not in run.unread]
 
 
 def _of(counts: dict[str, np.ndarray]) -> tuple[dict[str, Shares], dict[str, float]]:

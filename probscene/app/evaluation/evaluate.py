@@ -3,13 +3,15 @@
 Sources of counts: ``prior``, ``start`` where fits set out from another policy, and ``learnt`` are sampled structures;
 ``truth`` is a file of labels of the target's images; ``estimate`` is what the run's feature network counts in them,
 rounded. The last is no truth: the network learnt on prior renders alone and errs where objects crowd, but it is there
-without a single label. Where there are both, what was read in each image is held against its labels.
+without a single label. As it errs in renders, too, it is compared with what the same network reads in renders of the
+sampled structures, and never with the structures themselves. Where there are labels as well, what was read in each
+image is compared with them.
 
 Where kinds nest (cars on roads), children are counted by node and by the node's rank: which no context-free prior can
 weigh, and totals hide.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -23,10 +25,12 @@ from probscene.dataset import Images
 from probscene.errors import ProbsceneError
 from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation, wasserstein
 from probscene.inference.judging.tally import Tally
+from probscene.policy import Policy
 
 from ..fitting.fit import Progress
 from ..fitting.run import RunFolder
-from ..fitting.scene_features import features_in, kept_features, own_net
+from ..fitting.scene_features import features_in, features_of, kept_features, own_net
+from ..labelling.boxes import Boxes
 from ..walls.inexpressible import Inexpressible, inexpressible
 from ..walls.piled import Piled, piled, sentences
 from .count_errors import CountErrors, count_errors
@@ -34,9 +38,11 @@ from .estimate import class_counts, counted_classes, estimated
 from .image_distances import IMAGES, Distances, image_distances
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
-from .sources import FITTED, LEARNT, Source, before
+from .sources import ESTIMATE, FITTED, LEARNT, READ, Source, before
 from .structure_counts import Relation
 from .visible import Visible, counted, number_of, seen_by, whole_note
+
+IN_RENDERS = 1000  # renders of each source, at most, that the network reads
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +60,8 @@ class Evaluation:
         piled: the lists that are too short for what was learnt.
         inexpressible: the images that the model cannot have, by the labels, else by the estimate.
         errors: with labels, by class those of the counts that are read in each image; None where none are.
+        read: what the network that makes the estimate reads in renders of ``FITTED``; empty without an estimate.
+        boxes: of the labels.
     """
 
     run: RunFolder
@@ -66,6 +74,22 @@ class Evaluation:
     piled: tuple[Piled, ...] = ()
     inexpressible: tuple[Inexpressible, ...] = ()
     errors: dict[str, CountErrors | None] = field(default_factory=dict)
+    read: dict[str, Source] = field(default_factory=dict)
+    boxes: Boxes | None = None
+
+    def beside(self, b: str) -> dict[str, Source]:
+        """Source ``b``, and the others as they are compared with it: with the estimate, as the same network reads them
+        in renders."""
+        return self.sources | (self.read if b == ESTIMATE else {})
+
+    @property
+    def shown(self) -> dict[str, Source]:
+        """The sources whose histograms stand beside one another: before the estimate, which counts all classes or is
+        left out, what the network reads in learnt renders."""
+        found = {name: source for name, source in self.sources.items() if name != ESTIMATE}
+        if ESTIMATE in self.sources and not self.unread:
+            found |= {READ: self.read[LEARNT], ESTIMATE: self.sources[ESTIMATE]}
+        return found
 
     @cached_property
     def unread(self) -> tuple[str, ...]:
@@ -106,8 +130,8 @@ class Evaluation:
 
         ``kinds`` and ``children`` have both distances with their intervals, of each class's counts and, where kinds
         nest, of the children by ``structure_counts.GROUPS``; None where a source has no such node."""
-        one, other = self.sources[a], self.sources[b]
-        unread = self.unread if "estimate" in (a, b) else ()
+        one, other = self.beside(b)[a], self.sources[b]
+        unread = self.unread if b == ESTIMATE else ()
         number = histogram(one.total), histogram(other.total)
         shares = pooled_shares(one.counts), pooled_shares(other.counts)
         each = {
@@ -131,7 +155,7 @@ class Evaluation:
 
     def distances(self) -> dict[str, dict[str, dict[str, Any]]]:
         """From prior, start and learnt to the truth and to the estimate, where there are such."""
-        known = [name for name in ("truth", "estimate") if name in self.sources]
+        known = [name for name in ("truth", ESTIMATE) if name in self.sources]
         return {b: {a: self.distance(a, b) for a in FITTED if a in self.sources} for b in known}
 
     def record(self) -> dict[str, Any]:
@@ -153,6 +177,7 @@ class Evaluation:
                 "images": [found.record() for found in self.inexpressible],
             },
             "sources": {name: self._source(source) for name, source in self.sources.items()},
+            "read_in_renders": {name: self._source(source) for name, source in self.read.items()},
             "log_prob": {name: _plain(found) for name, found in self.likelihoods.items()},
             "images": {
                 name: {source: {figure.name: _plain(figure) for figure in found} for source, found in each.items()}
@@ -193,7 +218,7 @@ def evaluate(
     Args:
         target: its images; without them there is only the run's own record of what the network saw.
         truth: the labels of the target's images.
-        num: structures a source; see ``visible.SHOWN`` where they are rendered for it.
+        num: structures a source; see ``visible.SHOWN`` where they are rendered for it, and ``IN_RENDERS``.
         features: networks to compare images by, see ``seen.network``; none, as it renders.
         images: how many are compared at most, where they are; all where None.
         visible: least visible shares of what is counted in rendered scenes; those of the run where this is None.
@@ -228,16 +253,19 @@ def evaluate(
     if truth is not None:
         sources["truth"] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
     reading = features_read(run, target, progress)
-    estimate = None if reading is None else _estimate(run, reading)
+    estimate, read = None if reading is None else _estimate(run, reading), dict[str, Source]()
     if estimate is not None:
-        sources["estimate"] = estimate.only(columns)
+        sources[ESTIMATE] = estimate.only(columns)
+        in_renders = renders_read(run, policies, progress, num, seed)
+        read = {name: found.only(columns) for name, found in in_renders.items()}
     path = run.target if target is None else target.path
     classes = tuple(run.model.classes[c] for c in columns)
     notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
     short = piled(run.model, run.guide, None if run.unread else estimate, seed)
     beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
     errors = {} if truth is None else _errors(run, classes, truth, reading)
-    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, errors)
+    boxes = None if truth is None else truth.boxes
+    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, errors, read, boxes)
 
 
 def _inexpressible(
@@ -249,11 +277,11 @@ def _inexpressible(
     visible: bool,
 ) -> tuple[Inexpressible, ...]:
     """By the labels, else by the estimate of the classes whose instances can be counted."""
-    by = next((name for name in ("truth", "estimate") if name in sources), None)
+    by = next((name for name in ("truth", ESTIMATE) if name in sources), None)
     if by is None:
         return ()
     source = sources[by]
-    if by == "estimate":
+    if by == ESTIMATE:
         columns = [c for c, name in enumerate(classes) if name not in (*run.model.stuff, *run.unread)]
         classes, source = tuple(classes[c] for c in columns), source.only(columns)
     names = [] if target is None else [file.name for file in target.paths]
@@ -312,6 +340,31 @@ def _errors(
     return errors | {
         name: count_errors(found[:, names.index(name)], labelled[:, classes.index(name)]) for name in known
     }
+
+
+def renders_read(
+    run: RunFolder, policies: Mapping[str, Policy], progress: Progress, num: int, seed: int = 0
+) -> dict[str, Source]:
+    """What the run's feature network, which counts, reads in the first images that ``generate`` would write with
+    structures of each policy, rounded.
+
+    Args:
+        num: images of each, of which ``IN_RENDERS`` are read at most.
+    """
+    net, num, done = own_net(run), min(num, IN_RENDERS), 0
+
+    def each(images):
+        nonlocal done
+        done += images
+        progress("comparing", done, len(policies) * num, "")
+
+    found = {}
+    for name, policy in policies.items():
+        features = features_of(run, policy, num, net, seed, each)
+        read = estimated(run.model, run.feature_names, features * getattr(net, "unit", 1.0))
+        assert read is not None
+        found[name] = Source(*read)
+    return found
 
 
 def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:

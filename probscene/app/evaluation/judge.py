@@ -8,7 +8,7 @@ what can be read in them: those are another domain, and were read as such.
 Axis letters: N scenes, L images, D features.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,13 +31,15 @@ from ..fitting.observer import Observer
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..judging import looked
+from ..judging import sizes as size_figures
+from ..judging.advice import label
 from ..judging.aspects import Aspects, aspects
+from ..judging.sizes import Sizes, given_boxes, sizes, with_sizes
 from ..pictures import Pixels, pixels, shrunk
 from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement
 
-SCENES = 1000  # of the guide, and as many of the prior
-AFTER_A_FIT = 256  # where they are judged at once
+SCENES = 1000  # of the guide, and as many of the prior, whoever judges: a run has one verdict
 SHOWN = 8  # images in each picture
 THUMB = 128  # pixels
 
@@ -56,6 +58,8 @@ class Judged:
         walls: what the model is too narrow for, one sentence, where that is known.
         usable: which classes can be read, in a sentence, where the features say so.
         aspects: structure, layout and looks; None where there is no verdict.
+        basis: the images, their folder, whether the run was fitted to them, and the scenes of each side.
+        sizes: of the objects of each class of which boxes were given.
     """
 
     trust: Trust | None
@@ -67,35 +71,42 @@ class Judged:
     walls: str = ""
     usable: str = ""
     aspects: Aspects | None = None
+    basis: dict[str, Any] = field(default_factory=dict)
+    sizes: dict[str, Sizes] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
         if self.trust is None or self.aspects is None:
             return {"verdict": None, "because": self.absent}
-        more: dict[str, Any] = {"unlike_images": list(self.names)} | ({"usable": self.usable} if self.usable else {})
+        more: dict[str, Any] = {"basis": self.basis, "unlike_images": list(self.names)}
+        more |= {"usable": self.usable} if self.usable else {}
+        more |= {"sizes": size_figures.record(self.sizes)} if self.sizes else {}
         if self.agreement is not None:
             more["labels"] = self.agreement.record(self.trust.verdict)
-        return self.trust.record() | self.aspects.record() | more
+        parts = self.aspects.record()
+        parts = parts if self.agreement is None else self.agreement.corrected(parts)
+        return self.trust.record() | parts | more
 
 
 def judge(
     run: RunFolder,
     target: Images,
     progress: Progress,
-    num: int = SCENES,
+    num: int | None = None,
     evaluation: Evaluation | None = None,
     seed: int = 0,
 ) -> Judged:
     """Judge a finished run by a folder of real images.
 
     Args:
-        num: scenes of the guide, and as many of the prior.
+        num: scenes of the guide, and as many of the prior; ``SCENES`` where None.
         evaluation: with labels, what to hold the verdict against.
 
     Raises:
         ProbsceneError: fewer scenes than a verdict needs.
         RunError: see ``RunFolder.guide`` and ``own_net``.
     """
+    num = SCENES if num is None else num
     if num < NEEDED:
         raise ProbsceneError(f"Expected at least {NEEDED} scenes to judge by, actual {num}; or 0 for no verdict.")
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
@@ -108,7 +119,12 @@ def judge(
         )
     preset, model, net = run.preset, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)
-    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
+    own = kept_features(run, target) is not None
+    boxes = None if evaluation is None else evaluation.boxes
+    boxes = given_boxes(run, target) if boxes is None and own else boxes
+    total = 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
+    total += 0 if boxes is None else 2 * size_figures.SCENES
+    done = 0
 
     def each(images: int) -> None:
         nonlocal done
@@ -142,11 +158,15 @@ def judge(
     names = tuple(target.paths[i].name for i in real_unmatched)
     by_labels = None
     if evaluation is not None and "truth" in evaluation.sources:
-        by_labels = agreement(evaluation.sources["learnt"], evaluation.sources["truth"], evaluation.classes)
+        sources = evaluation.sources
+        by_labels = agreement(sources["learnt"], sources["truth"], evaluation.classes, label(run))
     walls = "" if evaluation is None else evaluation.walls
     features = {looked.LEARNT: scenes[0], looked.PRIOR: scenes[1], looked.TARGET: real}
-    parts = aspects(run, found, features, seen, seed)
-    return Judged(found, "", real_unmatched, generated_unmatched, names, by_labels, walls, usable(run), parts)
+    found_sizes = {} if boxes is None else sizes(run, boxes, each, seed)
+    parts = with_sizes(aspects(run, found, features, seen, seed), found_sizes)
+    basis = {"images": len(target), "folder": str(target.path), "fitted_to": own, "scenes": num}
+    shown = real_unmatched, generated_unmatched, names
+    return Judged(found, "", *shown, by_labels, walls, usable(run), parts, basis, found_sizes)
 
 
 def usable(run: RunFolder) -> str:

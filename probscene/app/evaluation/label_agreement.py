@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from probscene.inference.judging.nearness import Word
 from probscene.inference.judging.two_sample import JUDGED
 from probscene.inference.judging.verdict import Verdict
 
@@ -17,6 +18,7 @@ from .sources import Source
 
 RESAMPLES = 400
 RANKS = 6
+DISAGREE = "not good by the labels"
 
 
 class Compared(NamedTuple):
@@ -45,11 +47,13 @@ class Agreement(NamedTuple):
     Attributes:
         judged: how many of each side the comparison sees.
         labelled: how many images have labels.
+        remedy: what to do where a class is read wrongly, in words that follow others.
     """
 
     each: dict[str, Compared]
     judged: int
     labelled: int
+    remedy: str
 
     @property
     def close(self) -> bool:
@@ -64,13 +68,14 @@ class Agreement(NamedTuple):
         """Whether the labels say of the structures what the verdict says of the features."""
         return self.close == (verdict is Verdict.GOOD)
 
+    @property
+    def wrong(self) -> tuple[str, ...]:
+        """The histograms that are farther from the labels' than chance leaves."""
+        return tuple(name for name, found in self.each.items() if not found.close)
+
     def sentence(self, verdict: Verdict) -> str:
         """In words, with the figures of the worst histogram."""
-        found = self.each[self.worst]
-        figures = (
-            f"{self.worst}: total variation {found.distance:.3f}; seen on {self.judged} of each, {found.seen:.3f}, by "
-            f"chance {found.floor:.3f} and up to {found.high:.3f}"
-        )
+        figures = self._figures
         if self.agrees(verdict):
             which = "as near to the labels as labels are to one another" if self.close else "far from the labels"
             return f"The labels agree: learnt structures are {which} ({figures})."
@@ -79,10 +84,39 @@ class Agreement(NamedTuple):
                 f"The labels disagree: learnt structures are right ({figures}), so it is the features of the images "
                 "that differ."
             )
+        return f"{self._disagreement} {self._what_to_do}"
+
+    @property
+    def _figures(self) -> str:
+        """Of the worst histogram."""
+        found = self.each[self.worst]
         return (
-            f"The labels disagree: features match and structures do not ({figures}), so the feature network counts "
-            "wrongly in the real images; train it longer."
+            f"{self.worst}: total variation {found.distance:.3f}; seen on {self.judged} of each, {found.seen:.3f}, by "
+            f"chance {found.floor:.3f} and up to {found.high:.3f}"
         )
+
+    @property
+    def _disagreement(self) -> str:
+        return f"The labels disagree: features match and structures do not ({self._figures})."
+
+    @property
+    def _what_to_do(self) -> str:
+        return f"Wrongly read in the images: {', '.join(self.wrong)}. {self.remedy[:1].upper()}{self.remedy[1:]}."
+
+    def corrected(self, verdict: dict[str, Any]) -> dict[str, Any]:
+        """A verdict on parts and classes, for JSON, in which nothing is good that the labels disagree with."""
+        if self.close:
+            return verdict
+        words = verdict["classes"]
+        wrong = {name for name in words if name in self.wrong and words[name]["counts"] == Word.GOOD}
+        found = verdict | {"classes": {n: w | ({"counts": DISAGREE} if n in wrong else {}) for n, w in words.items()}}
+        structure = verdict["parts"]["structure"]
+        if structure["word"] != Word.GOOD:
+            return found
+        said = {"verdict": DISAGREE, "because": self._disagreement, "remedy": self._what_to_do}
+        overall = str(Word.BETTER) if verdict["overall"] == Word.GOOD else verdict["overall"]
+        parts = verdict["parts"] | {"structure": structure | {"word": str(Word.BETTER)} | said}
+        return found | said | {"overall": overall, "parts": parts}
 
     def record(self, verdict: Verdict) -> dict[str, Any]:
         """For JSON."""
@@ -95,13 +129,14 @@ class Agreement(NamedTuple):
         }
 
 
-def agreement(learnt: Source, truth: Source, classes: tuple[str, ...], seed: int = 0) -> Agreement:
+def agreement(learnt: Source, truth: Source, classes: tuple[str, ...], remedy: str, seed: int = 0) -> Agreement:
     """Compare.
 
     Args:
         learnt: structures of the guide.
         truth: the labels.
         classes: the C names.
+        remedy: see ``Agreement``.
     """
     rng = np.random.default_rng(seed)
     one, other = _columns(learnt, classes), _columns(truth, classes)
@@ -115,7 +150,7 @@ def agreement(learnt: Source, truth: Source, classes: tuple[str, ...], seed: int
         name: Compared(float(distance), float(seen.mean()), float(floor.mean()), limit * scale[name])
         for name, (distance, seen, floor) in found.items()
     }
-    return Agreement(each, judged, len(truth.total))
+    return Agreement(each, judged, len(truth.total), remedy)
 
 
 def _columns(source: Source, classes: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:

@@ -21,7 +21,7 @@ from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
-from ..labelling.boxes import read_boxes
+from ..labelling.boxes import Boxes, read_boxes
 from ..labelling.counts import read_table
 from ..labelling.naming import Entry, match_target
 from ..labelling.reading import has_boxes
@@ -42,6 +42,7 @@ class Labels(NamedTuple):
         min_height: where objects are labelled that can be seen, and not all that a structure has: that of a box which
             is counted, pixels of the canvas.
         rows: the numbers of the L images in the target; all of its images where None.
+        boxes: of the objects, where labels have such and none is left out.
     """
 
     structures: StructureCounts
@@ -50,6 +51,7 @@ class Labels(NamedTuple):
     notes: tuple[str, ...] = ()
     min_height: float | None = None
     rows: list[int] | None = None
+    boxes: Boxes | None = None
 
     def columns(self, model: SceneModel) -> list[int]:
         """Of the model's classes, the C that are labelled, by number."""
@@ -76,7 +78,8 @@ def read_labels(path: Path, model: SceneModel, target: Images, some: bool = Fals
         boxes = read_boxes(path, model, target, some, min_height)
         low = min_height * float(np.median(target.scales))
         counts, notes = StructureCounts(boxes.counts, {}), (SEEN, *boxes.notes)
-        return Labels(counts, classes=boxes.classes, notes=notes, min_height=low, rows=boxes.rows)
+        whole = None if min_height else boxes
+        return Labels(counts, None, boxes.classes, notes, low, boxes.rows, whole)
     if min_height:
         raise DataError(
             "Expected labels with boxes (COCO's, KITTI's or YOLO's) for a least height of objects, actual the file "

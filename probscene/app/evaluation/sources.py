@@ -18,6 +18,7 @@ from probscene.relations import PerParent
 from .structure_counts import Counts, Relation, tallies
 
 PRIOR, START, LEARNT = "prior", "start", "learnt"
+ESTIMATE, READ = "estimate", "read"  # what a network reads in the target's images, and in learnt renders
 FITTED = PRIOR, START, LEARNT  # sources that are sampled, in the order of a fit
 
 

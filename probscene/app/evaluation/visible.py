@@ -71,11 +71,8 @@ def seen_by(
     shares = _of_run(model, run) if given is None else visible_shares(given, model.classes)
     if given is None and not shares:
         return (None if truth is None or truth.min_height is None else Seen(truth.min_height)), ()
-    said = ", ".join(f"{name} {100 * share:.3g} %" for name, share in shares.items())
-    where = "" if given is not None else ", as the run's labels were read"
-    note = (
-        f"Prior and learnt scenes are rendered, and objects counted of which at least this is visible: {said}{where}."
-    )
+    said = _percentages(shares) if given is not None else _as_read(run, shares)
+    note = f"Prior and learnt scenes are rendered, and objects counted of which at least this is visible: {said}."
     return Seen(0.0 if truth is None else truth.min_height or 0.0, shares), (note,)
 
 
@@ -168,6 +165,20 @@ def shown(model: SceneModel, policy: Policy, num: int, seed: int, seen: Seen, ea
         if each is not None:
             each(len(parts[-1]))
     return torch.cat(parts).numpy()
+
+
+def _percentages(shares: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {100 * share:.3g} %" for name, share in shares.items())
+
+
+def _as_read(run: Storage, shares: Mapping[str, float]) -> str:
+    """The same, with what each class was read by in the run's images."""
+    records, words = run.readings["classes"], dict[str, dict[str, float]]()
+    for name, share in shares.items():
+        without = records[name].get("by") == "agreement"
+        how = "as its network reads the target's images without labels" if without else "as the run's labels were read"
+        words.setdefault(how, {})[name] = share
+    return "; ".join(f"{_percentages(some)}, {how}" for how, some in words.items())
 
 
 def _of_run(model: SceneModel, run: Storage) -> dict[str, float]:

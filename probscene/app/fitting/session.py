@@ -1,6 +1,7 @@
 """A fit from its beginning to its end: begun or taken up again, and timed.
 
-``timing.json`` in the run folder holds the seconds that each stage has taken, over all sittings that were not killed.
+``timing.json`` in the run folder holds the seconds that each stage has taken, over all sittings that were not killed,
+and as ``other`` those that no stage has: together they are the whole.
 """
 
 import dataclasses
@@ -35,9 +36,9 @@ from .preset import Preset
 from .presets import takers_of_labels
 from .run import RunFolder
 from .scene_features import UNLIKE, unlike
-from .storage import TIMING, check_free, timing
+from .storage import OTHER, TIMING, check_free, timing
 
-BEFORE = ("reading", "likeness", "features", "readings", "target", "pretraining")
+BEFORE = ("reading", "likeness", "looking", "features", "readings", "target", "pretraining")
 STAGES = (*BEFORE, "structure", "parameters", "structure-again", "outcome")
 
 
@@ -224,7 +225,9 @@ def carry_out(
     try:
         fit(run, show, target, cache, use_cache, show.say, run.few, cluster)
     finally:
-        spent = {stage: before.get(stage, 0.0) + show.seconds.get(stage, 0.0) for stage in STAGES}
+        now = {stage: show.seconds.get(stage, 0.0) for stage in STAGES}
+        now[OTHER] = show.elapsed - sum(show.seconds.values())
+        spent = {stage: before.get(stage, 0.0) + seconds for stage, seconds in now.items()}
         write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
 
 

@@ -34,7 +34,7 @@ from ..files import write_json, write_text, write_whole
 from ..modules import file_digest
 from .parts import IN_MEMORY, inner
 
-TIMING = "timing.json"
+TIMING, OTHER = "timing.json", "other"  # OTHER: seconds of no stage
 FORMAT = 3  # of the run folder; another number is not read
 READINGS, OUTCOME, PARAMETERS = "readings.json", "outcome.json", "parameters.json"
 SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost

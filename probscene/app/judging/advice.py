@@ -1,8 +1,10 @@
-"""What to do about layout and looks that are not good: by what was learnt, what was not read, and how sure it is."""
+"""What to do about parts of a fit that are not good: by what was learnt, what was not read, and how sure it is."""
 
 from typing import Any
 
 from probscene.inference.judging.nearness import CLEARLY, Nearness, Word
+from probscene.inference.judging.trust import Trust
+from probscene.inference.judging.verdict import Verdict
 
 from ..fitting.preset import BOTH, LIKELIHOOD, META_SIM, TILTING
 from ..fitting.run import RunFolder
@@ -12,17 +14,43 @@ PHOTO = (
     "images."
 )
 LONGER = {
-    LIKELIHOOD: "Fit longer: the default preset, or --set parameters.steps and parameters.rounds.",
-    TILTING: "Fit longer: --set tilting.rounds and tilting.scenes.",
-    META_SIM: "Fit longer: --set meta_sim.steps.",
+    LIKELIHOOD: ("parameters.steps", "parameters.rounds"),
+    TILTING: ("tilting.rounds", "tilting.scenes"),
+    META_SIM: ("meta_sim.steps",),
 }
 NONE = {
-    LIKELIHOOD: "Train the reader longer: the default preset, or --set parameters.reader_steps.",
     TILTING: "Give the model sites of the whole scene that images show.",
     META_SIM: "Give the model continuous sites.",
 }
+READER = ("parameters.reader_steps",)
 FARTHER = 2.0  # floors, from which on a site is named
 UNSURE = 0.7  # of the distance is left, and it is not sure that it is less than all
+
+
+def of_structure(run: RunFolder, found: Trust) -> str:
+    """What to do about structure, in a few sentences."""
+    if found.verdict is Verdict.NOT_FITTED:
+        return f"The guide still makes what the prior makes. {longer(run, ('batches',))}"
+    if found.verdict is Verdict.APART:
+        return f"{longer(run, ('batches',))} Where a class is read wrongly that does not help: {label(run)}."
+    return found.remedy
+
+
+def label(run: RunFolder) -> str:
+    """What to do about classes that are read wrongly in the target's images: label some."""
+    if "labels" in run.record:
+        return "label more images than this fit had (probscene label), and fit again with all of them"
+    return "label ten images (probscene label), and fit again with --labels"
+
+
+def longer(run: RunFolder, names: tuple[str, ...]) -> str:
+    """To take twice as much of some settings of the preset."""
+    had = []
+    for name in names:
+        part, _, setting = name.rpartition(".")
+        had.append(getattr(getattr(run.preset, part) if part else run.preset, setting))
+    words = " ".join(f"--set {name}={max(1, 2 * value)}" for name, value in zip(names, had, strict=True))
+    return f"Fit again for longer, such as twice the {' and '.join(map(str, had))} of this fit: {words}."
 
 
 def remedy(run: RunFolder, part: str, word: Word, figures: Nearness) -> str:
@@ -39,17 +67,20 @@ def remedy(run: RunFolder, part: str, word: Word, figures: Nearness) -> str:
 def _learn(run: RunFolder) -> str:
     """How parameters are learnt, or better."""
     record = run.parameters
+    method = record.get("method", LIKELIHOOD)
     if not record:
         if run.preset.learn != BOTH:
             return f"Learn parameters, too: fit again with --learn {BOTH}."
         return f"These features read no parameters: fit again with --features count, or --parameters {TILTING}."
     if not any(site["learnt"] for site in record["sites"]):
-        return NONE[record.get("method", LIKELIHOOD)]
+        if method == LIKELIHOOD:
+            return f"The reader reads no site. {longer(run, READER)}"
+        return NONE[method]
     if record["kept"] != "learnt":
         return (
             "What was learnt came no nearer to held-out images, and is unused: take the default preset or more images."
         )
-    return LONGER[record.get("method", LIKELIHOOD)]
+    return longer(run, LONGER[method])
 
 
 def _unread(record: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from probscene.inference.judging.verdict import Verdict
 from ..evaluation.estimate import class_counts, counted_classes
 from ..fitting.learnt.outcome import compared
 from ..fitting.run import RunFolder
-from .advice import remedy
+from .advice import of_structure, remedy
 from .looked import ALL, LEARNT, PRIOR, STRUCTURE, TARGET, Looked
 
 COUNTED = 500  # rows of each source whose counts are compared
@@ -142,7 +142,7 @@ def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: 
     sides = {name: Sample(_some(each if which is None else each[:, which])) for name, each in features.items()}
     figures = nearness(sides[TARGET], sides[LEARNT], {PRIOR: sides[PRIOR]}, seed=seed)
     word = called(None if figures is None else figures.word, found.verdict)
-    return Aspect(word, found.because, found.remedy, figures, str(found.verdict))
+    return Aspect(word, found.because, of_structure(run, found), figures, str(found.verdict))
 
 
 def said(figures: Nearness | None) -> str:

@@ -22,7 +22,14 @@ from ..evaluation.evaluate import Evaluation
 from .tables import nested_counts
 
 INK, FAINT = "#010203", "#010204"
-SOURCES = {"prior": "#010205", "start": "#010209", "learnt": "#010206", "truth": "#010207", "estimate": "#010208"}
+SOURCES = {
+    "prior": "#010205",
+    "start": "#010209",
+    "learnt": "#010206",
+    "truth": "#010207",
+    "estimate": "#010208",
+    "read": "#01020a",
+}
 VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
 READ = {"prior": "prior", "learnt": "learnt", "target": "truth"}  # in what a site is read, and its colour
 TALLEST = 6.0  # of a histogram over u, times the prior's density
@@ -51,7 +58,7 @@ STYLE: dict[Any, Any] = {
 def numbers(evaluation: Evaluation) -> str:
     """The share of images by number of objects."""
     return _counts(
-        {name: source.number() for name, source in evaluation.sources.items()},
+        {name: source.number() for name, source in evaluation.shown.items()},
         "objects in an image",
         "share of images",
         "number",
@@ -60,19 +67,19 @@ def numbers(evaluation: Evaluation) -> str:
 
 def classes(evaluation: Evaluation) -> str:
     """The share of objects by class."""
-    each = {name: source.classes() for name, source in evaluation.sources.items()}
+    each = {name: source.classes() for name, source in evaluation.shown.items()}
     return _bars(each, list(evaluation.classes), "class", "share of objects", "class")
 
 
 def nested(evaluation: Evaluation) -> list[str]:
     """Where kinds nest: images by the number of each class, then parents by the number of their children."""
-    sources, charts = evaluation.sources, []
+    sources, charts = evaluation.shown, []
     if not sources["learnt"].nested:
         return charts
     for c, kind in enumerate(evaluation.classes):
         each = {name: source.kinds[c].histogram() for name, source in sources.items()}
         charts.append(_counts(each, f"{kind} per image", "share of images", kind, SMALLER))
-    for what, tallies in nested_counts(evaluation).items():
+    for what, tallies in nested_counts(sources, evaluation.classes).items():
         each = {name: found.histogram() for name, found in tallies.items()}
         if len(each) > 1:
             share = "share of images" if what.endswith("per image") else "share"

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from probscene.errors import DataError
 
-from ..evaluation.compare import ESTIMATE, TRUTH, Comparison, Row
-from ..evaluation.sources import PRIOR, START
+from ..evaluation.compare import TRUTH, Comparison, Row
+from ..evaluation.sources import ESTIMATE, PRIOR, START
 from ..evaluation.structure_counts import ALL, OTHERS, label
 from ..files import make_folder, write_whole
 from .charts import label_bins

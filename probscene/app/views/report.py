@@ -11,19 +11,24 @@ from typing import Any
 
 import torch
 from PIL import Image
+from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import DataError, RunError
+from probscene.inference.parameters.sites import site_name
+from probscene.sampling import sample
+from probscene.threads import threads
 
+from ..chunks import chunk_randomness
 from ..evaluation.evaluate import Evaluation, evaluate
-from ..evaluation.judge import SCENES, Judged, judge
+from ..evaluation.judge import Judged, judge
 from ..evaluation.labels import read_labels
-from ..evaluation.sources import START
+from ..evaluation.sources import ESTIMATE, READ, START
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
 from ..fitting.fit import open_target
 from ..fitting.run import RunFolder
-from ..fitting.storage import timing
+from ..fitting.storage import OTHER, timing
 from ..judging.looked import LEARNT, PRIOR, STRUCTURE, policies
 from ..pictures import Pixels, grid, pixels, shrunk
 from ..progress import STAGES, Display
@@ -36,7 +41,9 @@ SITES = (
     "prior, 0 to 1. Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt "
     "from; the floor is that of two halves of it."
 )
-READ = {
+SHOWN, VALUES_OF = (0.05, 0.5, 0.95), 1000  # quantiles of a site of the scene, and scenes that they are of
+VALUES = "Of sites of the scene the last columns have quantiles of their values, in the program's units."
+OF_SITES = {
     "prior": "read in renders with the prior's parameters",
     "learnt": "with learnt parameters",
     "truth": "in the target",
@@ -46,7 +53,8 @@ LEGEND = {
     "start": "start: where the fit set out",
     "learnt": "learnt",
     "truth": "truth (labels)",
-    "estimate": "estimate: what the feature network counts in the target's images, without labels",
+    READ: "read: what the feature network counts in learnt renders",
+    ESTIMATE: "estimate: what it counts in the target's images, without labels",
 }
 
 
@@ -56,7 +64,7 @@ def report(
     out: Path | None = None,
     labels: Path | None = None,
     num: int = 10000,
-    judged_by: int = SCENES,
+    judged_by: int | None = None,
     visible: Visible | None = None,
     some_labels: bool = False,
 ) -> Path:
@@ -66,7 +74,7 @@ def report(
         out: ``report.html`` in the run folder where None.
         labels: of the run's target, see ``read_labels``.
         num: structures sampled a source.
-        judged_by: scenes rendered for the verdict, none where 0.
+        judged_by: scenes rendered for the verdict, none where 0; see ``judge``.
         visible: see ``evaluate``.
         some_labels: labels need not cover all images.
 
@@ -88,7 +96,7 @@ def report(
         absent = str(error)
     truth = None if labels is None or images is None else read_labels(labels, run.model, images, some_labels)
     evaluation = evaluate(run, images, truth, show, num, visible=visible)
-    judged = judge(run, images, show, judged_by, evaluation) if images and judged_by else None
+    judged = judge(run, images, show, judged_by, evaluation) if images and judged_by != 0 else None
     return write(run, evaluation, images, out, absent, judged)
 
 
@@ -117,7 +125,7 @@ def write(
             headline=_headline(evaluation),
             samples=_samples(run, images, absent),
             sites=_sites(run),
-            legend=_legend({name: LEGEND[name] for name in evaluation.sources}),
+            legend=_legend({name: LEGEND[name] for name in evaluation.shown}),
             numbers=charts.numbers(evaluation),
             classes=charts.classes(evaluation),
             nested=_nested(evaluation),
@@ -185,30 +193,65 @@ def said(run: RunFolder, source: str) -> str:
 
 
 def _sites(run: RunFolder) -> str:
-    """A table of the program's sites: whether each can be read, and what is read."""
+    """A table of the program's sites: whether each can be read, what is read, and what sites of the scene became."""
     record = run.parameters
     if not record:
         return "<p>Parameters were not learnt: where things stand and how they look keeps the prior.</p>"
+    sites, values = record["sites"], scene_values(run)
+    is_read = any(site["skill"] is not None or "read" in site for site in sites)
+    head = ["site", "of", ""]
+    head += ["skill", "prior", "this fit", "floor", "read in renders and target, 0 to 1"] if is_read else []
+    head += [f"{name}: {', '.join(f'{q:.0%}' for q in SHOWN)}" for name in ("prior", "learnt")] if values else []
     rows = []
-    for site in record["sites"]:
-        read = site.get("read")
+    for site in sites:
+        what = f"keeps the prior: {site['because']}"
         if site["learnt"]:
             what = "learnt" if record["kept"] == "learnt" else "learnt, and not kept"
-        else:
-            what = f"keeps the prior: {site['because']}"
-        chart = f'<div class="site">{charts.site(site["name"], read)}</div>' if read else "–"
-        distances = [_figure(read["distance"][key]) for key in ("prior", "learnt", "floor")] if read else ["–"] * 3
-        cells = [site["name"], ", ".join(site["kinds"]), _figure(site["skill"]), what, *distances]
-        rows.append("".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + f"<td>{chart}</td>")
-    head = ("site", "of", "skill", "", "prior", "this fit", "floor", "read in renders and target, 0 to 1")
+        cells = [
+            html.escape(cell)
+            for cell in (site["name"], ", ".join(site["kinds"]) or "the scene" * (site["name"] in values), what)
+        ]
+        read = site.get("read")
+        if is_read:
+            distances = [_figure(read["distance"][key]) for key in ("prior", "learnt", "floor")] if read else ["–"] * 3
+            chart = f'<div class="site">{charts.site(site["name"], read)}</div>' if read else "–"
+            cells += [_figure(site["skill"]), *distances, chart]
+        if values:
+            before, after = values.get(site["name"], (None, None))
+            cells += [_numbers(before), _numbers(after if site["learnt"] else None)]
+        rows.append("".join(f"<td>{cell}</td>" for cell in cells))
     first = "".join(f"<th>{name}</th>" for name in head)
     body = "".join(f"<tr>{row}</tr>" for row in rows)
-    learnt = any(site["learnt"] for site in record["sites"])
-    kept = _not_kept(record) if learnt and record["kept"] != "learnt" else ""
-    return (
-        f'{kept}<p class="legend">{_legend(READ)}</p><div class="chart"><table><tr>{first}</tr>{body}</table></div>'
-        f'<p class="soft">{SITES}</p>'
-    )
+    kept = _not_kept(record) if any(site["learnt"] for site in sites) and record["kept"] != "learnt" else ""
+    legend = f'<p class="legend">{_legend(OF_SITES)}</p>' if is_read else ""
+    said = " ".join([*([SITES] if is_read else []), *([VALUES] if values else [])])
+    return f'{kept}{legend}<div class="chart"><table><tr>{first}</tr>{body}</table></div><p class="soft">{said}</p>'
+
+
+def scene_values(run: RunFolder) -> dict[str, tuple[list[float], list[float] | None]]:
+    """Of each site with one value a scene, quantiles ``SHOWN`` in scenes of the prior and of the fit; None where the
+    latter has the prior's parameters."""
+    sites = {site["name"] for site in run.parameters["sites"] if not site["kinds"]}
+    found: list[dict[str, list[float]]] = []
+    for policy in (run.model.prior, run.guide) if sites else ():
+        if policy.suits is None and found:
+            break
+        with torch.no_grad(), threads(1), chunk_randomness(0, 0):
+            scenes = sample(run.model, policy, VALUES_OF, density=False)
+        values: dict[str, list[Tensor]] = {}
+        for name, value in scenes.parameters.items():
+            own, mask = site_name(run.model.grammar, name), scenes.site_mask[name]
+            one = own in sites and value.shape == mask.shape and mask.any() and mask.sum(1).max() == 1
+            if one and value.is_floating_point():
+                values.setdefault(own, []).append(value[mask])
+        at = torch.tensor(SHOWN)
+        found.append({name: torch.cat(some).float().quantile(at).tolist() for name, some in values.items()})
+    after = found[1] if len(found) > 1 else {}
+    return {name: (before, after.get(name)) for name, before in found[0].items()} if found else {}
+
+
+def _numbers(values: list[float] | None) -> str:
+    return "–" if values is None else ", ".join(f"{value:.3g}" for value in values)
 
 
 def _not_kept(record: dict[str, Any]) -> str:
@@ -234,12 +277,12 @@ def _picture(images: list[Pixels], caption: str, columns: int | None = None) -> 
 
 
 def _note(evaluation: Evaluation) -> str:
-    notes = [f"Labels: {html.escape(note)}" for note in evaluation.notes]
+    notes = [f"Note: {html.escape(note)}" for note in evaluation.notes]
     notes += [f"Read: {html.escape(line)}" for line in evaluation.readings]
-    if "estimate" in evaluation.sources:
+    if ESTIMATE in evaluation.sources:
         notes.append(
             "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; "
-            "its counts are rounded."
+            "its counts are rounded. It is compared with what the same network reads in renders."
         )
     return " ".join(notes)
 
@@ -273,7 +316,8 @@ def _timing(run: RunFolder) -> str:
     spent = timing(run)
     if not spent:
         return "<p>No times were recorded.</p>"
-    rows = [(STAGES[stage][0], f"{spent[stage]:.1f} s") for stage in STAGES if stage in spent]
+    names = {stage: name for stage, (name, _) in STAGES.items()} | {OTHER: "Other: between stages"}
+    rows = [(names[stage], f"{spent[stage]:.1f} s") for stage in names if stage in spent]
     return _table(["stage", "time"], [*rows, ("All", f"{sum(spent.values()):.1f} s")])
 
 

@@ -1,7 +1,7 @@
 """Evaluations and comparisons as tables of text."""
 
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,15 +12,16 @@ from rich.table import Table
 from probscene.inference.judging.metrics import Histogram, histogram_interval, ranges
 from probscene.inference.judging.tally import Interval, Tally
 
-from ..evaluation.compare import ESTIMATE, Comparison, Row
+from ..evaluation.compare import Comparison, Row
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.likelihood import Likelihood
-from ..evaluation.sources import FITTED, Source
+from ..evaluation.sources import ESTIMATE, FITTED, READ, Source
 from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, label
 
-NAMES = {"prior": "prior", "start": "start", "learnt": "learnt", "truth": "truth", "estimate": "estimate *"}
+NAMES = {name: name for name in ("prior", "start", "learnt", "truth")} | {READ: "read *", ESTIMATE: "estimate *"}
 FOOTNOTE = (
-    "* An estimate without labels: what the feature network counts in the target's images, rounded; not the truth."
+    "* An estimate without labels: what the feature network counts in the target's images, rounded; not the truth. It "
+    "is compared with what the same network reads in renders."
 )
 LEGEND = "TV: total variation, 0 to 1. W-1: Wasserstein-1, in objects."
 
@@ -45,7 +46,7 @@ def show(evaluation: Evaluation, console: Console) -> None:
     if evaluation.images:
         console.print(FLOOR, style="dim", soft_wrap=True)
     for note in evaluation.notes:
-        console.print(f"Labels: {note}", style="dim", soft_wrap=True)
+        console.print(f"Note: {note}", style="dim", soft_wrap=True)
     for note in sorted(notes):
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
     for warning in (*evaluation.kept, *evaluation.warnings):
@@ -54,25 +55,29 @@ def show(evaluation: Evaluation, console: Console) -> None:
 
 def apart(evaluation: Evaluation, spread: bool = False) -> list[Table]:
     """``distances`` with the means of every source."""
+    measured = evaluation.distances()
     means = {
-        name: {ALL_OBJECTS: float(source.total.mean())}
-        | {kind: found.mean() for kind, found in zip(evaluation.classes, source.kinds, strict=True)}
-        for name, source in evaluation.sources.items()
+        b: {
+            name: {ALL_OBJECTS: float(source.total.mean())}
+            | {kind: found.mean() for kind, found in zip(evaluation.classes, source.kinds, strict=True)}
+            for name, source in evaluation.beside(b).items()
+        }
+        for b in measured
     }
-    if evaluation.unread and ESTIMATE in means:
-        means[ESTIMATE] |= dict.fromkeys((ALL_OBJECTS, *evaluation.unread))
-    return distances(evaluation.distances(), means, spread)
+    for each in means.get(ESTIMATE, {}).values():
+        each |= dict.fromkeys((ALL_OBJECTS, *evaluation.unread) if evaluation.unread else ())
+    return distances(measured, means, spread)
 
 
 def distances(
-    measured: dict[str, Any], means: Mapping[str, Mapping[str, Any]] | None = None, spread: bool = False
+    measured: dict[str, Any], means: Mapping[str, Mapping[str, Mapping[str, Any]]] | None = None, spread: bool = False
 ) -> list[Table]:
     """How far prior, start and learnt structures are from the truth and from the estimate: a table each, with a row for
     all objects, one for each class's count, and one for the classes' shares.
 
     Args:
         measured: ``Evaluation.distances()``.
-        means: by source and row, where they are to be shown.
+        means: by what is compared with, source and row, where they are to be shown.
         spread: also half the width of the 95 % intervals that are known.
     """
     tables = []
@@ -84,7 +89,7 @@ def distances(
         if len(kinds) > 1:  # one class is all objects
             rows |= kinds | {SHARES: [(each["classes"], None) for each in found.values()]}
         for words, values in rows.items():
-            _add(table, words, values, [means[name].get(words) for name in shown] if means else [], spread)
+            _add(table, words, values, [means[b][name].get(words) for name in shown] if means else [], spread)
         tables.append(table)
     return tables
 
@@ -109,7 +114,7 @@ def _add(table: Table, words: str, values: list[tuple[Any, Any]], means: list[An
 
 
 def _numbers(evaluation: Evaluation) -> Table:
-    sources = _whole(evaluation)
+    sources = evaluation.shown
     table = _table("Images by number of objects, %", "objects", [NAMES[name] for name in sources])
     rows = ranges(source.total for source in sources.values())
     firsts = [first for first, _ in rows]
@@ -125,7 +130,7 @@ def _numbers(evaluation: Evaluation) -> Table:
 
 
 def _classes(evaluation: Evaluation) -> Table:
-    sources = _whole(evaluation)
+    sources = evaluation.shown
     table = _table("Objects by class, %", "class", [NAMES[name] for name in sources])
     each = [source.classes() for source in sources.values()]
     for c, name in enumerate(evaluation.classes):
@@ -133,12 +138,7 @@ def _classes(evaluation: Evaluation) -> Table:
     return table
 
 
-def _whole(evaluation: Evaluation) -> dict[str, Source]:
-    """The sources that count all classes."""
-    return {name: source for name, source in evaluation.sources.items() if name != ESTIMATE or not evaluation.unread}
-
-
-def nested_counts(evaluation: Evaluation) -> dict[str, dict[str, Tally]]:
+def nested_counts(sources: Mapping[str, Source], classes: Sequence[str]) -> dict[str, dict[str, Tally]]:
     """Where kinds nest, what is counted of them, in words, with the tallies of each source that has such nodes.
 
     What another row says is left out: how many parents there are, where they are a class or have been counted below
@@ -146,14 +146,12 @@ def nested_counts(evaluation: Evaluation) -> dict[str, dict[str, Tally]]:
     """
     found: dict[str, dict[str, Tally]] = {}
     whole: list[tuple[str, dict[str, Tally]]] = []
-    for relation in dict.fromkeys(r for source in evaluation.sources.values() for r in source.nested):
-        known = {
-            name: source.nested[relation] for name, source in evaluation.sources.items() if relation in source.nested
-        }
+    for relation in dict.fromkeys(r for source in sources.values() for r in source.nested):
+        known = {name: source.nested[relation] for name, source in sources.items() if relation in source.nested}
         before = [each for child, each in whole if child == relation[0]]
         for group in GROUPS:
             each = {name: tallies[group] for name, tallies in known.items() if not tallies[group].empty}
-            if not each or (group == PARENTS and relation[0] in evaluation.classes):
+            if not each or (group == PARENTS and relation[0] in classes):
                 continue
             if not any(_same(each, other) for other in before):
                 found.setdefault(label(relation, group), each)
@@ -175,19 +173,18 @@ def nested(evaluation: Evaluation, spread: bool = False) -> list[Table]:
     Args:
         spread: also half the width of the 95 % intervals.
     """
-    rows, tables = nested_counts(evaluation), []
-    if not rows:
-        return []
+    tables: list[Table] = []
     title, fitted = "Counts by what they depend on", [name for name in FITTED if name in evaluation.sources]
     for b in (name for name in evaluation.sources if name not in FITTED):
         table = _distances(f"{title}, distance to {WORDS[b]}", fitted, (*fitted, b))
-        for words, each in rows.items():
+        for words, each in nested_counts(evaluation.beside(b), evaluation.classes).items():
             if b in each:
                 found = [each[a].distance(each[b]) if a in each else None for a in fitted]
                 _add(table, words, [x or (None, None) for x in found], [_mean(each, n) for n in (*fitted, b)], spread)
         if table.row_count:
             tables.append(table)
-    if not tables:
+    rows = nested_counts(evaluation.sources, evaluation.classes)
+    if rows and not tables:
         table = _table(f"{title}, means", "", fitted)
         for words, each in rows.items():
             table.add_row(words, *(_figure(_mean(each, name), 2) for name in fitted))
@@ -280,7 +277,7 @@ def show_comparison(comparison: Comparison, console: Console) -> None:
     if comparison.reference == ESTIMATE:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
     for note in comparison.notes:
-        console.print(f"Labels: {note}", style="dim", soft_wrap=True)
+        console.print(f"Note: {note}", style="dim", soft_wrap=True)
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -294,7 +291,7 @@ def comparison_table(comparison: Comparison) -> Table:
     for name in comparison.sources:
         table.add_column(textwrap.fill(NAMES.get(name, name), 16), justify="right", no_wrap=True)
     rows, kinds = comparison.rows(), len(comparison.classes) if len(comparison.classes) > 1 else 0
-    known = nested_counts(comparison)
+    known = nested_counts(comparison.sources, comparison.classes)
     deeper = {row.label: row for row in rows[1 + kinds :] if row.label in known}
     for row in (*rows[: 1 + kinds], *([comparison.shares_of_classes()] if kinds else []), *deeper.values()):
         table.add_row(row.label, *(_compared(row, name) for name in comparison.sources))

@@ -21,7 +21,8 @@ PARTS = ("", "verdict", "this fit", "structure alone", "prior", "the floor")
 DISTANCES = (LEARNT, STRUCTURE, PRIOR, "floor")
 OVERALL = (
     "Energy distances from the target: of the run's features, of where objects stand in images with as many of them, "
-    f"and of EfficientNet's features. The whole is as good as its worst part. {FLOOR}"
+    "and of EfficientNet's features; sizes are medians of boxes. The whole is as good as its worst part. "
+    f"{FLOOR}"
 )
 
 
@@ -53,7 +54,7 @@ def show_parts(record: dict[str, Any], console: Console) -> None:
         console.print()
         return
     console.print(f"Verdict: {record['verdict']}.", style="bold", soft_wrap=True)
-    for text in (record["because"], record["remedy"]):
+    for text in (record["because"], record["remedy"], *judged_by(record)):
         console.print(text, soft_wrap=True)
     if "parts" not in record:  # of a run of before
         return
@@ -74,13 +75,26 @@ def section(judged: Judged, real: str, generated: str) -> str:
     record = judged.record()
     if judged.trust is None or record["verdict"] is None:
         return f"<p>No verdict. {html.escape(judged.absent)}</p>"
-    said = (record["because"], record["remedy"])
+    said = (record["because"], record["remedy"], *judged_by(record))
     more = (*what_to_do(record), *by_class(record), *sites(record), *_sentences(judged))
     return (
         f'<div class="card">Verdict<b>{html.escape(record["verdict"])}</b></div>{_paragraphs(said)}'
         f'{_table(PARTS, parts(record))}<p class="soft">{OVERALL}</p>{_paragraphs(more)}'
         f'<div class="row two">{real}{generated}</div><h3>Structure</h3>{_table(HEAD, rows(judged.trust))}'
     )
+
+
+def judged_by(record: dict[str, Any]) -> list[str]:
+    """Which images a verdict is about; nothing for those of before."""
+    if not (basis := record.get("basis")):
+        return []
+    images, folder, scenes = basis["images"], basis["folder"], basis["scenes"]
+    which = (
+        f"the {images} images that it was fitted to"
+        if basis["fitted_to"]
+        else f"{images} images that it was not fitted to, in {folder}"
+    )
+    return [f"Judged by {which}, {scenes} scenes of the fit and as many of the prior."]
 
 
 def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -95,11 +109,12 @@ def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def what_to_do(record: dict[str, Any]) -> list[str]:
-    """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said."""
+    """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said.
+    Sizes have their figures in any case."""
     return [
         f"{name.capitalize()}: {part['because']} {part['remedy'].removeprefix(record['remedy']).strip()}".strip()
         for name, part in record["parts"].items()
-        if part["word"] != "good" and part["because"] != record["because"]
+        if (part["word"] != "good" or name == "sizes") and part["because"] != record["because"]
     ]
 
 
@@ -157,7 +172,8 @@ def _sentences(judged: Judged) -> list[str]:
     """What else is known: which classes can be read, what labels say, what the model is too narrow for."""
     found = [judged.usable] if judged.usable else []
     if judged.agreement is not None and judged.trust is not None:
-        found.append(judged.agreement.sentence(judged.trust.verdict))
+        said = judged.agreement.sentence(judged.trust.verdict)
+        found += [] if said.startswith(judged.record()["because"]) else [said]
     return [*found, judged.walls] if judged.walls else found
 
 

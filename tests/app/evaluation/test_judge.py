@@ -1,18 +1,21 @@
 """The verdict on real renders: right where one knows it, held against labels, shown by both commands."""
 
 import functools
+import html
 import json
 import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation import judge as verdict
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.judge import judge
-from probscene.app.evaluation.label_agreement import agreement
+from probscene.app.evaluation.label_agreement import DISAGREE, agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
 from probscene.app.fitting.run import RunFolder
@@ -21,6 +24,7 @@ from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features import pretrained
+from probscene.inference.judging.nearness import Word, worst
 from probscene.inference.judging.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
 
@@ -143,11 +147,35 @@ def test_labels_disagree_where_the_network_counts_wrongly():
     rng = np.random.default_rng(0)
     truth = Source.of(rng.multinomial(6, [0.5, 0.5], 300))
     same, other = Source.of(rng.multinomial(6, [0.5, 0.5], 5000)), Source.of(rng.multinomial(6, [0.8, 0.2], 5000))
-    right, wrong = (agreement(side, truth, ("a", "b")) for side in (same, other))
+    right, wrong = (agreement(side, truth, ("a", "b"), "label ten images") for side in (same, other))
     assert right.close and right.agrees(Verdict.GOOD) and not right.agrees(Verdict.APART)
     assert not wrong.close and wrong.agrees(Verdict.APART) and not wrong.agrees(Verdict.GOOD)
-    assert "counts wrongly" in wrong.sentence(Verdict.GOOD) and "it is the features" in right.sentence(Verdict.APART)
+    said = wrong.sentence(Verdict.GOOD)
+    assert "Wrongly read in the images: a, b. Label ten images" in said and "train" not in said
+    assert "it is the features" in right.sentence(Verdict.APART)
     assert wrong.worst != "number of objects"  # that is always six
+
+
+@given(st.sampled_from(Word), st.sampled_from(Word), st.sampled_from(Word), st.booleans())
+def test_what_the_labels_disagree_with_is_nowhere_good(structure, layout, counts, close):
+    """And what they do not disagree with stays as it is."""
+    rng = np.random.default_rng(0)
+    truth = Source.of(rng.poisson([2, 4], (300, 2)))
+    learnt = Source.of(rng.poisson([2 if close else 4, 4], (3000, 2)))
+    found = agreement(learnt, truth, ("a", "b"), "label ten images")
+    parts = {"structure": structure, "layout": layout}
+    overall = worst(parts.values())
+    record = {"overall": str(overall), "verdict": str(overall), "because": "", "remedy": ""}
+    record |= {"parts": {name: {"word": str(word)} for name, word in parts.items()}}
+    record |= {"classes": {name: {"counts": str(counts), "layout": "good"} for name in "ab"}}
+    said = found.corrected(record)
+    assert said["parts"]["layout"] == record["parts"]["layout"] and said["classes"]["b"] == record["classes"]["b"]
+    assert found.close is close and (said == record or not close)
+    if not close:
+        assert found.wrong == ("number of objects", "a")
+        words = said["overall"], said["verdict"], said["parts"]["structure"]["word"], said["classes"]["a"]["counts"]
+        assert "good" not in words and (said["verdict"] == DISAGREE) is (structure is Word.GOOD)
+        assert said["overall"] == str(worst([overall, Word.BETTER]))
 
 
 def test_labels_of_one_distribution_rarely_disagree():
@@ -155,7 +183,7 @@ def test_labels_of_one_distribution_rarely_disagree():
     close = 0
     for seed in range(40):
         truth, learnt = (Source.of(rng.poisson([2, 0.3, 5], (n, 3))) for n in (120, 3000))
-        close += agreement(learnt, truth, ("a", "b", "c"), seed).close
+        close += agreement(learnt, truth, ("a", "b", "c"), "", seed).close
     assert close >= 38
 
 
@@ -172,13 +200,22 @@ def test_both_commands_say_it(call, seeing, drawn, tmp_path):
     assert "Can this fit be trusted?" in page and "Target images least like any generated scene: 000" in page
 
 
-def test_a_fit_ends_with_its_verdict(call, drawn, discs, tmp_path):
+def test_a_fit_ends_with_its_verdict_which_is_that_of_every_command_on_the_same_images(call, drawn, discs, tmp_path):
     words = [word for word in discs.settings if word != "--no-verdict"]
     done = call("fit", discs.file, "--target", drawn.target.path, "--out", tmp_path / "run", *words)
     assert done.code == 0, done.err
     assert re.match(r"Verdict: [\w ]+\.\n", done.out) and "\nLearnt." in done.out
     for part in ("structure", "layout", "looks"):
         assert re.search(rf"│ {part} +│", done.out)
+    said = done.out[: done.out.index("\nLearnt.")]
+    assert "Judged by the 200 images that it was fitted to, 60 scenes of the fit" in said
+    evaluated = call("evaluate", tmp_path / "run", "--target", drawn.target.path, "--num", 100)
+    shown = call("report", tmp_path / "run", "--num", 100, "--out", tmp_path / "r.html")
+    assert evaluated.out.startswith(said) and shown.code == 0
+    page = html.unescape((tmp_path / "r.html").read_text(encoding="utf-8"))
+    assert all(cell in page for cell in re.findall(r"\d+\.\d+", said)) and said.split("\n")[1] in page
+    others = call("evaluate", tmp_path / "run", "--target", drawn.crowd.path, "--num", 100, "--scenes", 50)
+    assert "Judged by 200 images that it was not fitted to, in " in others.out and "50 scenes of the fit" in others.out
     again = call("fit", "--resume", "--out", tmp_path / "run")
     assert again.code == 0 and "Verdict" not in again.out  # it was finished
 

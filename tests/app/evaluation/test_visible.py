@@ -1,5 +1,6 @@
 """What can be seen against plain loops over renders: which objects count, for whom, and what is said about it."""
 
+import itertools
 import json
 import shutil
 from types import SimpleNamespace
@@ -91,7 +92,7 @@ def test_the_hidden_are_what_is_hardly_seen(model, drawn):
 def run(fitted, tmp_path):
     """The fitted run, whose labels were read at other shares."""
     shutil.copytree(fitted, tmp_path / "run")
-    read = {"classes": {"red": {"visible": 0.5, "rule": "sum"}, "blue": {"rule": "sum"}}}
+    read = {"classes": {"red": {"visible": 0.5, "by": "labels"}, "blue": {"by": "labels"}}}
     (tmp_path / "run" / "readings.json").write_text(json.dumps(read))
     return RunFolder.at(tmp_path / "run")
 
@@ -115,6 +116,19 @@ def test_a_run_knows_what_labels_count(run, fitted, target):
     (run.path / "readings.json").write_text('{"classes": {"red": {"visible": 2}}}')
     with pytest.raises(RunError, match="visible shares"):
         seen_by(model, run, truth, None)
+
+
+def test_shares_are_said_to_be_read_by_what_they_were_read_by(run):
+    how = {"labels": "the run's labels", "histogram": "the run's labels", "agreement": "without labels"}
+    for red, blue in itertools.product(how, how):
+        read = {"red": {"visible": 0.5, "by": red}, "blue": {"visible": 0.25, "by": blue}}
+        (run.path / "readings.json").write_text(json.dumps({"classes": read}))
+        _, (note,) = seen_by(run.model, run, None, None)
+        groups = note.partition("visible: ")[2].split("; ")
+        assert len(groups) == len({how[red], how[blue]})
+        for name, by in (("red 50 %", red), ("blue 25 %", blue)):
+            (group,) = [group for group in groups if name in group]
+            assert how[by] in group and "labels" in group
 
 
 def test_a_note_says_where_it_matters(monkeypatch, model, target):

@@ -5,7 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fitting.learnt.outcome import _said, moved
+from probscene.app.fitting.learnt.outcome import _said, _worse_said, moved, worse_than_labels
+from probscene.app.labelling.few import FewLabels
 
 N = 500
 
@@ -38,3 +39,17 @@ def test_the_sentence_names_them_and_says_what_to_do():
     assert "car (from 1.66 to 2.01 in a structure)" in _said({"car": (1.66, 2.01)}) and "Label ten" in _said(
         {"a": (1, 2)}
     )
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_was_learnt_is_held_against_the_labels_histogram(seed):
+    """As many as the labels have are as good, whatever the labels; five more an image are worse. A class without
+    labels is left out."""
+    drawn = counts([1.0, 2.0, 1.0], seed)
+    labels = FewLabels(torch.arange(10), drawn[:10, :2].long(), ("dead", "live"), None, ())
+    learnt = dict(zip(("dead", "live", "other"), drawn.T.numpy(), strict=True))
+    assert worse_than_labels(labels, learnt) == {} and _worse_said({}) == ""
+    found = worse_than_labels(labels, learnt | {"dead": learnt["dead"] + 5})
+    assert found.keys() == {"dead"} and found["dead"][0] > found["dead"][1] + 1
+    assert f"dead ({found['dead'][0]:.2f} against {found['dead'][1]:.2f})" in _worse_said(found)
+    assert worse_than_labels(labels, {}) == {}

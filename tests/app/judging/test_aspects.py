@@ -23,7 +23,7 @@ from probscene.app.fitting.preset import LIKELIHOOD, META_SIM, TILTING
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.judging import looked
-from probscene.app.judging.advice import remedy
+from probscene.app.judging.advice import of_structure, remedy
 from probscene.app.judging.aspects import KINDS, Aspect, Aspects, called
 from probscene.app.views import verdict_text
 from probscene.dataset import ImageFolder
@@ -169,16 +169,27 @@ def test_sites_that_could_not_be_read_are_named(fitted):
 
 @pytest.mark.parametrize("method", [LIKELIHOOD, TILTING, META_SIM])
 @pytest.mark.parametrize("learnt", [True, False])
-def test_the_remedy_names_settings_that_the_fit_reads(method, learnt):
-    """Whatever it tells to be set is a setting of the way that was taken."""
+def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, learnt):
+    """Whatever it tells to be set is a setting of the way that was taken, and to be twice what it was."""
     site = {"name": "light", "kinds": [], "learnt": learnt, "skill": None, "because": ""}
-    run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]})
+    chosen = override(preset("quick"), [f"parameter_method={method}"])
+    run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]}, preset=chosen)
     figures = SimpleNamespace(left=None, high=None)
     said = remedy(run, "looks", Word.NO_BETTER, figures)
-    named = re.findall(r"(\w+)\.(\w+)", said.replace("scene.photo", ""))
-    chosen = override(preset("quick"), [f"parameter_method={method}"])
-    assert learnt <= bool(named) and all(hasattr(getattr(chosen, part), field) for part, field in named)
-    assert not {part for part, _ in named} & set(chosen.unread())
+    named = re.findall(r"--set (\w+)\.(\w+)=(\d+)", said)
+    assert said.count("--set") == len(named) and learnt <= bool(named)
+    assert all(int(value) == 2 * getattr(getattr(chosen, part), field) for part, field, value in named)
+    assert not {part for part, *_ in named} & set(chosen.unread())
+
+
+@pytest.mark.parametrize("verdict", Verdict)
+@pytest.mark.parametrize("labelled", [True, False])
+def test_structure_that_is_read_wrongly_needs_labels_and_what_is_to_be_set_has_a_value(verdict, labelled):
+    run = SimpleNamespace(preset=preset("quick"), record={"labels": {}} if labelled else {})
+    said = of_structure(run, SimpleNamespace(verdict=verdict, remedy="Use it."))
+    assert "train" not in said and ("--set batches=120" in said) is (verdict in (Verdict.NOT_FITTED, Verdict.APART))
+    if verdict is Verdict.APART:
+        assert ("label more images than this fit had" if labelled else "label ten images") in said
 
 
 def printed(found) -> str:

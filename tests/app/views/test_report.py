@@ -1,21 +1,28 @@
 """The report: one page that needs nothing else, says what the run holds, and stands where the target is gone."""
 
 import base64
+import copy
 import html
 import io
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
+import pyro
+import pyro.distributions as dist
 import pytest
 from PIL import Image
 
 from probscene.app.fitting.run import RunFolder
+from probscene.app.loading import load_model
 from probscene.app.progress import Display
 from probscene.app.views import charts
-from probscene.app.views.report import report
+from probscene.app.views.report import _sites, report, scene_values
 from probscene.errors import DataError, RunError
+from probscene.model import SceneModel
 
 VOID = {"meta", "img", "br"}
 
@@ -116,6 +123,35 @@ def test_the_page_shows_every_site_and_what_is_read_of_it(kept, fitted, tmp_path
         assert what in section, what
     assert ("All sites keep the prior" in section) is (kept == "prior")
     assert ("learnt, and not kept" in section) is (kept == "prior")
+
+
+def lit(low: float, high: float, model) -> SceneModel:
+    """A model whose scenes have a light from ``low`` to ``high``, beside discs of as many places as there are."""
+
+    def program(num_scenes, structure):
+        with pyro.plate("lights", num_scenes, dim=-2):
+            pyro.sample("light", dist.Uniform(low, high).expand((num_scenes, 1)))
+        return model.program(num_scenes, structure)
+
+    return replace(model, program=program)
+
+
+@pytest.mark.parametrize("learnt", [True, False])
+def test_a_site_of_the_scene_has_quantiles_of_what_it_was_and_what_it_became(learnt, discs):
+    model = lit(0.0, 10.0, load_model(str(discs.file)))
+    guide = copy.copy(model.prior)
+    guide.suits = (lambda model: lit(4.0, 5.0, load_model(str(discs.file)))) if learnt else None
+    about = {"learnt": False, "skill": None, "because": "it is not of the whole scene"}
+    sites = [about | {"name": "light", "kinds": [], "learnt": learnt, "because": ""}]
+    sites += [about | {"name": "x", "kinds": ["red"]}, about | {"name": "y", "kinds": []}]
+    run = SimpleNamespace(model=model, guide=guide, parameters={"kept": "learnt", "sites": sites})
+    ((before, after),) = [scene_values(run).pop("light")]
+    assert before == pytest.approx([0.5, 5.0, 9.5], abs=0.5) and scene_values(run).keys() == {"light"}
+    if learnt:
+        assert after == pytest.approx([4.05, 4.5, 4.95], abs=0.05)
+    table = Page(_sites(run)).text
+    assert "the scene" in table and f"{before[1]:.3g}" in table and "skill" not in table
+    assert ("learnt: 5%" in table) and ((after is not None) is learnt)
 
 
 def test_the_page_of_a_run_without_parameters_says_so(fitted, tmp_path):

@@ -97,7 +97,7 @@ def test_what_depends_on_context_is_one_table_that_says_nothing_twice(found):
 
 
 def test_what_is_left_out_is_what_another_row_says(found):
-    kept = tables.nested_counts(found)
+    kept = tables.nested_counts(found.sources, found.classes)
     for relation, groups in found.sources["learnt"].nested.items():
         for group, tally in groups.items():
             if not tally.empty and label(relation, group) not in kept:

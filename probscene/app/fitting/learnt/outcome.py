@@ -1,22 +1,27 @@
 """What a fit leaves: the learnt guide, or the prior where the guide's scenes are farther from the target.
 
 New scenes of both are looked at through the run's own features. The number of a class that cannot be read is held
-(``inference.holding``); where it changes all the same, as it goes with what was learnt of others, that is said.
+(``inference.holding``); where it changes all the same, as it goes with what was learnt of others, that is said. So is
+where learnt scenes predict the few labels worse than the labels' own histogram does. Axis letters: N scenes, K labels.
 """
 
 import math
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.photographs.readability import ENOUGH, histogram_scores, scores
 from probscene.inference.guides.base import Guide
 from probscene.inference.judging.farther import farther
 from probscene.inference.training import batch_seed
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
 
+from ...labelling.few import FewLabels
 from ...progress import Progress
 from ..observer import RENDERED_AT_ONCE, Observer
 from ..run import PRIOR_KEPT, RunFolder
@@ -24,6 +29,7 @@ from .parameters import NAME, beside
 
 SCENES = 500  # of each policy, at most; fewer where the fit's batches are smaller
 REJECTED = "guide-rejected"
+WORSE, LITTLE = 2.0, 0.1  # standard errors, and objects, by which scores on labels differ that are told
 SURELY, MUCH = 4.0, 0.1  # standard errors by which means differ that are told, and what part of the larger one
 
 
@@ -42,8 +48,8 @@ def give_up(run: RunFolder) -> str:
 def conclude(
     run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, guide: Guide, progress: Progress
 ) -> str:
-    """Keep the guide or the prior; a sentence where it is the prior, or where a class that cannot be read has another
-    number than in the prior, else nothing.
+    """Keep the guide or the prior; sentences where it is the prior, where a class that cannot be read has another
+    number than in the prior, and where the labels' histogram is better than what was learnt, else nothing.
 
     Args:
         net: what it learnt by.
@@ -74,9 +80,11 @@ def conclude(
         unread = run.unread
         kinds = {kind: i for i, kind in enumerate(run.model.grammar.kinds) if kind in unread}
         changed = moved(numbers[0], numbers[1], kinds)
-        run.write_outcome(record | ({"moved": changed} if changed else {}))
+        worse = {} if run.few is None else worse_than_labels(run.few, _class_counts(net, found[0], which))
+        more = {"moved": changed, "worse_than_labels": worse}
+        run.write_outcome(record | {name: what for name, what in more.items() if what})
         run.write_tensors("guide", guide.state_dict() | beside(run.read_tensors(NAME) or {}))
-        return _said(changed)
+        return " ".join(filter(None, (_said(changed), _worse_said(worse))))
     because = (
         f"Learnt scenes are farther from the target than the prior's, {apart.one:.2f} against {apart.other:.2f} in "
         "energy distance of the features"
@@ -100,6 +108,41 @@ def moved(learnt: Tensor, prior: Tensor, kinds: dict[str, int]) -> dict[str, tup
         if abs(after - before) > max(SURELY * chance, MUCH * max(before, after)):
             found[name] = before, after
     return found
+
+
+def worse_than_labels(labels: FewLabels, learnt: dict[str, NDArray[np.float64]]) -> dict[str, tuple[float, float]]:
+    """Classes whose labels are surely predicted worse by learnt scenes than by the labels' own histogram: the mean
+    continuous ranked probability scores of both.
+
+    Args:
+        learnt: by class, ``(N,)`` counts of what can be seen in learnt scenes.
+    """
+    found = {}
+    for name, counts in zip(labels.classes, labels.counts.T.double().numpy(), strict=True):
+        if name not in learnt or len(counts) < ENOUGH:
+            continue
+        of_scenes, of_labels = scores(learnt[name], counts), histogram_scores(counts)
+        chance = float((of_scenes - of_labels).std(ddof=1)) / math.sqrt(len(counts))
+        if (of_scenes - of_labels).mean() > max(WORSE * chance, LITTLE):
+            found[name] = float(of_scenes.mean()), float(of_labels.mean())
+    return found
+
+
+def _class_counts(net: FeatureNet, features: NDArray[np.float64], which: slice | Tensor) -> dict[str, Any]:
+    """By the names of features, what they count ``(N,)``."""
+    unit = getattr(net, "unit", None)
+    unit = np.ones(len(net.names)) if unit is None else unit.double().numpy()
+    return dict(zip(np.array(net.names)[which], (features * unit[which]).T, strict=True))
+
+
+def _worse_said(worse: dict[str, tuple[float, float]]) -> str:
+    if not worse:
+        return ""
+    each = ", ".join(f"{name} ({learnt:.2f} against {labels:.2f})" for name, (learnt, labels) in worse.items())
+    return (
+        "Learnt scenes predict the labels worse than the labels' own histogram does, by the continuous ranked "
+        f"probability score in objects: {each}. Label more images, and fit again with all of them."
+    )
 
 
 def _said(changed: dict[str, tuple[float, float]]) -> str:

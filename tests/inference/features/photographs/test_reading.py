@@ -13,8 +13,10 @@ from probscene.inference.features.photographs.readability import (
     AGREE,
     Read,
     disagreement,
+    histogram_scores,
     rules_for_renders,
     scopes_without_labels,
+    scores,
     with_labels,
     without_labels,
 )
@@ -198,6 +200,45 @@ def test_the_labels_histogram_is_learnt_where_nothing_reads_them():
     counts = by_steps(read.photographs[:, found.scope, found.rules[0]], torch.tensor([found.steps]))
     assert found.readable and found.by == "histogram" and found.error > 0
     assert counts.mean().item() == pytest.approx(labels.mean().item(), abs=0.35)
+
+
+@pytest.mark.parametrize("apart", [0.02, 2.0], ids=["readable without labels", "not readable without them"])
+@pytest.mark.parametrize("noise", [0.2, 1.0, 2.0, 3.0])
+def test_no_reading_that_errs_more_than_the_labels_histogram_is_learnt(noise, apart):
+    """Of unbiased readings, which labels would bear out: those that err clearly more, or a histogram of which predicts
+    labels worse, are given up."""
+    labels = torch.from_numpy(COUNTS[:10])
+    off = noise * np.random.default_rng(4).permutation(np.linspace(-1.7, 1.7, len(COUNTS)))
+    off[:10] -= off[:10].mean()
+    found = with_labels(made(COUNTS[:10], COUNTS + off, apart), 0, labels)
+    error, histogram = float(np.abs(off[:10]).mean()), float(histogram_scores(COUNTS[:10]).mean())
+    assert found.readable and (found.by == "histogram") is (error > histogram)
+    assert ("bear it out" in found.because) is (found.by == "labels" and apart < 1)
+    assert ("histogram of 10 labels is learnt" in found.because) is (found.by == "histogram")
+
+
+def test_a_reading_whose_histogram_is_right_may_err_a_little_more_than_the_labels_histogram():
+    """As what one image shows is not asked for. Far more it may not err, nor with another histogram."""
+    labels, rng = torch.from_numpy(COUNTS[:10]), np.random.default_rng(0)
+    for _ in range(200):
+        seen = COUNTS.copy()
+        seen[:10] = rng.permutation(COUNTS[:10])
+        error, histogram = np.abs(seen[:10] - COUNTS[:10]).mean(), float(histogram_scores(COUNTS[:10]).mean())
+        if histogram + 0.05 < error < 1.25 * histogram:
+            break
+    assert with_labels(made(COUNTS[:10], seen), 0, labels).by == "labels"
+    wider = np.concatenate([seen[:10], seen[10:] * 3 - 4])
+    assert with_labels(made(COUNTS[:10], wider), 0, labels).by == "histogram"
+
+
+@given(arrays(float, st.integers(1, 9), elements=st.floats(-9, 9)), arrays(float, 4, elements=st.floats(0, 9)))
+def test_the_score_is_the_mean_distance_less_half_of_the_distances_among_what_is_read(seen, labels):
+    among = np.mean([abs(a - b) for a in seen for b in seen])
+    for label, score in zip(labels, scores(seen, labels), strict=True):
+        assert score == pytest.approx(np.mean(np.abs(seen - label)) - among / 2, abs=1e-9)
+    for i, score in enumerate(histogram_scores(labels)):
+        others = np.delete(labels, i)
+        assert score == pytest.approx(scores(others, labels[i : i + 1])[0], abs=1e-9)
 
 
 def test_labels_of_another_place_choose_no_rule():
