@@ -68,8 +68,8 @@ def generate(
         source: a run or its folder, for the learnt structures; or a model, for the prior's.
         num: how many images.
         out: the folder to write, or an address of a file system that fsspec knows, such as ``s3://bucket/folder``.
-        format: ``"coco"``, ``"panoptic"``, ``"yolo"``, ``"yolo-seg"``, ``"yolo-obb"``, ``"kitti"``, ``"webdataset"``,
-            ``"depth"``, several of them, or ``"images"`` for no labels.
+        format: ``"coco"``, ``"panoptic"``, ``"yolo"``, ``"yolo-seg"``, ``"yolo-obb"``, ``"yolo-pose"``, ``"kitti"``,
+            ``"webdataset"``, ``"depth"``, several of them, or ``"images"`` for no labels.
         workers: processes of a run's generation; the bytes do not depend on their number. More than one are spawned: a
             script calls this under ``if __name__ == "__main__":``.
         policy: other structures for a model.

@@ -20,8 +20,8 @@ def generate(
         list[str] | None,
         typer.Option(
             metavar="FORMAT",
-            help="coco (if not given), panoptic, yolo, yolo-seg, yolo-obb, kitti, webdataset, depth, or images for no "
-            "labels; again for more.",
+            help="coco (if not given), panoptic, yolo, yolo-seg, yolo-obb, yolo-pose, kitti, webdataset, depth, or "
+            "images for no labels; again for more.",
         ),
     ] = None,
     seed: Seed = 0,

@@ -229,12 +229,18 @@ class Job:
     def _check(self) -> None:
         """See that the model's scenes have what is asked for, before anything is written."""
         boxes = "kitti" in self.formats and self.box_margin > 0
-        if not ("depth" in self.formats or boxes or self.amodal or self.values):
+        posed = "yolo-pose" in self.formats
+        if not ("depth" in self.formats or boxes or posed or self.amodal or self.values):
             return
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], 0)
         attributes.check(self.model, scenes, self.values)
         if self.amodal:
             amodal.check(self.model, scenes.drawing)
+        if posed and keypoints(scenes.drawing[:1], self.model.canvas) is None:
+            raise ProbsceneError(
+                f"Expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, actual none; "
+                "name some: Sprites(..., keypoints={'nose': (0.5, 0.2)}), or choose other formats."
+            )
         if "depth" in self.formats or boxes:
             first = self._renderer(scenes.drawing[:1])
             if boxes:
@@ -261,7 +267,7 @@ class Job:
         if self.formats != ("images",):
             record |= self._annotated(scenes, drawing, batch, first)
         record["provenance"] = provenance(self.model, scenes, first, self.origin, self.folder.flat)[:size]
-        files, links = self._files(drawing, batch, first, record["annotations"])
+        files, links = self._files(drawing, batch, first, record)
         if "panoptic" in self.formats:
             found = panoptic.segments(self.model, batch, record["annotations"], first, self.min_visible)
             record["panoptic"] = found[0]
@@ -284,11 +290,11 @@ class Job:
         return {"annotations": found, "keypoints": {} if points is None else points.names}
 
     def _files(
-        self, drawing: Renderable, batch: RenderBatch, first: int, found: list[dict[str, Any]]
+        self, drawing: Renderable, batch: RenderBatch, first: int, record: dict[str, Any]
     ) -> tuple[dict[str, bytes], dict[str, str]]:
         """What is written of each image at once, and further names of that; see ``DatasetFolder.write``."""
         of_image: dict[int, list] = {first + i: [] for i in range(len(batch.image))}
-        for annotation in found:
+        for annotation in record["annotations"]:
             of_image[annotation["image_id"]].append(annotation)
         images = map(png, as_written(self.model, batch.image))
         files = {self.folder.image(i): image for i, image in zip(of_image, images, strict=True)}
@@ -300,6 +306,9 @@ class Job:
             lines["yolo-seg"] = yolo.polygons(self.model, batch, self.min_visible)
         if "yolo-obb" in self.formats:
             lines["yolo-obb"] = yolo.oriented(self.model, batch, drawing, self.min_visible, self.box_margin)
+        if "yolo-pose" in self.formats:
+            number = _most(record["keypoints"])
+            lines["yolo-pose"] = [yolo.label(self.model, of_image[i], number) for i in of_image]
         for folder, texts in lines.items():
             names = [f"{folder}/{yolo.label_name(i, flat)}" for i in of_image]
             files |= {name: text.encode() for name, text in zip(names, texts, strict=True)}
@@ -327,10 +336,9 @@ class Job:
         if "panoptic" in self.formats:
             segments = (record["panoptic"] for record in folder.records())
             labels["panoptic.json"] = lambda path: panoptic.write(path, model, folder.num, info, segments, flat)
-        for name in ("yolo", "yolo-seg", "yolo-obb"):
+        for name in ("yolo", "yolo-seg", "yolo-obb", "yolo-pose"):
             if name in self.formats:
-                file = "data.yaml" if name == "yolo" else f"{name}/data.yaml"
-                labels[file] = lambda path: path.write_text(yolo.data(model), encoding="utf-8", newline="\n")
+                labels["data.yaml" if name == "yolo" else f"{name}/data.yaml"] = partial(self._write_data, name)
         if "webdataset" in self.formats:
             for number, chunks in enumerate(folder.chunks(shards.CHUNKS)):
                 labels[shards.shard_name(number)] = partial(self._write_shard, chunks)
@@ -339,24 +347,33 @@ class Job:
         return labels
 
     def _write_coco(self, path: Path, info: dict[str, Any]) -> None:
-        """Write COCO's annotations.
+        """Write COCO's annotations."""
+        names = next(self.folder.records())["keypoints"]
+        found = (annotation for record in self._records() for annotation in record["annotations"])
+        coco.write(path, self.model, self.folder.num, info, found, self.folder.flat, names)
+
+    def _write_data(self, name: str, path: Path) -> None:
+        """Write the ``data.yaml`` of a format of YOLO."""
+        number = 0
+        for record in self._records() if name == "yolo-pose" else ():
+            number = _most(record["keypoints"])
+        path.write_text(yolo.data(self.model, number), encoding="utf-8", newline="\n")
+
+    def _records(self) -> Iterator[dict[str, Any]]:
+        """The chunks' records.
 
         Raises:
             ModelError: keypoints of some scenes have other names than those of others.
         """
-        names = next(self.folder.records())["keypoints"]
-
-        def found() -> Iterator[dict[str, Any]]:
-            for record in self.folder.records():
-                if record["keypoints"] != names:
-                    raise ModelError(
-                        f"Expected model {self.model.name!r} to name the same keypoints whatever it draws, actual "
-                        f"{names} in some scenes and {record['keypoints']} in others; give scene.draw every layer "
-                        "always."
-                    )
-                yield from record["annotations"]
-
-        coco.write(path, self.model, self.folder.num, info, found(), self.folder.flat, names)
+        names = None
+        for record in self.folder.records():
+            names = record["keypoints"] if names is None else names
+            if record["keypoints"] != names:
+                raise ModelError(
+                    f"Expected model {self.model.name!r} to name the same keypoints whatever it draws, actual {names} "
+                    f"in some scenes and {record['keypoints']} in others; give scene.draw every layer always."
+                )
+            yield record
 
     def _write_shard(self, chunks: range, path: Path) -> None:
         def samples() -> Iterator[tuple[int, dict[str, bytes]]]:
@@ -367,6 +384,11 @@ class Job:
                     yield i, {"png": image, "json": label}
 
         shards.write(path, samples())
+
+
+def _most(keypoints: dict[str, Any]) -> int:
+    """The largest number of keypoints that a class has."""
+    return max(map(len, keypoints.values()), default=0)
 
 
 def _worker(run: Path, num: int, out: str, seed: int, format: tuple[str, ...], *settings: Any) -> Callable[[int], int]:

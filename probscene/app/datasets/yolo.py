@@ -6,6 +6,7 @@
 
     yolo-seg/   data.yaml, images and labels likewise, a line: class x1 y1 x2 y2 ..., the corners of a polygon
     yolo-obb/   the same, a line: class x1 y1 x2 y2 x3 y3 x4 y4, the corners of an oriented box
+    yolo-pose/  the same, a line: class cx cy w h x1 y1 v1 ..., keypoints with COCO's visibility; kpt_shape in data.yaml
 
 A polygon holds the visible pixels and no others, see ``polygons``. Ultralytics draws its border too, which adds a pixel
 to the right and below, and a line between the parts of an object that has several.
@@ -13,6 +14,8 @@ to the right and below, and a line between the parts of an object that has sever
 An oriented box is turned as the object's sprite is and touches what is visible; its corners are the sprite's upper left
 one, then clockwise. Of meshes and of what a generator draws it is the smallest rectangle around the visible pixels.
 Ultralytics refuses corners beyond the image, so these are moved to its border.
+
+All lines with keypoints have as many of them; for classes that have fewer, zeros are added.
 
 ``data.yaml`` names the same images for training and validation; set another folder of images aside for the latter.
 """
@@ -41,8 +44,8 @@ def label_name(index: int, flat: bool = True) -> str:
     return f"labels/{stem(index, flat)}.txt"
 
 
-def label(model: SceneModel, annotations: list[dict[str, Any]]) -> str:
-    """The lines of one image's COCO annotations, in their order.
+def label(model: SceneModel, annotations: list[dict[str, Any]], keypoints: int = 0) -> str:
+    """The lines of one image's COCO annotations, in their order, with so many keypoints each.
 
     Eight decimals: times a canvas of up to a million pixels and rounded, the corners are COCO's.
     """
@@ -50,8 +53,12 @@ def label(model: SceneModel, annotations: list[dict[str, Any]]) -> str:
     lines = []
     for annotation in annotations:
         x, y, w, h = annotation["bbox"]
-        numbers = ((x + w / 2) / width, (y + h / 2) / height, w / width, h / height)
-        lines.append(_line(annotation["category_id"], numbers))
+        line = _line(annotation["category_id"], ((x + w / 2) / width, (y + h / 2) / height, w / width, h / height))
+        points = annotation.get("keypoints", []) if keypoints else []
+        points = points + [0] * (3 * keypoints - len(points))
+        for at in range(0, len(points), 3):
+            line += f" {points[at] / width:.8f} {points[at + 1] / height:.8f} {points[at + 2]}"
+        lines.append(line + "\n")
     return "".join(lines)
 
 
@@ -95,10 +102,11 @@ def around(mask: np.ndarray, angle: float, margin: float = 0.0) -> np.ndarray:
     return np.array([(left, top), (right, top), (right, bottom), (left, bottom)]) @ axes
 
 
-def data(model: SceneModel) -> str:
-    """``data.yaml``; without ``path``, a reader looks beside the file."""
+def data(model: SceneModel, keypoints: int = 0) -> str:
+    """``data.yaml``, of labels with so many keypoints; without ``path``, a reader looks beside the file."""
     names = "".join(f"  {i}: {json.dumps(name, ensure_ascii=False)}\n" for i, name in enumerate(model.classes))
-    return f"train: images\nval: images\nnames:\n{names}"
+    shape = f"kpt_shape: [{keypoints}, 3]\n" if keypoints else ""
+    return f"train: images\nval: images\n{shape}names:\n{names}"
 
 
 def _labels(model: SceneModel, batch: RenderBatch, min_visible: float, corners: Any) -> list[str]:
@@ -109,13 +117,13 @@ def _labels(model: SceneModel, batch: RenderBatch, min_visible: float, corners: 
         lines = []
         for node in category[i].nonzero()[:, 0].tolist():
             shares = np.clip(corners(instance == node + 1, i, node) / size, 0, 1) + 0.0  # no -0
-            lines.append(_line(int(category[i, node]), shares.ravel()))
+            lines.append(_line(int(category[i, node]), shares.ravel()) + "\n")
         found.append("".join(lines))
     return found
 
 
 def _line(category: int, numbers: Any) -> str:
-    return " ".join([str(category - 1), *(f"{number:.8f}" for number in numbers)]) + "\n"
+    return " ".join([str(category - 1), *(f"{number:.8f}" for number in numbers)])
 
 
 def _angles(drawing: Renderable) -> Tensor:

@@ -4,6 +4,7 @@ segments, masks of whole objects, polygons, oriented boxes, keypoints, and the p
 import contextlib
 import io
 import json
+import tarfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,6 @@ import torch
 import yaml
 from faster_coco_eval import COCO, COCOeval_faster
 from faster_coco_eval import mask as rle
-from globox import AnnotationSet
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -304,6 +304,20 @@ def test_coco_tools_read_keypoints(drawn):
         assert one["num_keypoints"] == (np.reshape(one["keypoints"], (3, 3))[:, 2] > 0).sum()
 
 
+def test_yolos_keypoints_are_cocos(cars, tmp_path):
+    generate_scenes(cars.model, cars.model.prior, 20, tmp_path, 1, "coco,yolo-pose")
+    assert yaml.safe_load((tmp_path / "yolo-pose" / "data.yaml").read_text())["kpt_shape"] == [3, 3]
+    entries = json.loads((tmp_path / "annotations.json").read_text())["annotations"]
+    for i in range(20):
+        lines = (tmp_path / "yolo-pose" / "labels" / f"{i:06d}.txt").read_text().splitlines()
+        for line, one in zip(lines, [one for one in entries if one["image_id"] == i], strict=True):
+            number, cx, cy, w, h, *points = np.array(line.split(), float)
+            assert number == one["category_id"] - 1 and len(points) == 9
+            assert np.allclose([(cx - w / 2) * 96, (cy - h / 2) * 72, w * 96, h * 72], one["bbox"], atol=1e-4)
+            found = np.reshape(points, (3, 3)) * (96, 72, 1)
+            assert np.allclose(found.ravel(), one.get("keypoints", [0] * 9), atol=1e-4)
+
+
 def test_keypoints_are_seen_where_the_mask_is(drawn):
     if drawn.name == "lots":
         return
@@ -376,7 +390,7 @@ def test_annotations_have_the_programs_own_values(drawn):
 # all of them
 
 
-ALL = {"format": "coco,panoptic,yolo,yolo-seg,yolo-obb,webdataset", "amodal": True, "values": "car.x,light"}
+ALL = {"format": "coco,panoptic,yolo,yolo-seg,yolo-obb,yolo-pose,webdataset", "amodal": True, "values": "car.x,light"}
 
 
 def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path, monkeypatch):
@@ -394,16 +408,24 @@ def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path,
     assert generate(run, 70, tmp_path / "one", **ALL).made == 0  # it is seen to be finished
     with pytest.raises(ProbsceneError, match=r"begun with \(amodal True\), actual amodal False"):
         generate(run, 70, tmp_path / "one", **ALL | {"amodal": False})
-    boxes = AnnotationSet.from_yolo_v5(tmp_path / "one" / "labels", image_folder=tmp_path / "one" / "images")
-    assert len(boxes) == 70
-    sample = json.loads((tmp_path / "one" / "annotations.json").read_text())
-    assert sample["info"]["values"] == "car.x,light" and sample["info"]["amodal"] is True
+    found = json.loads((tmp_path / "one" / "annotations.json").read_text())
+    assert found["info"]["values"] == "car.x,light" and found["info"]["amodal"] is True
+    sharded = []
+    with tarfile.open(tmp_path / "one" / "shard-000000.tar") as tar:
+        for name in tar.getnames()[1::2]:
+            sample = json.load(tar.extractfile(name))
+            assert sample["keypoints"] == {"car": ["nose", "left", "beyond"]}
+            sharded += sample["annotations"]
+    keys = ("category_id", "segmentation", "amodal_segmentation", "attributes", "keypoints", "num_keypoints")
+    for one, other in zip(sharded, found["annotations"], strict=True):
+        assert all(one.get(key) == other.get(key) for key in keys)
 
 
 def test_what_a_model_does_not_have_is_one_error(cars, tmp_path, call):
     def message(**asked) -> str:
         with pytest.raises(ProbsceneError) as error:
-            generate_scenes(asked.pop("model", cars.model), cars.model.prior, 1, tmp_path / "out", **asked)
+            model = asked.pop("model", cars.model)
+            generate_scenes(model, model.prior, 1, tmp_path / "out", **asked)
         assert not (tmp_path / "out").exists()
         return str(error.value)
 
@@ -413,6 +435,10 @@ def test_what_a_model_does_not_have_is_one_error(cars, tmp_path, call):
     for asked in ({"amodal": True}, {"values": "x"}):
         assert "Expected coco or webdataset among the formats" in message(format="yolo,panoptic", **asked)
     assert "to have depth" in message(format="coco,depth")
+    plain = load_model(str(FILES["lots"]))
+    assert "sprites of model 'lots' with keypoints, for format yolo-pose, actual none" in message(
+        model=plain, format="yolo-pose"
+    )
 
     def request(num_scenes, structure):
         with pyro.plate("scenes", num_scenes, dim=-2):
