@@ -42,14 +42,16 @@ def keypoints(drawing: Renderable, canvas: tuple[int, int]) -> Keypoints | None:
         return None
     names: dict[str, tuple[str, ...]] = {}
     for layer in drawing.layers:
-        for kind in layer.kinds if layer.keypoint_names else ():
+        for kind in () if layer.keypoints is None else layer.kinds:
             names[kind] = tuple(dict.fromkeys((*names.get(kind, ()), *layer.keypoint_names)))
     if not names:
         return None
     points = torch.zeros(*drawing.kind.shape, max(map(len, names.values())), 3, dtype=torch.float64)
     named = torch.zeros(points.shape[:3], dtype=torch.bool)
     for number, layer in enumerate(drawing.layers):
-        for kind in layer.kinds if layer.keypoint_names else ():
+        if layer.keypoints is None:
+            continue
+        for kind in layer.kinds:
             scene, node = (layer.present & (drawing.kind == drawing.kinds.index(kind))).nonzero().T
             for k, name in enumerate(layer.keypoint_names):
                 place = names[kind].index(name)

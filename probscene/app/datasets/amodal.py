@@ -20,8 +20,8 @@ from probscene.world import World, resolve_scene
 from ..chunks import CHUNK
 
 
-def check(model: SceneModel, drawing: Renderable) -> None:
-    """See that a model's objects can be drawn alone.
+def drawable(model: SceneModel, drawing: Renderable) -> Drawing | World:
+    """The drawing, where its objects can be drawn alone.
 
     Raises:
         ProbsceneError: its generator draws whole scenes.
@@ -31,6 +31,7 @@ def check(model: SceneModel, drawing: Renderable) -> None:
             f"Expected a model of sprites or meshes for amodal masks, actual {model.name!r}, whose generator draws "
             "whole scenes; leave amodal out."
         )
+    return drawing
 
 
 def masks(

@@ -235,7 +235,7 @@ class Job:
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], 0)
         attributes.check(self.model, scenes, self.values)
         if self.amodal:
-            amodal.check(self.model, scenes.drawing)
+            amodal.drawable(self.model, scenes.drawing)
         if posed and keypoints(scenes.drawing[:1], self.model.canvas) is None:
             raise ProbsceneError(
                 f"Expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, actual none; "
@@ -282,7 +282,8 @@ class Job:
             more.append(coco.with_keypoints(self.model, points))
         if self.amodal:
             category = coco.labelled(self.model, batch, self.min_visible)
-            more.append(coco.with_amodal(amodal.masks(self._renderer, drawing, batch, category)))
+            whole = amodal.masks(self._renderer, amodal.drawable(self.model, drawing), batch, category)
+            more.append(coco.with_amodal(whole))
         if self.values:
             values = attributes.Attributes(scenes, self.values)
             more.append(lambda scene, node: {"attributes": values(scene, node)})

@@ -112,6 +112,6 @@ def write(
 
 
 def _box(mask: np.ndarray) -> list[int]:
-    rows, columns = mask.any(1).nonzero()[0], mask.any(0).nonzero()[0]
-    x, y = int(columns[0]), int(rows[0])
-    return [x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y]
+    rows, columns = np.nonzero(mask)
+    x, y = int(columns.min()), int(rows.min())
+    return [x, y, int(columns.max()) + 1 - x, int(rows.max()) + 1 - y]

@@ -150,7 +150,7 @@ class SceneDataset(IterableDataset):
                     drawn, scenes = chunk, draw_chunk(model, policy, self.seed, start + chunk)
                 drawing = scenes.drawing[first:last]
                 if self.amodal:
-                    amodal.check(model, drawing)
+                    amodal.drawable(model, drawing)  # before it is rendered
                 batch = with_margin(render(drawing), self.box_margin)
                 yield from self._samples(model, render, drawing, batch, (start + chunk) * CHUNK + first)
                 at += last - first
@@ -179,7 +179,9 @@ class SceneDataset(IterableDataset):
     ) -> Iterator[Sample]:
         images, points = as_written(model, batch.image), keypoints(drawing, model.canvas)
         category, depth = labelled(model, batch, self.min_visible), depth_of(batch)
-        whole_masks = amodal.masks(render, drawing, batch, category) if self.amodal else None
+        whole_masks = None
+        if self.amodal:
+            whole_masks = amodal.masks(render, amodal.drawable(model, drawing), batch, category)
         for i, image in enumerate(images):
             nodes = category[i].nonzero()[:, 0]
             instance = batch.instance[i]
