@@ -10,6 +10,7 @@ from .drawing import Drawing, Layer
 from .request import Renderable
 
 OUTSIDE, HIDDEN, VISIBLE = 0, 1, 2
+_PAIRS = 1 << 20  # of points and sprites, at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +69,13 @@ def _seen(drawing: Drawing, canvas: tuple[int, int], number: int, scene: Tensor,
     hidden = torch.zeros(len(at), dtype=torch.bool)
     for i, layer in enumerate(drawing.layers[number:]):
         columns = torch.arange(layer.present.shape[1])
-        covers = layer.present[scene]
-        if i == 0:
-            covers = covers & (columns > node[:, None])
-        elif layer.labelled:
-            covers = covers & (columns != node[:, None])
-        hidden |= _opaque(layer, scene, at, covers)
+        for some in torch.arange(len(at)).split(max(1, _PAIRS // max(1, len(columns)))):
+            covers = layer.present[scene[some]]
+            if i == 0:
+                covers = covers & (columns > node[some, None])
+            elif layer.labelled:
+                covers = covers & (columns != node[some, None])
+            hidden[some] |= _opaque(layer, scene[some], at[some], covers)
     visibility = torch.where(hidden, HIDDEN, VISIBLE).double()
     return torch.where(inside[:, None], torch.cat([at, visibility[:, None]], 1), OUTSIDE)
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import probscene
 from probscene.batch import RenderBatch
 from probscene.errors import ModelError, ProbsceneError
-from probscene.keypoints import keypoints
+from probscene.keypoints import Keypoints, keypoints
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.request import Renderable
@@ -236,7 +236,7 @@ class Job:
         attributes.check(self.model, scenes, self.values)
         if self.amodal:
             amodal.drawable(self.model, scenes.drawing)
-        if posed and keypoints(scenes.drawing[:1], self.model.canvas) is None:
+        if posed and not self._named(keypoints(scenes.drawing[:1], self.model.canvas)):
             raise ProbsceneError(
                 f"Expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, actual none; "
                 "name some: Sprites(..., keypoints={'nose': (0.5, 0.2)}), or choose other formats."
@@ -288,7 +288,11 @@ class Job:
             values = attributes.Attributes(scenes, self.values)
             more.append(lambda scene, node: {"attributes": values(scene, node)})
         found = coco.annotations(self.model, batch, first, self.min_visible, more)
-        return {"annotations": found, "keypoints": {} if points is None else points.names}
+        return {"annotations": found, "keypoints": self._named(points)}
+
+    def _named(self, points: Keypoints | None) -> dict[str, tuple[str, ...]]:
+        """The names of keypoints by class."""
+        return {} if points is None else {c: points.names[c] for c in self.model.classes if c in points.names}
 
     def _files(
         self, drawing: Renderable, batch: RenderBatch, first: int, record: dict[str, Any]

@@ -39,6 +39,7 @@ from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.photo import Photo
 from probscene.request import Objects
+from probscene.scenarios import join
 from probscene.scene import SceneGraph
 from probscene.world import resolve_scene
 
@@ -419,6 +420,33 @@ def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path,
     keys = ("category_id", "segmentation", "amodal_segmentation", "attributes", "keypoints", "num_keypoints")
     for one, other in zip(sharded, found["annotations"], strict=True):
         assert all(one.get(key) == other.get(key) for key in keys)
+
+
+def test_scenarios_keep_keypoints_and_values(cars, tmp_path):
+    both = join("both", {"one": cars.model, "other": cars.model})
+    generate_scenes(both, both.prior, 30, tmp_path, values="one/car.x,one/light")
+    entries = json.loads((tmp_path / "annotations.json").read_text())["annotations"]
+    entries = [one for one in entries if one["category_id"] == 1]
+    assert {tuple(one["attributes"]) for one in entries} == {(), ("one/car.x", "one/light")}
+    for one in entries:
+        x, y, w, h = one["bbox"]
+        for u, v, visibility in np.reshape(one["keypoints"], (3, 3))[:2]:
+            assert visibility < 2 or (x - 1 <= u <= x + w + 1 and y - 1 <= v <= y + h + 1)
+
+
+def test_names_of_keypoints_that_change_are_one_error(cars, tmp_path):
+    names = iter("abc")
+
+    def program(num_scenes, structure):
+        drawing = cars.model.program(num_scenes, structure)
+        layers = [replace(layer, keypoint_names=(next(names), "x", "y")) if layer.keypoint_names else layer
+                  for layer in drawing.layers]  # fmt: skip
+        return replace(drawing, layers=tuple(layers))
+
+    changing = replace(cars.model, program=program)
+    with pytest.raises(ModelError, match="name the same keypoints whatever it draws, actual .*'a'.* and .*'b'"):
+        generate_scenes(changing, changing.prior, 65, tmp_path)
+    assert not (tmp_path / "annotations.json").exists()
 
 
 def test_what_a_model_does_not_have_is_one_error(cars, tmp_path, call):
