@@ -11,9 +11,9 @@
     depth       depth/000000.png ..., of renders that have it
     images      no labels
 
-All are written from the same renders and share ``images/``: the image files of KITTI and of ``yolo-seg/`` and
-the like are hard links to those there, copies where the file system has none. Shards hold images of their own; for them
-alone, no ``images/`` is written.
+All are written from the same renders and share ``images/``: the image files of KITTI, of ``yolo-seg/`` and the like are
+hard links to those there, copies where the file system has none. Shards hold images of their own; for them alone, no
+``images/`` is written.
 """
 
 from collections.abc import Callable, Iterable

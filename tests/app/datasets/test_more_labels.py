@@ -51,7 +51,7 @@ FORMATS, VALUES, NUM = ("coco", "panoptic", "yolo-seg", "yolo-obb"), ("car.x", "
 
 @pytest.fixture(scope="module", params=FILES)
 def drawn(request, tmp_path_factory) -> SimpleNamespace:
-    """Flat or 3D scenes: their drawing, their render, and their data set, of which 12 have masks of whole objects."""
+    """Flat or 3D scenes: their drawing, their render, their data set, its annotations, and the nodes of these."""
     model, out = load_model(str(FILES[request.param])), tmp_path_factory.mktemp("labels")
     values = VALUES if request.param == "cars" else ()
     generate_scenes(model, model.prior, NUM, out / "out", 1, FORMATS, amodal=True, values=values)
