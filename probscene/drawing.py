@@ -4,6 +4,7 @@ Coordinates are pixels with the origin in the upper left corner of the canvas, x
 pixel in row i and column j is (j + 0.5, i + 0.5). Axis letters: N scenes, M nodes.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
@@ -99,9 +100,11 @@ class Sprites:
         tint: RGB in 0..1 that multiplies the sprite's colour, ``(3,)`` or ``(N, M, 3)``.
         labelled: whether nodes get an instance id; False for layers that only cover others, such as shadows.
         present: ``(N, M)`` bool, which of them are drawn; all if None.
+        keypoints: points of the sprite by name, for labels: ``{"nose": (u, v)}``, as shares of the sprite's width from
+            its left edge and of its height from its upper edge. They are moved, turned and scaled as the sprite is.
 
     Raises:
-        ModelError: an atlas that is none.
+        ModelError: an atlas that is none; keypoints of sprites without a label, or that are no pairs by name.
     """
 
     kinds: str | tuple[str, ...]
@@ -115,6 +118,7 @@ class Sprites:
     tint: Tensor | tuple[float, float, float] = (1.0, 1.0, 1.0)
     labelled: bool = True
     present: Tensor | None = None
+    keypoints: Mapping[str, tuple[Tensor | float, Tensor | float]] | None = None
 
     def __post_init__(self):
         if not isinstance(self.atlas, Atlas):
@@ -122,16 +126,33 @@ class Sprites:
                 f"Expected an Atlas in Sprites({self.kinds!r}), actual {_described(self.atlas)}; write "
                 "Atlas((sprite,)) around a sprite, or Atlas(tuple(sprites)) around several."
             )
+        if self.keypoints and (not self.labelled or self.kinds == ()):
+            raise ModelError(
+                f"Expected keypoints of sprites with a label, actual some of Sprites({self.kinds!r}) without one; give "
+                "them to the layer that draws the object."
+            )
+        points = {} if self.keypoints is None else self.keypoints
+        if not isinstance(points, Mapping) or not all(
+            isinstance(name, str) and isinstance(point, tuple | list) and len(point) == 2
+            for name, point in points.items()
+        ):
+            raise ModelError(
+                f"Expected the keypoints of Sprites({self.kinds!r}) as pairs by name, actual {self.keypoints!r}; write "
+                "keypoints={'nose': (0.5, 0.2)}, shares of the sprite's width and height."
+            )
 
     @staticmethod
-    def disc(kinds, x, y, radius, tint=(1.0, 1.0, 1.0), labelled: bool = True) -> "Sprites":
+    def disc(kinds, x, y, radius, tint=(1.0, 1.0, 1.0), labelled: bool = True, keypoints=None) -> "Sprites":
         """Discs of ``radius`` pixels."""
-        return Sprites(kinds, _DISC, 0, x, y, scale=radius * 2 / 64, tint=tint, labelled=labelled)
+        scale = radius * 2 / 64
+        return Sprites(kinds, _DISC, 0, x, y, scale=scale, tint=tint, labelled=labelled, keypoints=keypoints)
 
     @staticmethod
-    def box(kinds, x, y, width, height, angle=0.0, tint=(1.0, 1.0, 1.0), labelled: bool = True) -> "Sprites":
+    def box(
+        kinds, x, y, width, height, angle=0.0, tint=(1.0, 1.0, 1.0), labelled: bool = True, keypoints=None
+    ) -> "Sprites":
         """Rectangles of ``width`` by ``height`` pixels, turned by ``angle``."""
-        return Sprites(kinds, _BOX, 0, x, y, angle, width / 8, height / 8, tint, labelled)
+        return Sprites(kinds, _BOX, 0, x, y, angle, width / 8, height / 8, tint, labelled, keypoints=keypoints)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +160,8 @@ class Layer:
     """``Sprites`` resolved on a batch of scenes: every tensor has its full shape.
 
     M is the scene's nodes, or the layer's own number of sprites where it is not ``labelled``. ``present (N, M)`` bool;
-    ``sprite (N, M)`` int64; ``x, y, angle, scale_x, scale_y (N, M)`` float32; ``tint (N, M, 3)``.
+    ``sprite (N, M)`` int64; ``x, y, angle, scale_x, scale_y (N, M)`` float32; ``tint (N, M, 3)``. Where the K
+    ``keypoint_names`` lie on the canvas is ``keypoints (N, M, K, 2)`` float64, of nodes of ``kinds``.
     """
 
     atlas: Atlas
@@ -152,6 +174,9 @@ class Layer:
     scale_y: Tensor
     tint: Tensor
     labelled: bool
+    kinds: tuple[str, ...] = ()
+    keypoint_names: tuple[str, ...] = ()
+    keypoints: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +286,7 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
             f"actual {int(chosen.min())}..{int(chosen.max())}."
         )
     scale_y = sprites.scale if sprites.scale_y is None else sprites.scale_y
-    return Layer(
+    layer = Layer(
         atlas=sprites.atlas,
         present=present,
         sprite=index,
@@ -272,4 +297,22 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
         scale_y=full("scale_y", scale_y),
         tint=full("tint", sprites.tint, tail=(3,)),
         labelled=sprites.labelled,
+        kinds=(sprites.kinds,) if isinstance(sprites.kinds, str) else tuple(sprites.kinds),
     )
+    if not sprites.keypoints:
+        return layer
+    points = [[full(f"keypoints[{name!r}]", each) for each in pair] for name, pair in sprites.keypoints.items()]
+    return replace(
+        layer,
+        keypoint_names=tuple(sprites.keypoints),
+        keypoints=torch.stack([_on_canvas(layer, u.double(), v.double()) for u, v in points], 2),
+    )
+
+
+def _on_canvas(layer: Layer, u: Tensor, v: Tensor) -> Tensor:
+    """Where points of the sprites are, ``(N, M, 2)``; ``u, v (N, M)`` are shares of a sprite's width and height."""
+    sizes = torch.tensor([sprite.shape[1::-1] for sprite in layer.atlas.sprites], dtype=torch.float64)
+    width, height = sizes[layer.sprite.clamp(0, len(sizes) - 1)].unbind(-1)
+    right, down = (u - 0.5) * width * layer.scale_x, (v - 0.5) * height * layer.scale_y
+    cos, sin = layer.angle.double().cos(), layer.angle.double().sin()
+    return torch.stack([layer.x + cos * right + sin * down, layer.y - sin * right + cos * down], -1)

@@ -60,6 +60,8 @@ def generate(
     cluster: str | None = None,
     flat: bool = False,
     box_margin: int = 0,
+    amodal: bool = False,
+    values: str | Iterable[str] = (),
 ) -> Dataset:
     """Write a labelled dataset; the same call goes on after an interruption.
 
@@ -67,15 +69,15 @@ def generate(
         source: a run or its folder, for the learnt structures; or a model, for the prior's.
         num: how many images.
         out: the folder to write, or an address of a file system that fsspec knows, such as ``s3://bucket/folder``.
-        format: ``"coco"``, ``"yolo"``, ``"kitti"``, ``"webdataset"``, ``"depth"``, several of them, or
-            ``"images"`` for no labels.
+        format: ``"coco"``, ``"panoptic"``, ``"yolo"``, ``"yolo-seg"``, ``"yolo-obb"``, ``"yolo-pose"``, ``"kitti"``,
+            ``"webdataset"``, ``"depth"``, several of them, or ``"images"`` for no labels.
         workers: processes of a run's generation; the bytes do not depend on their number. More than one are spawned: a
             script calls this under ``if __name__ == "__main__":``.
         policy: other structures for a model.
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
         shard: ``"I/N"``, I from 0: one of N calls that make the dataset together, see ``generate_run``.
         cluster: the address of a Ray cluster whose nodes make a run's images, see ``Cluster``.
-        flat, box_margin: see ``generate_run``.
+        flat, box_margin, amodal, values: see ``generate_run``.
 
     Raises:
         ProbsceneError: see ``generate_run``.
@@ -89,11 +91,12 @@ def generate(
             if workers != 1 or cluster is not None:
                 raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
             policy = policy or source.prior
-            return generate_scenes(source, policy, num, out, seed, format, said, min_visible, shard, flat, box_margin)
+            more = min_visible, shard, flat, box_margin, amodal, values
+            return generate_scenes(source, policy, num, out, seed, format, said, *more)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
         with connected(cluster, show.say) as nodes:
-            more = min_visible, shard, nodes, flat, box_margin
-            return generate_run(run, num, out, seed, workers, format, said, *more)
+            given = min_visible, shard, nodes, flat, box_margin, amodal, values
+            return generate_run(run, num, out, seed, workers, format, said, *given)
 
 
 def evaluate(

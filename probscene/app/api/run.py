@@ -78,11 +78,12 @@ class Run(RunFolder):
         min_visible: float = 0.0,
         shard: str | None = None,
         box_margin: int = 0,
+        amodal: bool = False,
+        values: str | Iterable[str] = (),
     ) -> Dataset:
         """Write a labelled dataset of the learnt structures, see ``generate``."""
-        return calls.generate(
-            self, num, out, format, seed, workers, progress, None, min_visible, shard, box_margin=box_margin
-        )
+        more = {"box_margin": box_margin, "amodal": amodal, "values": values}
+        return calls.generate(self, num, out, format, seed, workers, progress, None, min_visible, shard, **more)
 
     def evaluate(
         self, target: Target | None = None, labels: Path | str | Labels | None = None, **options: Any

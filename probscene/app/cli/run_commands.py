@@ -30,7 +30,8 @@ def generate(
         list[str] | None,
         typer.Option(
             metavar="FORMAT",
-            help="coco (if not given), yolo, kitti, webdataset, depth, or images for no labels; again for more.",
+            help="coco (if not given), panoptic, yolo, yolo-seg, yolo-obb, yolo-pose, kitti, webdataset, depth, or "
+            "images for no labels; again for more.",
         ),
     ] = None,
     seed: Seed = 0,
@@ -45,6 +46,13 @@ def generate(
     cluster: ClusterAddress = None,
     flat: Annotated[bool, typer.Option("--flat", help="One folder also for more than 10,000 images.")] = False,
     box_margin: BoxMargin = 0,
+    amodal: Annotated[bool, typer.Option("--amodal", help="Also masks of whole objects, in COCO and shards.")] = False,
+    values: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SITE,...", help="Sites whose values annotations have, in COCO and shards; again for more."
+        ),
+    ] = None,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
     from ..datasets.generate import generate
@@ -55,7 +63,7 @@ def generate(
     with Display() as show, connected(cluster, show.say) as nodes:
         said = show.stage("generating")
         opened = RunFolder.at(run)
-        more = min_visible, shard, nodes, flat, box_margin
+        more = min_visible, shard, nodes, flat, box_margin, amodal, values or ()
         dataset = generate(opened, num, out, seed, workers, format or "coco", said, *more)
     print(f"{dataset.num} images in {dataset.path}, {dataset.made} of them made now")
     if not dataset.finished:

@@ -5,13 +5,19 @@ and ``amodal_bbox``, the box of the whole silhouette, which others may cover and
 also has ``truncated``, the share of that box beyond the canvas, and ``box_3d``: height, width, length, x, y, z and
 rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within the canvas. What a renderer does not
 know is left out, see ``RenderBatch.unknown``.
+
+Where the program's sprites name keypoints, categories have ``keypoints``, their names, and an empty ``skeleton``, and
+annotations ``keypoints``, x, y and visibility of each, and ``num_keypoints``, see ``probscene.keypoints``; x and y are
+in the pixels of boxes, in which the middle of the upper left one is (0.5, 0.5). On request, annotations have
+``amodal_segmentation``, the run lengths of the whole silhouette within the image, and ``attributes``, the program's own
+values by site.
 """
 
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TextIO, cast
 
 import torch
 from pycocotools import mask as rle
@@ -19,14 +25,26 @@ from torch import Tensor
 
 from probscene.batch import RenderBatch
 from probscene.errors import ProbsceneError
+from probscene.keypoints import Keypoints
 from probscene.model import SceneModel
 
 from .provenance import stem
 
+More = Callable[[int, int], dict[str, Any]]
+"""What else the annotation of a scene's node has, by their indices."""
 
-def categories(model: SceneModel) -> list[dict[str, Any]]:
-    """The model's classes, with ids from 1."""
-    return [{"id": i, "name": name, "supercategory": model.name} for i, name in enumerate(model.classes, 1)]
+
+def categories(model: SceneModel, keypoints: dict[str, Any] | None = None) -> list[dict[str, Any]]:
+    """The model's classes, with ids from 1.
+
+    Args:
+        keypoints: names of keypoints by class.
+    """
+    return [
+        {"id": i, "name": name, "supercategory": model.name}
+        | ({"keypoints": [*keypoints[name]], "skeleton": []} if keypoints and name in keypoints else {})
+        for i, name in enumerate(model.classes, 1)
+    ]
 
 
 def check_min_visible(min_visible: float) -> None:
@@ -78,7 +96,9 @@ def labelled(model: SceneModel, batch: RenderBatch, min_visible: float = 0.0) ->
     return torch.where(shown, category[batch.kind.clamp(min=0)], 0)
 
 
-def annotations(model: SceneModel, batch: RenderBatch, first: int, min_visible: float = 0.0) -> list[dict[str, Any]]:
+def annotations(
+    model: SceneModel, batch: RenderBatch, first: int, min_visible: float = 0.0, more: Iterable[More] = ()
+) -> list[dict[str, Any]]:
     """Annotations of rendered scenes, but for their ids: one for each node that is ``labelled``.
 
     Args:
@@ -101,27 +121,67 @@ def annotations(model: SceneModel, batch: RenderBatch, first: int, min_visible: 
                     **_in_space(batch, i, node),
                 }
             )
+            for of in more:
+                found[-1] |= of(i, node)
     return found
 
 
+def with_keypoints(model: SceneModel, keypoints: Keypoints) -> More:
+    """What annotations have of keypoints."""
+
+    def of(scene: int, node: int) -> dict[str, Any]:
+        kind = model.grammar.kinds[int(kinds[scene, node])]
+        if kind not in keypoints.names:
+            return {}
+        points = keypoints.points[scene, node, : len(keypoints.names[kind])].tolist()
+        flat = [value for x, y, seen in points for value in (round(x, 3), round(y, 3), int(seen))]
+        return {"keypoints": flat, "num_keypoints": sum(seen > 0 for seen in flat[2::3])}
+
+    kinds = keypoints.kind
+    return of
+
+
+def with_amodal(masks: Iterable[tuple[int, int, Tensor]]) -> More:
+    """What annotations have of masks of whole objects, see ``amodal.masks``."""
+    encoded = {(i, node): _encoded(mask.T.contiguous()[None])[0] for i, node, mask in masks}
+    return lambda scene, node: {"amodal_segmentation": encoded[scene, node]}
+
+
 def write(
-    path: Path, model: SceneModel, num: int, info: dict[str, Any], found: Iterable[dict[str, Any]], flat: bool = True
+    path: Path,
+    model: SceneModel,
+    num: int,
+    info: dict[str, Any],
+    found: Iterable[dict[str, Any]],
+    flat: bool = True,
+    keypoints: dict[str, Any] | None = None,
 ) -> None:
     """The whole file, for ``num`` images; annotations get ids from 1 in the order they come, and are not kept.
 
     Args:
         flat: see ``stem``.
+        keypoints: see ``categories``.
     """
-    height, width = model.canvas
-    images = ({"id": i, "file_name": f"{stem(i, flat)}.png", "height": height, "width": width} for i in range(num))
     numbered = ({"id": number, **annotation} for number, annotation in enumerate(found, 1))
     with open(path, "w", encoding="utf-8", newline="\n") as file:
-        file.write(f'{{"info": {json.dumps(info)},\n"licenses": [],\n"categories": {json.dumps(categories(model))}')
-        for key, entries in (("images", images), ("annotations", numbered)):
-            file.write(f',\n"{key}": [')
-            file.writelines(_lines(entries))
-            file.write("]")
+        kinds = json.dumps(categories(model, keypoints))
+        file.write(f'{{"info": {json.dumps(info)},\n"licenses": [],\n"categories": {kinds}')
+        write_list(file, "images", images(model, num, flat))
+        write_list(file, "annotations", numbered)
         file.write("}\n")
+
+
+def images(model: SceneModel, num: int, flat: bool) -> Iterator[dict[str, Any]]:
+    """The entries of images 0 to ``num - 1``."""
+    height, width = model.canvas
+    return ({"id": i, "file_name": f"{stem(i, flat)}.png", "height": height, "width": width} for i in range(num))
+
+
+def write_list(file: TextIO, key: str, entries: Iterable[dict[str, Any]]) -> None:
+    """A further key of an object, of entries that are not kept."""
+    file.write(f',\n"{key}": [')
+    file.writelines(_lines(entries))
+    file.write("]")
 
 
 def _lines(entries: Iterable[dict[str, Any]]) -> Iterator[str]:
@@ -139,8 +199,12 @@ def _masks(instance: Tensor, nodes: Tensor) -> list[dict[str, Any]]:
     if not len(nodes):
         return []
     columns = instance.T.contiguous()  # runs go down the columns
-    masks = columns == (nodes + 1).view(-1, 1, 1).to(columns.dtype)
-    encoded = cast(list[dict[str, Any]], rle.encode(masks.numpy().view("uint8").transpose(2, 1, 0)))
+    return _encoded(columns == (nodes + 1).view(-1, 1, 1).to(columns.dtype))
+
+
+def _encoded(columns: Tensor) -> list[dict[str, Any]]:
+    """Compressed run lengths of K masks, ``columns (K, W, H)`` bool."""
+    encoded = cast(list[dict[str, Any]], rle.encode(columns.numpy().view("uint8").transpose(2, 1, 0)))
     return [{"size": mask["size"], "counts": mask["counts"].decode("ascii")} for mask in encoded]
 
 

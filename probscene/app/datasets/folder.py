@@ -27,7 +27,7 @@ from .provenance import image_name
 LINES, SETTINGS = "provenance.jsonl", f"{PARTS}/settings.json"
 SEEN = 20  # seconds
 FLAT = 10_000  # images
-UNSAID = {"min_visible": 0.0, "box_margin": 0, "flat": True}
+UNSAID = {"min_visible": 0.0, "box_margin": 0, "flat": True, "amodal": False, "values": ""}
 """Settings that are recorded only where they have another value than this."""
 
 

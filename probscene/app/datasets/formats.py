@@ -1,24 +1,33 @@
 """Which formats a dataset is written in: those asked for, and those that a finished folder holds.
 
     coco        annotations.json
+    panoptic    panoptic.json, and panoptic/000000.png ...
     yolo        labels/000000.txt ... and data.yaml
+    yolo-seg    yolo-seg/ with images, labels and data.yaml
+    yolo-obb    yolo-obb/ likewise
+    yolo-pose   yolo-pose/ likewise, of renders with keypoints
     kitti       Kitti/raw/training/ with image_2, label_2 and instance, and calib of 3D scenes
     webdataset  shard-000000.tar ..., images and labels together
     depth       depth/000000.png ..., of renders that have it
     images      no labels
 
-All are written from the same renders and share ``images/``: KITTI's image files are hard links to those there, copies
-where the file system has none. Shards hold images of their own; for them alone, no ``images/`` is written.
+All are written from the same renders and share ``images/``: the image files of KITTI, of ``yolo-seg/`` and the like are
+hard links to those there, copies where the file system has none. Shards hold images of their own; for them alone, no
+``images/`` is written.
 """
 
 from collections.abc import Callable, Iterable
 
 from probscene.errors import ProbsceneError
 
-FORMATS = ("coco", "yolo", "kitti", "webdataset", "depth", "images")
+FORMATS = ("coco", "panoptic", "yolo", "yolo-seg", "yolo-obb", "yolo-pose", "kitti", "webdataset", "depth", "images")
 _MARKS = {
     "coco": "annotations.json",
+    "panoptic": "panoptic.json",
     "yolo": "data.yaml",
+    "yolo-seg": "yolo-seg",
+    "yolo-obb": "yolo-obb",
+    "yolo-pose": "yolo-pose",
     "kitti": "Kitti",
     "webdataset": "shard-000000.tar",
     "depth": "depth",
@@ -54,5 +63,5 @@ def found(exists: Callable[[str], bool]) -> tuple[str, ...]:
 
 def _normal(names: list[str]) -> tuple[str, ...]:
     """``images`` adds something to shards alone: the other formats have that folder anyway."""
-    implied = {"coco", "yolo", "kitti", "depth"} & set(names)
+    implied = set(names) - {"webdataset", "images"}
     return tuple(name for name in FORMATS if name in names and not (name == "images" and implied))

@@ -18,20 +18,23 @@ from typing import Any, NamedTuple
 
 import probscene
 from probscene.batch import RenderBatch
-from probscene.errors import ProbsceneError
+from probscene.errors import ModelError, ProbsceneError
+from probscene.keypoints import Keypoints, keypoints
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.request import Renderable
+from probscene.sampling import Scenes
 
 from ..chunks import CHUNK, as_written, draw_chunk, png
 from ..fitting.run import RunFolder
 from ..loading import renderer_for
 from ..workers.cluster import Cluster
 from ..workers.processes import spread
-from . import coco, depth, kitti, shards, yolo
+from . import amodal, attributes, coco, depth, kitti, panoptic, shards, yolo
 from .folder import LINES, UNSAID, WHOLE, DatasetFolder, Shard, check_begun
 from .formats import chosen
 from .places import place_at
-from .provenance import provenance
+from .provenance import image_name, provenance
 
 Done = Callable[[int, int], None]
 """Called with the number of images there are, and how many there are to be."""
@@ -66,6 +69,8 @@ def generate(
     cluster: Cluster | None = None,
     flat: bool = False,
     box_margin: int = 0,
+    amodal: bool = False,
+    values: str | Iterable[str] = (),
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
 
@@ -83,11 +88,16 @@ def generate(
         flat: all images in one folder; of more than 10,000, a thousand share one otherwise. KITTI's folders are flat.
         box_margin: pixels by which boxes of what is visible are wider than it on each side, within the image; masks and
             boxes of whole silhouettes stay.
+        amodal: COCO's annotations, and those of shards, have masks of whole objects, too, see ``coco``; each object
+            that is not wholly visible is drawn once more, alone.
+        values: names of the program's sites, such as ``"plate.x,mug.turn"``, whose values these annotations have as
+            ``attributes``: those of the object, else of the nearest node above it, else of the scene.
 
     Raises:
         ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, a margin that is
             no whole number or of KITTI's boxes in 3D, an unknown format, more classes or objects than KITTI's masks can
-            number, no depth where it is asked for, another text for a shard.
+            number, no depth where it is asked for, another text for a shard, a value that is no site of the program,
+            amodal masks of a generator's objects, or either in formats that have no place for them.
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped. See also
@@ -98,7 +108,8 @@ def generate(
     if cluster is not None and workers > 1:
         raise ProbsceneError(f"Expected workers or a cluster, actual {workers} workers and a cluster; leave one out.")
     part = WHOLE if shard is None else Shard.of(shard)
-    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), min_visible, flat, box_margin)
+    more = min_visible, flat, box_margin, amodal, attributes.chosen(values)
+    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), *more)
     if workers == 1 and cluster is None:
         return job.run(job.each, progress, part)
     if run.objects:
@@ -106,7 +117,7 @@ def generate(
             f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual "
             f"{workers if cluster is None else 'a cluster'}; fit a model and parts in files for more."
         )
-    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, min_visible, flat, box_margin)
+    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, *more)
     if cluster is None:
         return job.run(partial(spread, _worker, task, workers), progress, part)
     crew = cluster.crew(_actor, task)
@@ -128,12 +139,15 @@ def generate_scenes(
     shard: str | None = None,
     flat: bool = False,
     box_margin: int = 0,
+    amodal: bool = False,
+    values: str | Iterable[str] = (),
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
 
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
-    job = Job(model, policy, num, out, seed, format, min_visible=min_visible, flat=flat, box_margin=box_margin)
+    more = min_visible, flat, box_margin, amodal, values
+    job = Job(model, policy, num, out, seed, format, None, *more)
     return job.run(job.each, progress, WHOLE if shard is None else Shard.of(shard))
 
 
@@ -142,7 +156,7 @@ class Job:
 
     Args:
         guide: SHA-256 of the policy's checkpoint, where it is a learnt one.
-        min_visible, flat, box_margin: see ``generate``.
+        min_visible, flat, box_margin, amodal, values: see ``generate``.
 
     Raises:
         ProbsceneError: see ``generate``.
@@ -160,6 +174,8 @@ class Job:
         min_visible: float = 0.0,
         flat: bool = False,
         box_margin: int = 0,
+        amodal: bool = False,
+        values: str | Iterable[str] = (),
     ):
         if num < 1:
             raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
@@ -168,14 +184,23 @@ class Job:
         coco.check_min_visible(min_visible)
         coco.check_box_margin(box_margin)
         self.formats, self.box_margin = chosen(format), int(box_margin)
+        self.amodal, self.values = bool(amodal), attributes.chosen(values)
+        if (self.amodal or self.values) and not {"coco", "webdataset"} & {*self.formats}:
+            raise ProbsceneError(
+                f"Expected coco or webdataset among the formats for {'amodal masks' if amodal else 'values'}, actual "
+                f"{', '.join(self.formats)}; add one of them."
+            )
         if "kitti" in self.formats:
             kitti.check(model)
         self.model, self.policy, self.min_visible = model, policy, float(min_visible)
         self.origin = {"seed": seed, "model": model.name, "guide": guide, "version": probscene.__version__}
-        if self.min_visible != UNSAID["min_visible"]:
-            self.origin["min_visible"] = self.min_visible
-        if self.box_margin != UNSAID["box_margin"]:
-            self.origin["box_margin"] = self.box_margin
+        more = {
+            "min_visible": self.min_visible,
+            "box_margin": self.box_margin,
+            "amodal": self.amodal,
+            "values": ",".join(self.values),
+        }
+        self.origin |= {key: value for key, value in more.items() if value != UNSAID[key]}
         self.folder = DatasetFolder(out, self.origin, num, self.formats, flat)
         self._renderer = renderer_for(model, threads=1)
 
@@ -184,13 +209,8 @@ class Job:
     ) -> Dataset:
         """Do what is missing of a shard by ``work(chunks, done)``; of the whole, then write the labels."""
         folder, made = self.folder, 0
-        boxes = "kitti" in self.formats and self.box_margin > 0
-        if ("depth" in self.formats or boxes) and not folder.finished:  # before anything is written
-            first = self._renderer(draw_chunk(self.model, self.policy, self.origin["seed"], 0).drawing[:1])
-            if boxes:
-                kitti.check_box_margin(self.model, first, self.box_margin)
-            if "depth" in self.formats:
-                depth.files(self.model, first)
+        if not folder.finished:
+            self._check()
         chunks, num = folder.missing(shard), sum(map(folder.size, folder.of(shard)))
         before = num - sum(map(folder.size, chunks))
 
@@ -206,6 +226,28 @@ class Job:
             folder.finish(self._labels())
         return Dataset(folder.place.where, made, num, folder.finished)
 
+    def _check(self) -> None:
+        """See that the model's scenes have what is asked for, before anything is written."""
+        boxes = "kitti" in self.formats and self.box_margin > 0
+        posed = "yolo-pose" in self.formats
+        if not ("depth" in self.formats or boxes or posed or self.amodal or self.values):
+            return
+        scenes = draw_chunk(self.model, self.policy, self.origin["seed"], 0)
+        attributes.check(self.model, scenes, self.values)
+        if self.amodal:
+            amodal.drawable(self.model, scenes.drawing)
+        if posed and not self._named(keypoints(scenes.drawing[:1], self.model.canvas)):
+            raise ProbsceneError(
+                f"Expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, actual none; "
+                "name some: Sprites(..., keypoints={'nose': (0.5, 0.2)}), or choose other formats."
+            )
+        if "depth" in self.formats or boxes:
+            first = self._renderer(scenes.drawing[:1])
+            if boxes:
+                kitti.check_box_margin(self.model, first, self.box_margin)
+            if "depth" in self.formats:
+                depth.files(self.model, first)
+
     def each(self, chunks: list[int], done: Callable[[int], None]) -> None:
         """Make chunks one after the other."""
         for chunk in chunks:
@@ -219,25 +261,63 @@ class Job:
         """
         first, size = chunk * CHUNK, self.folder.size(chunk)
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
-        batch = coco.with_margin(self._renderer(scenes.drawing[:size]), self.box_margin)
-        found = [] if self.formats == ("images",) else coco.annotations(self.model, batch, first, self.min_visible)
-        lines = provenance(self.model, scenes, first, self.origin, self.folder.flat)
-        record = {"annotations": found, "provenance": lines[:size]}
-        self.folder.write(chunk, *self._files(batch, first, found), record)
+        drawing = scenes.drawing[:size]
+        batch = coco.with_margin(self._renderer(drawing), self.box_margin)
+        record: dict[str, Any] = {"annotations": [], "keypoints": {}}
+        if self.formats != ("images",):
+            record |= self._annotated(scenes, drawing, batch, first)
+        record["provenance"] = provenance(self.model, scenes, first, self.origin, self.folder.flat)[:size]
+        files, links = self._files(drawing, batch, first, record)
+        if "panoptic" in self.formats:
+            found = panoptic.segments(self.model, batch, record["annotations"], first, self.min_visible)
+            record["panoptic"] = found[0]
+            files |= {panoptic.file_name(first + i, self.folder.flat): file for i, file in enumerate(found[1])}
+        self.folder.write(chunk, files, links, record)
         return chunk
 
+    def _annotated(self, scenes: Scenes, drawing: Renderable, batch: RenderBatch, first: int) -> dict[str, Any]:
+        """Annotations of rendered scenes, and names of keypoints by class."""
+        more, points = [], keypoints(drawing, self.model.canvas)
+        if points is not None:
+            more.append(coco.with_keypoints(self.model, points))
+        if self.amodal:
+            category = coco.labelled(self.model, batch, self.min_visible)
+            whole = amodal.masks(self._renderer, amodal.drawable(self.model, drawing), batch, category)
+            more.append(coco.with_amodal(whole))
+        if self.values:
+            values = attributes.Attributes(scenes, self.values)
+            more.append(lambda scene, node: {"attributes": values(scene, node)})
+        found = coco.annotations(self.model, batch, first, self.min_visible, more)
+        return {"annotations": found, "keypoints": self._named(points)}
+
+    def _named(self, points: Keypoints | None) -> dict[str, tuple[str, ...]]:
+        """The names of keypoints by class."""
+        return {} if points is None else {c: points.names[c] for c in self.model.classes if c in points.names}
+
     def _files(
-        self, batch: RenderBatch, first: int, found: list[dict[str, Any]]
+        self, drawing: Renderable, batch: RenderBatch, first: int, record: dict[str, Any]
     ) -> tuple[dict[str, bytes], dict[str, str]]:
         """What is written of each image at once, and further names of that; see ``DatasetFolder.write``."""
         of_image: dict[int, list] = {first + i: [] for i in range(len(batch.image))}
-        for annotation in found:
+        for annotation in record["annotations"]:
             of_image[annotation["image_id"]].append(annotation)
         images = map(png, as_written(self.model, batch.image))
         files = {self.folder.image(i): image for i, image in zip(of_image, images, strict=True)}
         links, flat = {}, self.folder.flat
         if "yolo" in self.formats:
             files |= {yolo.label_name(i, flat): yolo.label(self.model, of_image[i]).encode() for i in of_image}
+        lines = {}
+        if "yolo-seg" in self.formats:
+            lines["yolo-seg"] = yolo.polygons(self.model, batch, self.min_visible)
+        if "yolo-obb" in self.formats:
+            lines["yolo-obb"] = yolo.oriented(self.model, batch, drawing, self.min_visible, self.box_margin)
+        if "yolo-pose" in self.formats:
+            number = _most(record["keypoints"])
+            lines["yolo-pose"] = [yolo.label(self.model, of_image[i], number) for i in of_image]
+        for folder, texts in lines.items():
+            names = [f"{folder}/{yolo.label_name(i, flat)}" for i in of_image]
+            files |= {name: text.encode() for name, text in zip(names, texts, strict=True)}
+            links |= {f"{folder}/{image_name(i, flat)}": self.folder.image(i) for i in of_image}
         if "depth" in self.formats:
             depths = depth.files(self.model, batch)
             files |= {depth.file_name(i, flat): each for i, each in zip(of_image, depths, strict=True)}
@@ -257,16 +337,48 @@ class Job:
         info = {key: value for key, value in folder.settings.items() if key != "flat"}
         labels = {}
         if "coco" in self.formats:
-            found = (annotation for record in folder.records() for annotation in record["annotations"])
-            labels["annotations.json"] = lambda path: coco.write(path, model, folder.num, info, found, flat)
-        if "yolo" in self.formats:
-            labels["data.yaml"] = lambda path: path.write_text(yolo.data(model), encoding="utf-8", newline="\n")
+            labels["annotations.json"] = lambda path: self._write_coco(path, info)
+        if "panoptic" in self.formats:
+            segments = (record["panoptic"] for record in folder.records())
+            labels["panoptic.json"] = lambda path: panoptic.write(path, model, folder.num, info, segments, flat)
+        for name in ("yolo", "yolo-seg", "yolo-obb", "yolo-pose"):
+            if name in self.formats:
+                labels["data.yaml" if name == "yolo" else f"{name}/data.yaml"] = partial(self._write_data, name)
         if "webdataset" in self.formats:
             for number, chunks in enumerate(folder.chunks(shards.CHUNKS)):
                 labels[shards.shard_name(number)] = partial(self._write_shard, chunks)
         lines = (line for record in folder.records() for line in record["provenance"])
         labels[LINES] = lambda path: _write_lines(path, (json.dumps(line, ensure_ascii=False) + "\n" for line in lines))
         return labels
+
+    def _write_coco(self, path: Path, info: dict[str, Any]) -> None:
+        """Write COCO's annotations."""
+        names = next(self.folder.records())["keypoints"]
+        found = (annotation for record in self._records() for annotation in record["annotations"])
+        coco.write(path, self.model, self.folder.num, info, found, self.folder.flat, names)
+
+    def _write_data(self, name: str, path: Path) -> None:
+        """Write the ``data.yaml`` of a format of YOLO."""
+        number = 0
+        for record in self._records() if name == "yolo-pose" else ():
+            number = _most(record["keypoints"])
+        path.write_text(yolo.data(self.model, number), encoding="utf-8", newline="\n")
+
+    def _records(self) -> Iterator[dict[str, Any]]:
+        """The chunks' records.
+
+        Raises:
+            ModelError: keypoints of some scenes have other names than those of others.
+        """
+        names = None
+        for record in self.folder.records():
+            names = record["keypoints"] if names is None else names
+            if record["keypoints"] != names:
+                raise ModelError(
+                    f"Expected model {self.model.name!r} to name the same keypoints whatever it draws, actual {names} "
+                    f"in some scenes and {record['keypoints']} in others; give scene.draw every layer always."
+                )
+            yield record
 
     def _write_shard(self, chunks: range, path: Path) -> None:
         def samples() -> Iterator[tuple[int, dict[str, bytes]]]:
@@ -277,6 +389,11 @@ class Job:
                     yield i, {"png": image, "json": label}
 
         shards.write(path, samples())
+
+
+def _most(keypoints: dict[str, Any]) -> int:
+    """The largest number of keypoints that a class has."""
+    return max(map(len, keypoints.values()), default=0)
 
 
 def _worker(run: Path, num: int, out: str, seed: int, format: tuple[str, ...], *settings: Any) -> Callable[[int], int]:

@@ -120,7 +120,9 @@ class LocalPlace:
     def write(self, files: dict[str, Callable[[Path], Any]]) -> None:
         """Write files by what fills a path; they appear one after the other when all are written."""
         for name, fill in files.items():
-            write_whole(self.path / PARTS / name, fill)
+            aside = self.path / PARTS / name
+            make_folder(aside.parent)
+            write_whole(aside, fill)
         for name in files:
             _move(self.path / PARTS / name, self.path / name)
 

@@ -55,7 +55,7 @@ def provenance(
                 "rules": rules,
                 "derivation": _spelt(model, rules),
                 "parameters": {
-                    site: _exact(value[i][scenes.site_mask[site][i]]) for site, value in scenes.parameters.items()
+                    site: exact(value[i][scenes.site_mask[site][i]]) for site, value in scenes.parameters.items()
                 },
             }
         )
@@ -127,7 +127,7 @@ def _spelt(model: SceneModel, rules: list[int]) -> str:
     return "; ".join(str(model.grammar.rules[rule]) for rule in rules)
 
 
-def _exact(values: Tensor) -> list:
+def exact(values: Tensor) -> list:
     """Numbers that JSON gives back to the bit; float32 with the fewest digits that do."""
     if values.dtype != torch.float32:
         return values.tolist()

@@ -17,7 +17,7 @@ Axis letters: N scenes, M nodes, n objects of an image, H W.
 import atexit
 import os
 from collections.abc import Iterator
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,17 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from probscene.batch import RenderBatch
+from probscene.batch import RenderBatch, Renderer
 from probscene.errors import ModelError, ProbsceneError
+from probscene.keypoints import keypoints
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.request import Renderable
 
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
+from . import amodal
 from .coco import check_box_margin, check_min_visible, labelled, with_margin
 from .depth import of as depth_of
 
@@ -49,7 +52,9 @@ class SceneDataset(IterableDataset):
     ``(n, 4)`` float32, boxes of the whole silhouettes, which others may cover and the canvas may cut; ``visible``
     ``(n,)`` float32, the visible fraction, see ``RenderBatch``; ``image_id``, an int. An image may have no object:
     n = 0. Where renders have it, ``depth`` ``(H, W)`` float32 is metres along the camera's z, infinity where there is
-    sky. What a generator does not tell, of depth and of whole silhouettes, is not in the target.
+    sky. What a generator does not tell, of depth and of whole silhouettes, is not in the target. Where the program's
+    sprites name keypoints, ``keypoints`` ``(n, K, 3)`` float32 are x, y and visibility, in the order of the class's
+    names, see ``probscene.keypoints``; zeros where a class has fewer than K.
 
     Worker processes start Taichi themselves: give the loader ``multiprocessing_context="spawn"``. Several ranks of a
     distributed training take seeds of their own.
@@ -63,13 +68,15 @@ class SceneDataset(IterableDataset):
         box_margin: pixels by which ``boxes`` are wider on each side, see ``generate``.
         batch_size: the loader's, where the order must not depend on the number of workers.
         policy: other structures, over the grammar of ``source``.
+        amodal: targets also have ``amodal_masks`` ``(n, H, W)`` uint8, of the whole silhouettes within the image; each
+            object that is not wholly visible is drawn once more, alone.
 
     Attributes:
         model: the scene model.
         classes: the names of the labels 1, 2, ...
 
     Raises:
-        ProbsceneError: a number out of its range.
+        ProbsceneError: a number out of its range; while iterating, amodal masks of a generator's objects.
         RunError, ModelError: see ``RunFolder`` and ``load_model``; while iterating, see ``sample``.
     """
 
@@ -82,6 +89,7 @@ class SceneDataset(IterableDataset):
         batch_size: int | None = None,
         policy: Policy | None = None,
         box_margin: int = 0,
+        amodal: bool = False,
     ):
         for name, number in (("images", num), ("images of a batch", batch_size)):
             if number is not None and number < 1:
@@ -91,7 +99,7 @@ class SceneDataset(IterableDataset):
         check_min_visible(min_visible)
         check_box_margin(box_margin)
         self.num, self.seed, self.batch_size = num, seed, batch_size
-        self.min_visible, self.box_margin = min_visible, box_margin
+        self.min_visible, self.box_margin, self.amodal = min_visible, box_margin, amodal
         self._source = source if isinstance(source, SceneModel) else _resolved(source)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that persist see it change
         self._given, self._opened = policy, None
@@ -140,8 +148,11 @@ class SceneDataset(IterableDataset):
                 last = min(first + stop - at, CHUNK)
                 if scenes is None or drawn != chunk:
                     drawn, scenes = chunk, draw_chunk(model, policy, self.seed, start + chunk)
-                batch = with_margin(render(scenes.drawing[first:last]), self.box_margin)
-                yield from self._samples(model, batch, (start + chunk) * CHUNK + first)
+                drawing = scenes.drawing[first:last]
+                if self.amodal:
+                    amodal.drawable(model, drawing)  # before it is rendered
+                batch = with_margin(render(drawing), self.box_margin)
+                yield from self._samples(model, render, drawing, batch, (start + chunk) * CHUNK + first)
                 at += last - first
 
     def __len__(self) -> int:
@@ -163,9 +174,14 @@ class SceneDataset(IterableDataset):
         images, targets = zip(*samples, strict=True)
         return list(images), list(targets)
 
-    def _samples(self, model: SceneModel, batch: RenderBatch, first: int) -> Iterator[Sample]:
-        images = as_written(model, batch.image)
+    def _samples(
+        self, model: SceneModel, render: Renderer, drawing: Renderable, batch: RenderBatch, first: int
+    ) -> Iterator[Sample]:
+        images, points = as_written(model, batch.image), keypoints(drawing, model.canvas)
         category, depth = labelled(model, batch, self.min_visible), depth_of(batch)
+        whole_masks = None
+        if self.amodal:
+            whole_masks = amodal.masks(render, amodal.drawable(model, drawing), batch, category)
         for i, image in enumerate(images):
             nodes = category[i].nonzero()[:, 0]
             instance = batch.instance[i]
@@ -180,6 +196,11 @@ class SceneDataset(IterableDataset):
             whole = {"amodal_boxes": batch.amodal_box[i, nodes].float(), "visible": batch.visible[i, nodes]}
             unknown = {"amodal_boxes": "amodal_box"}
             target |= {key: value for key, value in whole.items() if unknown.get(key, key) not in batch.unknown}
+            if points is not None:
+                target["keypoints"] = points.points[i, nodes].float()
+            if whole_masks is not None:
+                masks = [mask for _, _, mask in islice(whole_masks, len(nodes))]
+                target["amodal_masks"] = torch.stack(masks).to(torch.uint8) if masks else target["masks"]
             if depth is not None:
                 target["depth"] = depth[i]
             yield image.expand(3, -1, -1).to(torch.float32, memory_format=torch.contiguous_format).div(255), target

@@ -3,7 +3,8 @@
     shard-000000.tar ...   000000.png, 000000.json, 000001.png, ...
 
 A JSON file holds ``classes``, ``height``, ``width``, ``annotations`` (COCO's, and ``class``, the name) and
-``provenance``, the image's line. Owners and times are zero, so that equal samples are equal bytes.
+``provenance``, the image's line; where the program names keypoints, ``keypoints`` has their names by class. Owners and
+times are zero, so that equal samples are equal bytes.
 """
 
 import io
@@ -33,9 +34,11 @@ def labels(model: SceneModel, record: dict[str, Any]) -> Iterator[tuple[int, byt
     for annotation in record["annotations"]:
         rest = {key: value for key, value in annotation.items() if key != "image_id"}
         found[annotation["image_id"]].append({"class": model.classes[annotation["category_id"] - 1], **rest})
+    names = {"keypoints": record["keypoints"]} if record["keypoints"] else {}
     for line in record["provenance"]:
         sample = {
             "classes": list(model.classes),
+            **names,
             "height": height,
             "width": width,
             "annotations": found[line["index"]],

@@ -263,7 +263,7 @@ def test_other_formats_leave_a_dataset_as_it_is(model, out):
 
 @pytest.mark.parametrize("format", ["voc", ("coco", "voc"), "coco,voc", "", "coco,", ()])
 def test_an_unknown_format_is_one_error_that_names_them(model, tmp_path, format):
-    names = "coco, yolo, kitti, webdataset, depth, images"
+    names = "coco, panoptic, yolo, yolo-seg, yolo-obb, yolo-pose, kitti, webdataset, depth, images"
     with pytest.raises(ProbsceneError, match=f"among {names}, actual ('(voc)?'|none)"):
         generate_scenes(model, model.prior, 1, tmp_path / "out", format=format)
     assert not (tmp_path / "out").exists()

@@ -128,7 +128,7 @@ def test_shares_are_a_partition_by_turns(num, workers, batch_size):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_dataset, "draw_chunk", lambda model, policy, seed, chunk: Stub(64 * chunk))
         patch.setattr(scene_dataset, "renderer_for", lambda model, threads: lambda drawing: drawing)
-        patch.setattr(SceneDataset, "_samples", lambda self, model, batch, first: iter(check_slice(batch, first)))
+        patch.setattr(SceneDataset, "_samples", lambda self, model, render, drawing, *rest: iter(check_slice(*rest)))
         whole = list(dataset)
         shares = []
         for worker in range(workers):
