@@ -1,7 +1,8 @@
 """Can this fit be trusted? Figures and a verdict from features alone, without labels.
 
-What a judge can tell, what a nearest neighbour is and which shares are sure comes from halves of the real set and from
-binomial limits; ``verdict`` holds the rules. Axis letters: N generated, L real, P prior, D features.
+Whether the sets differ, and which differences would be seen, comes from resamples of both (``differences``). What a
+nearest neighbour is and which shares are sure comes from halves of the real set and from binomial limits. ``verdict``
+holds the rules. Axis letters: N generated, L real, P prior, D features.
 """
 
 from dataclasses import dataclass
@@ -12,12 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from probscene.errors import ProbsceneError
 
+from .differences import differences
 from .modes import effective_share, interval, modes
 from .support import Fidelity, Mask, fidelity, foreign, likeness, unlike_floor
-from .two_sample import NEEDED, Apart, Features, apart, check_features, marginals, permutation_p, principal
+from .two_sample import (
+    EXAMINED,
+    NEEDED,
+    Apart,
+    Features,
+    apart,
+    check_features,
+    marginals,
+    permutation_p,
+    principal,
+)
 from .verdict import PRETRAINED_REMEDY, REMEDY, Figures, Gap, Verdict, decide
 
-EXAMINED = 2000  # real images whose likes are looked for
 SHOWN = 16  # images of each side that are least like the other
 
 
@@ -51,6 +62,7 @@ class Trust:
             "verdict": str(self.verdict),
             "because": self.because,
             "remedy": self.remedy,
+            "differences": _differences(found),
             "images": dict(zip(("generated", "real", "prior"), found.numbers, strict=True)),
             "distance": _apart(found.joint),
             "largest_single_feature": {"name": found.names[found.single.worst], **_apart(found.single.largest)},
@@ -142,6 +154,7 @@ def trust(
     figures = Figures(
         joint=joint,
         single=single,
+        differences=differences(generated, whole, resolution, seed),
         names=names,
         from_prior=from_prior,
         p_value=permutation_p(generated, whole, seed=seed),
@@ -192,6 +205,17 @@ def _measured(unlike: Mask, nearest: Features, floor: float, index: NDArray[np.i
     low, high = interval(np.array([unlike.sum()]), len(unlike), 0.95)
     worst = index[np.argsort(-nearest, kind="stable")[:SHOWN]]
     return Gap(float(unlike.mean()), float(low[0]), float(high[0]), floor, worst)
+
+
+def _differences(figures: Figures) -> dict[str, Any]:
+    found = figures.differences
+    return {
+        "found": found.found,
+        "most_in": None if found.worst is None else figures.names[found.worst],
+        "total_variation": found.variation,
+        "seen_above": found.visible,
+        "images": dict(zip(("generated", "real"), found.numbers, strict=True)),
+    }
 
 
 def _apart(found: Apart) -> dict[str, Any]:

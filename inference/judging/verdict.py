@@ -6,19 +6,19 @@ In this order, the first that holds:
   another. Where there are features of appearance this is asked of them, for counts of a strange image may be ordinary.
 - out of reach: surely more than one real image in twenty is like no generated and no prior scene, and without these
   images generated and real features are less than half as far apart.
-- not fitted yet: a judge who sees 250 images of each tells generated from real ones, and cannot tell generated from
-  the prior's.
+- not fitted yet: generated and real features differ by more than is tolerated (``differences``), and generated ones
+  cannot be told from the prior's.
 - out of reach: more than half of the real images are like no scene.
 - modes lost: a cluster of the real images has surely less than a quarter of its share among the generated, and more
   among the prior's; and such clusters hold more than the generated scenes that are like no real image, which show that
   scenes are somewhere else and not just fewer kinds.
-- still apart: the judge tells generated from real.
-- good: none of these.
+- still apart: generated and real features differ by more than is tolerated.
+- good: none of these. The total variation from which on a difference would have been found is named.
 
-What a judge can tell, what a nearest neighbour is and which shares are sure comes from halves of the real set and from
-binomial limits; the limits "half", "a quarter" and "one in twenty" are the resolution of the clusters and of the
-neighbourhoods (``modes``, ``support``). A good verdict is about what the features see: a network that counts wrongly
-in real images and rightly in renders gives a good match of wrong counts.
+What the prior's scenes are told by, what a nearest neighbour is and which shares are sure comes from halves of the sets
+and from binomial limits. The limits "half", "a quarter" and "one in twenty" are the resolution of the clusters and of
+the neighbourhoods (``modes``, ``support``). A good verdict is about what the features see: a network that counts
+wrongly in real images and rightly in renders gives a good match of wrong counts.
 """
 
 from enum import StrEnum
@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .differences import Differences
 from .modes import Modes
 from .support import Fidelity
 from .two_sample import Apart, Marginals
@@ -87,6 +88,7 @@ class Figures(NamedTuple):
     Attributes:
         joint: energy distance of generated and real features.
         single: the features one by one.
+        differences: whether they are more than is tolerated, and which would be seen.
         names: of the features, or of their principal components.
         from_prior: energy distance of generated and prior features; None where there is no prior.
         p_value: whether generated and real differ at all, by all images.
@@ -103,6 +105,7 @@ class Figures(NamedTuple):
 
     joint: Apart
     single: Marginals
+    differences: Differences
     names: tuple[str, ...]
     from_prior: Apart | None
     p_value: float
@@ -122,16 +125,10 @@ class Figures(NamedTuple):
 def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
     """The verdict and one sentence with the figures that decided; ``explained`` says whether the real images that are
     out of reach are what most of the distance comes from."""
-    joint, largest, modes, outside = found.joint, found.single.largest, found.modes, found.real_out_of_support
-    close = is_close(joint, found.single)
-    if joint.floor > 0:
-        far = (
-            f"generated and real features are {joint.ratio:.1f} floors apart (two real sets of {joint.judged} are "
-            f"{joint.low / joint.floor:.1f} to {joint.high / joint.floor:.1f}), the feature "
-            f"{found.names[found.single.worst]!r} by itself {largest.distance:.1f} (by chance up to {largest.high:.1f})"
-        )
-    else:
-        far = "the real features hardly vary"
+    modes, outside, differ = found.modes, found.real_out_of_support, found.differences
+    number = f"{differ.numbers[0]} generated and {differ.numbers[1]} real images"
+    feature = "all features together" if differ.worst is None else f"the feature {found.names[differ.worst]!r}"
+    apart = f"{number} can be told apart, most by {feature} (total variation {differ.variation:.2f})"
     if found.foreign > 0.5:
         how = "look" if found.by_appearance else "are by their features"
         return (
@@ -146,8 +143,8 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             Verdict.OUT_OF_REACH,
             f"{_outside(outside)}; without them generated and real features are less than half as far apart.",
         )
-    if not close and found.from_prior is not None and found.from_prior.close:
-        return Verdict.NOT_FITTED, f"{_sentence(far)}, while generated and prior scenes cannot be told apart."
+    if differ.found and found.from_prior is not None and found.from_prior.close:
+        return Verdict.NOT_FITTED, f"{apart}, while generated and prior scenes cannot be told apart."
     if gap and outside.share > max(0.5, lost):
         return Verdict.OUT_OF_REACH, f"{_outside(outside)}."
     if lost > max(0.0, found.generated_unmatched.share - found.generated_unmatched.floor):
@@ -157,18 +154,19 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             f"{int(modes.lost.sum())} of {len(modes.real)} clusters, {_percent(lost)} of the real images, are "
             f"{_percent(left)} of the generated ones: surely less than a quarter of their share.",
         )
-    if not close:
-        return Verdict.APART, f"{_sentence(far)}."
+    if differ.found:
+        return Verdict.APART, f"{apart}."
     return (
         Verdict.GOOD,
-        f"{_sentence(far)}; {_percent(found.real_unmatched.share)} of the real images are like no generated scene "
-        f"(between real halves up to {_percent(found.real_unmatched.floor)}).",
+        f"{number} cannot be told apart{_seen_above(differ)}; {_percent(found.real_unmatched.share)} of the real "
+        f"images are like no generated scene (between real halves up to {_percent(found.real_unmatched.floor)}).",
     )
 
 
-def is_close(joint: Apart, single: Marginals) -> bool:
-    """Whether the judge takes generated for real features."""
-    return joint.close and single.largest.close
+def _seen_above(differ: Differences) -> str:
+    if differ.visible is None:
+        return ", as far as features that hardly vary say"
+    return f": differences above a total variation of {differ.visible:.2f} in any one feature would be seen"
 
 
 def _outside(gap: Gap) -> str:
@@ -180,7 +178,3 @@ def _outside(gap: Gap) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
-
-
-def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:]

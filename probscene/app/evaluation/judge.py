@@ -1,9 +1,9 @@
 """Can a run be trusted? Its scenes, the prior's and the target's images through its own network, judged without labels.
 
-Structure is judged by scenes that are drawn and looked at as the fit has looked at them, layout and looks by images as
-``generate`` writes them (``judging.looked``). For another domain the looks are asked, by EfficientNet-Lite: counts of a
-strange image may be quite ordinary. They are not asked where the features were suited to the target's images and say
-what can be read in them: those are another domain, and were read as such.
+Structure is judged by scenes that are drawn and looked at as the fit has looked at them, layout and looks by half as
+many images as ``generate`` writes them (``judging.looked``). For another domain the looks are asked, by
+EfficientNet-Lite: counts of a strange image may be quite ordinary. They are not asked where the features were suited to
+the target's images and say what can be read in them: those are another domain, and were read as such.
 
 Axis letters: N scenes, L images, D features.
 """
@@ -37,7 +37,7 @@ from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement
 
 SCENES = 1000  # of the guide, and as many of the prior
-AFTER_A_FIT = 256  # where they are judged at once
+AFTER_A_FIT = 512  # where they are judged at once
 SHOWN = 8  # images in each picture
 THUMB = 128  # pixels
 
@@ -108,11 +108,12 @@ def judge(
         )
     preset, model, net = run.preset, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)
-    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
+    images = min(looked.IMAGES, num // 2)
+    done, total = 0, 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, images)
 
-    def each(images: int) -> None:
+    def each(more: int) -> None:
         nonlocal done
-        done += images
+        done += more
         progress("judging", done, total, "")
 
     each(0)
@@ -120,7 +121,7 @@ def judge(
     draws = [1 if policy.suits else preset.draws_per_structure for policy in policies]
     scenes = [_features(run, *each_of, num, seed) for each_of in zip(policies, eyes, draws, strict=True)]
     real = _real(run, target, net, each)
-    seen = looked.look(run, target, net, EfficientNetLite(), each, looked.IMAGES, seed)
+    seen = looked.look(run, target, net, EfficientNetLite(), each, images, seed)
     rendered = np.concatenate([seen[name].looks.features for name in (looked.LEARNT, looked.PRIOR)])
     which = compared(net)
     which = torch.ones(real.shape[1], dtype=torch.bool) if which is None else which

@@ -25,7 +25,7 @@ from ..fitting.parts import inner
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import images_of
 
-IMAGES = 200  # of each source
+IMAGES = 500  # of each source, at most
 TARGET, LEARNT, STRUCTURE, PRIOR = "target", "learnt", "structure alone", "prior"
 ALL = ""  # the objects of all classes
 
