@@ -15,7 +15,7 @@ from probscene.errors import ProbsceneError
 
 from .differences import differences
 from .modes import effective_share, interval, modes
-from .support import Fidelity, Mask, fidelity, foreign, likeness, unlike_floor
+from .support import Fidelity, Mask, Places, fidelity, foreign, likeness, strange, unlike_floor
 from .two_sample import (
     EXAMINED,
     NEEDED,
@@ -99,7 +99,7 @@ def trust(
     prior: ArrayLike | None = None,
     names: tuple[str, ...] | None = None,
     resolution: float = 0.0,
-    looks: tuple[ArrayLike, ArrayLike] | None = None,
+    places: tuple[Places, Places] | None = None,
     seed: int = 0,
     pretrained: bool = False,
 ) -> Trust:
@@ -111,8 +111,8 @@ def trust(
         prior: ``(P, D)`` of the scenes that the guide set out from.
         names: of the features.
         resolution: features that differ by less mean the same: 0.5 for counts.
-        looks: features of appearance of some real images and of some scenes ``(A, E)``, ``(B, E)``, to tell another
-            domain by.
+        places: features of what stands out in some real images and in some scenes, to tell another domain by; see
+            ``strange``.
         seed: of the splits.
         pretrained: whether the features are a pretrained network's, which advice goes by.
 
@@ -145,10 +145,10 @@ def trust(
     nowhere = ~to_generated.like if to_prior is None else ~to_generated.like & ~to_prior.like
     nearest = to_generated.nearest if to_prior is None else np.minimum(to_generated.nearest, to_prior.nearest)
     found = modes(generated, whole, before, seed)
-    if looks is None:
+    if places is None:
         strangers = foreign(some, generated if before is None else np.concatenate([before, generated])[:EXAMINED])
     else:
-        strangers = foreign(*(np.asarray(side, np.float64) for side in looks))
+        strangers = strange(*places, seed=seed)
     size = min(len(generated), len(some))
     one, other = np.array_split(read_some, 2)
     figures = Figures(
@@ -163,7 +163,7 @@ def trust(
         generated_unmatched=_measured(~to_real.like, to_real.nearest, floor, np.arange(len(generated))),
         modes=found,
         foreign=float(strangers.mean()),
-        by_appearance=looks is not None,
+        by_appearance=places is not None,
         effective=effective_share(read_generated, read_some, seed=seed),
         effective_floor=effective_share(one, other, seed=seed),
         fidelity=fidelity(generated[:size], some[:size]),

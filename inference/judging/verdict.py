@@ -2,8 +2,9 @@
 
 In this order, the first that holds:
 
-- another domain: more than half of the real images are farther from every scene than two random scenes are from one
-  another. Where there are features of appearance this is asked of them, for counts of a strange image may be ordinary.
+- another domain: more than half of the real images show what is unlike anything in scenes, wherever it stands
+  (``support.strange``). Without features of appearance: they are farther from every scene than two random scenes are
+  from one another.
 - out of reach: surely more than one real image in twenty is like no generated and no prior scene, and without these
   images generated and real features are less than half as far apart.
 - not fitted yet: generated and real features differ by more than is tolerated (``differences``), and generated ones
@@ -96,7 +97,7 @@ class Figures(NamedTuple):
         real_out_of_support: real images that no generated and no prior scene is like.
         generated_unmatched: generated scenes that no real image is like; its floor is the real images' own.
         modes: the clusters.
-        foreign: share of real images that are farther from every scene than scenes are from one another.
+        foreign: share of real images of another domain.
         by_appearance: whether ``foreign`` is by features of appearance.
         effective: ESS / N of the density ratio; ``effective_floor`` that of a real half to the other.
         fidelity, fidelity_floor: precision, recall, density, coverage, and those between real halves.
@@ -130,12 +131,12 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
     feature = "all features together" if differ.worst is None else f"the feature {found.names[differ.worst]!r}"
     apart = f"{number} can be told apart, most by {feature} (total variation {differ.variation:.2f})"
     if found.foreign > 0.5:
-        how = "look" if found.by_appearance else "are by their features"
-        return (
-            Verdict.ANOTHER_DOMAIN,
-            f"{_percent(found.foreign)} of the real images {how} farther from every scene than two random scenes are "
-            "from one another.",
+        how = (
+            "show what is unlike anything in scenes"
+            if found.by_appearance
+            else "are by their features farther from every scene than two random scenes are from one another"
         )
+        return Verdict.ANOTHER_DOMAIN, f"{_percent(found.foreign)} of the real images {how}."
     lost = float(modes.real[modes.lost].sum())
     gap = outside.low > max(SHARE, outside.floor)
     if gap and explained:

@@ -120,10 +120,11 @@ def test_layout_and_looks_of_the_prior_are_not_good_however_good_the_structure(f
     found = judge(guided(fitted, learnt=learnt), fitted.images, quiet, 300)
     found_words = words(found)
     assert found_words.pop("looks") in (Word.NO_BETTER, None)  # dots are small, and images few
-    assert found_words == {"structure": Word.GOOD, "layout": Word.NO_BETTER} and found.trust.verdict is Verdict.GOOD
+    assert found_words.pop("structure") in (Word.GOOD, Word.BETTER)  # dots that lie in a line are counted otherwise
+    assert found_words == {"layout": Word.NO_BETTER}
     record = found.record()
-    assert record["verdict"] == record["overall"] == "no better than the prior"
-    assert "--learn structure,parameters" in record["remedy"]
+    assert record["overall"] == "no better than the prior" and record["verdict"] != "good"
+    assert "--learn structure,parameters" in record["parts"]["layout"]["remedy"]
     assert ("structure alone" in record["parts"]["layout"]["distances"]) is (learnt is not None)
 
 
@@ -252,9 +253,9 @@ def test_each_image_is_the_one_that_generate_writes(fitted, tmp_path):
     run, seen = guided(fitted, learnt=None), []
 
     class Kept:
-        def embed(self, images):
+        def places(self, images):
             seen.append(images)
-            return torch.zeros(len(images), 1)
+            return torch.zeros(len(images), 1), torch.zeros(len(images), 2, 1)
 
     found = looked.look(run, fitted.images, run.network(), Kept(), lambda _: None, 20, 3)
     assert set(found) == {looked.TARGET, looked.LEARNT, looked.PRIOR}
