@@ -4,9 +4,10 @@
 
 Printed for each is the share of its images that show what is unlike anything in the prior's scenes (``strange``); from
 a half on a verdict says "another domain". Beside it is the share of images that are farther from every scene than two
-scenes are from one another, by features of whole images (``foreign``), which verdicts went by before. Nothing is fitted. Not learnt, but within the model's reach, are digits and
-roads in other numbers and other places. Other domains are letters, and digits and roads that are turned, larger,
-blurred, noisy or in other colours than the model draws; photographs in folders are held against the model of digits.
+scenes are from one another, by features of whole images (``foreign``), which verdicts went by before. Nothing is
+fitted. Not learnt, but within the model's reach, are digits and roads in other numbers and other places. Other domains
+are letters, and digits and roads that are turned, larger, blurred, noisy or in other colours than the model draws;
+photographs in folders are held against the model of digits.
 """
 
 import argparse

@@ -33,6 +33,7 @@ from .modes import Modes
 from .support import Fidelity
 from .two_sample import Apart, Marginals
 
+ALIEN, DOUBTFUL = 0.5, 0.2  # of the real images: another domain; and what is said beside "not fitted yet"
 SHARE = 0.05  # of the real images: what is smaller is a figure and no verdict
 
 
@@ -130,7 +131,7 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
     number = f"{differ.numbers[0]} generated and {differ.numbers[1]} real images"
     feature = "all features together" if differ.worst is None else f"the feature {found.names[differ.worst]!r}"
     apart = f"{number} can be told apart, most by {feature} (total variation {differ.variation:.2f})"
-    if found.foreign > 0.5:
+    if found.foreign > ALIEN:
         how = (
             "show what is unlike anything in scenes"
             if found.by_appearance
@@ -144,8 +145,10 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             Verdict.OUT_OF_REACH,
             f"{_outside(outside)}; without them generated and real features are less than half as far apart.",
         )
+    doubt = found.by_appearance and found.foreign > DOUBTFUL
+    beside = f" {_percent(found.foreign)} of the real images show what is unlike anything in scenes." if doubt else ""
     if differ.found and found.from_prior is not None and found.from_prior.close:
-        return Verdict.NOT_FITTED, f"{apart}, while generated and prior scenes cannot be told apart."
+        return Verdict.NOT_FITTED, f"{apart}, while generated and prior scenes cannot be told apart.{beside}"
     if gap and outside.share > max(0.5, lost):
         return Verdict.OUT_OF_REACH, f"{_outside(outside)}."
     if lost > max(0.0, found.generated_unmatched.share - found.generated_unmatched.floor):
@@ -156,7 +159,7 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             f"{_percent(left)} of the generated ones: surely less than a quarter of their share.",
         )
     if differ.found:
-        return Verdict.APART, f"{apart}."
+        return Verdict.APART, f"{apart}.{beside}"
     return (
         Verdict.GOOD,
         f"{number} cannot be told apart{_seen_above(differ)}; {_percent(found.real_unmatched.share)} of the real "

@@ -172,6 +172,9 @@ def test_looks_decide_what_domain_it_is():
     found = trust(*case, resolution=0.5, places=(far, scenes))
     assert found.verdict == Verdict.ANOTHER_DOMAIN and "show what is unlike" in found.because
     assert found.figures.by_appearance
+    some = np.concatenate([far[:20], near[20:]])
+    found = trust(*aerial("the prior", rng, 300, 300), resolution=0.5, places=(some, scenes))
+    assert found.verdict == Verdict.NOT_FITTED and "% of the real images show what is unlike" in found.because
 
 
 def test_wide_features_are_judged_by_their_principal_components():
