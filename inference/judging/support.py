@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 from .two_sample import Features
 
 NEIGHBOURS = 10
-BANK, COMMON = 12000, 0.95  # places of scenes that are compared; share of scenes
+COMMON = 0.95  # of scenes are no stranger than what is not strange
 Mask = NDArray[np.bool_]
 Places = NDArray[np.floating]
 
@@ -108,8 +108,8 @@ def foreign(real: Features, scenes: Features) -> Mask:
 
 def strange(real: Places, scenes: Places, seed: int = 0) -> Mask:
     """``(L,)`` whether what an image shows is unlike what any scene shows, wherever that stands and however much there
-    is of it: more of it is left unexplained than in ``COMMON`` of other scenes. Explained is what the most similar
-    place of ``BANK`` of the scenes' leaves of how much a place differs from the rest of its image, in squares.
+    is of it: more of it is left unexplained than in ``COMMON`` of a quarter of the scenes. Unexplained is what the most
+    similar place of the others leaves of how much a place differs from the rest of its image, in squares.
 
     Args:
         real, scenes: ``(L, 1 + K, E)`` and ``(N, 1 + K, E)``: of each image first the feature that is usual in it, then
@@ -119,7 +119,7 @@ def strange(real: Places, scenes: Places, seed: int = 0) -> Mask:
     bank, others = scenes[order[len(order) // 4 :]], scenes[order[: len(order) // 4]]
     rows = bank[:, 1:].reshape(-1, bank.shape[2])
     scale = np.where(rows.std(0) > 0, rows.std(0), 1.0)
-    rows = (rows[np.linspace(0, len(rows) - 1, min(BANK, len(rows))).astype(int)] / scale).astype(np.float32)
+    rows = (rows / scale).astype(np.float32)
     squares = (rows**2).sum(1)
 
     def sums(images: Places) -> Features:
