@@ -38,6 +38,7 @@ from .names import network_name
 
 AT_ONCE = 4  # images a pass: what it takes is then kept for the next, and not asked from the system anew each time
 LAST = torch.channels_last  # in memory; twice as fast on a CPU
+PLACES = 8  # of an image, as many as one object has
 LEAST = 96  # pixels of the shorter side, for images that are very long
 PATIENCE = 20.0  # seconds that a server may take to answer
 MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's channels, in 0..1
@@ -141,6 +142,20 @@ class EfficientNetLite(_Frozen):
             whole.append(self._pool(maps[-1]))
             texture.append(torch.cat([maps[0].mean((2, 3)), maps[0].std((2, 3))], 1))
         return torch.cat(whole), torch.cat(texture)
+
+    @torch.no_grad()
+    def places(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Of ``(N, 1 or 3, H, W)`` uint8 images: ``pooled``, and of the finest maps the median and the places that
+        differ most from it, ``(N, 1 + PLACES, 40)``: objects, wherever they stand, if most of an image is ground."""
+        whole, found = [], []
+        for some in images.split(AT_ONCE):
+            maps = self.pyramid(self.enter(some))
+            whole.append(self._pool(maps[-1]))
+            each = maps[0].flatten(2).transpose(1, 2)  # (n, h w, C)
+            usual = each.median(1, keepdim=True).values
+            most = ((each - usual) ** 2).sum(2).topk(PLACES, 1).indices
+            found.append(torch.cat([usual, each.gather(1, most.unsqueeze(2).expand(-1, -1, each.shape[2]))], 1))
+        return torch.cat(whole), torch.cat(found)
 
     @torch.no_grad()
     def logits(self, images: Tensor) -> Tensor:

@@ -42,9 +42,10 @@ class Word(StrEnum):
     NO_BETTER = "no better than the prior"
 
 
-def worst(words: Iterable[Word]) -> Word:
-    """The worst of them; good where there are none."""
-    order = list(Word)
+def worst(words: Iterable[Word | None]) -> Word | None:
+    """The worst of them; good where there are none. None is what cannot be judged: it may be no better than the prior,
+    and is not known to be."""
+    order = (Word.GOOD, Word.BETTER, None, Word.NO_BETTER)
     return order[max((order.index(word) for word in words), default=0)]
 
 

@@ -18,7 +18,9 @@ from scipy.spatial.distance import cdist
 from .two_sample import Features
 
 NEIGHBOURS = 10
+COMMON = 0.95  # of scenes are no stranger than what is not strange
 Mask = NDArray[np.bool_]
+Places = NDArray[np.floating]
 
 
 class Likeness(NamedTuple):
@@ -102,3 +104,35 @@ def foreign(real: Features, scenes: Features) -> Mask:
     within = cdist(scenes, scenes)
     spread = np.median(within[np.triu_indices(len(scenes), 1)])
     return cdist(real, scenes).min(1) > spread
+
+
+def strange(real: Places, scenes: Places, seed: int = 0) -> Mask:
+    """``(L,)`` whether what an image shows is unlike what any scene shows, wherever that stands and however much there
+    is of it: more of it is left unexplained than in ``COMMON`` of a quarter of the scenes. Unexplained is what the most
+    similar place of the others leaves of how much a place differs from the rest of its image, in squares.
+
+    Args:
+        real, scenes: ``(L, 1 + K, E)`` and ``(N, 1 + K, E)``: of each image first the feature that is usual in it, then
+            those of places.
+    """
+    order = np.random.default_rng(seed).permutation(len(scenes))
+    bank, others = scenes[order[len(order) // 4 :]], scenes[order[: len(order) // 4]]
+    rows = bank[:, 1:].reshape(-1, bank.shape[2])
+    scale = np.where(rows.std(0) > 0, rows.std(0), 1.0)
+    rows = (rows / scale).astype(np.float32)
+    squares = (rows**2).sum(1)
+
+    def sums(images: Places) -> Features:
+        """What is left, and what there is to explain, ``(2, L)``."""
+        found = []
+        for image in (images / scale).astype(np.float32):
+            usual, places = image[0], image[1:]
+            nearest = ((places**2).sum(1)[:, None] - 2 * places @ rows.T + squares).min(1)
+            found.append((nearest.clip(min=0).sum(), ((places - usual) ** 2).sum()))
+        return np.array(found, np.float64).T
+
+    left, whole = sums(others)
+    least = 1e-3 * max(float(whole.mean()), 1e-12)  # in an image that shows nothing there is nothing strange
+    limit = np.quantile(left / np.maximum(whole, least), COMMON)
+    left, whole = sums(real)
+    return left / np.maximum(whole, least) > limit

@@ -1,7 +1,8 @@
 """Can this fit be trusted? Figures and a verdict from features alone, without labels.
 
-What a judge can tell, what a nearest neighbour is and which shares are sure comes from halves of the real set and from
-binomial limits; ``verdict`` holds the rules. Axis letters: N generated, L real, P prior, D features.
+Whether the sets differ, and which differences would be seen, comes from resamples of both (``differences``). What a
+nearest neighbour is and which shares are sure comes from halves of the real set and from binomial limits. ``verdict``
+holds the rules. Axis letters: N generated, L real, P prior, D features.
 """
 
 from dataclasses import dataclass
@@ -12,12 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from probscene.errors import ProbsceneError
 
+from .differences import differences
 from .modes import effective_share, interval, modes
-from .support import Fidelity, Mask, fidelity, foreign, likeness, unlike_floor
-from .two_sample import NEEDED, Apart, Features, apart, check_features, marginals, permutation_p, principal
+from .support import Fidelity, Mask, Places, fidelity, foreign, likeness, strange, unlike_floor
+from .two_sample import (
+    EXAMINED,
+    NEEDED,
+    Apart,
+    Features,
+    apart,
+    check_features,
+    marginals,
+    permutation_p,
+    principal,
+)
 from .verdict import PRETRAINED_REMEDY, REMEDY, Figures, Gap, Verdict, decide
 
-EXAMINED = 2000  # real images whose likes are looked for
 SHOWN = 16  # images of each side that are least like the other
 
 
@@ -51,6 +62,7 @@ class Trust:
             "verdict": str(self.verdict),
             "because": self.because,
             "remedy": self.remedy,
+            "differences": _differences(found),
             "images": dict(zip(("generated", "real", "prior"), found.numbers, strict=True)),
             "distance": _apart(found.joint),
             "largest_single_feature": {"name": found.names[found.single.worst], **_apart(found.single.largest)},
@@ -87,7 +99,7 @@ def trust(
     prior: ArrayLike | None = None,
     names: tuple[str, ...] | None = None,
     resolution: float = 0.0,
-    looks: tuple[ArrayLike, ArrayLike] | None = None,
+    places: tuple[Places, Places] | None = None,
     seed: int = 0,
     pretrained: bool = False,
 ) -> Trust:
@@ -99,8 +111,8 @@ def trust(
         prior: ``(P, D)`` of the scenes that the guide set out from.
         names: of the features.
         resolution: features that differ by less mean the same: 0.5 for counts.
-        looks: features of appearance of some real images and of some scenes ``(A, E)``, ``(B, E)``, to tell another
-            domain by.
+        places: features of what stands out in some real images and in some scenes, to tell another domain by; see
+            ``strange``.
         seed: of the splits.
         pretrained: whether the features are a pretrained network's, which advice goes by.
 
@@ -133,15 +145,16 @@ def trust(
     nowhere = ~to_generated.like if to_prior is None else ~to_generated.like & ~to_prior.like
     nearest = to_generated.nearest if to_prior is None else np.minimum(to_generated.nearest, to_prior.nearest)
     found = modes(generated, whole, before, seed)
-    if looks is None:
+    if places is None:
         strangers = foreign(some, generated if before is None else np.concatenate([before, generated])[:EXAMINED])
     else:
-        strangers = foreign(*(np.asarray(side, np.float64) for side in looks))
+        strangers = strange(*places, seed=seed)
     size = min(len(generated), len(some))
     one, other = np.array_split(read_some, 2)
     figures = Figures(
         joint=joint,
         single=single,
+        differences=differences(generated, whole, resolution, seed),
         names=names,
         from_prior=from_prior,
         p_value=permutation_p(generated, whole, seed=seed),
@@ -150,7 +163,7 @@ def trust(
         generated_unmatched=_measured(~to_real.like, to_real.nearest, floor, np.arange(len(generated))),
         modes=found,
         foreign=float(strangers.mean()),
-        by_appearance=looks is not None,
+        by_appearance=places is not None,
         effective=effective_share(read_generated, read_some, seed=seed),
         effective_floor=effective_share(one, other, seed=seed),
         fidelity=fidelity(generated[:size], some[:size]),
@@ -192,6 +205,17 @@ def _measured(unlike: Mask, nearest: Features, floor: float, index: NDArray[np.i
     low, high = interval(np.array([unlike.sum()]), len(unlike), 0.95)
     worst = index[np.argsort(-nearest, kind="stable")[:SHOWN]]
     return Gap(float(unlike.mean()), float(low[0]), float(high[0]), floor, worst)
+
+
+def _differences(figures: Figures) -> dict[str, Any]:
+    found = figures.differences
+    return {
+        "found": found.found,
+        "most_in": None if found.worst is None else figures.names[found.worst],
+        "total_variation": found.variation,
+        "seen_above": found.visible,
+        "images": dict(zip(("generated", "real"), found.numbers, strict=True)),
+    }
 
 
 def _apart(found: Apart) -> dict[str, Any]:

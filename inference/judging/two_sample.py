@@ -1,9 +1,8 @@
 """Are two sets of features samples of one distribution? A distance, and the floor that chance alone leaves.
 
-With enough images every fit differs from the target, so a p-value alone cannot tell a good one. The floor is therefore
-that of a judge who sees ``judged`` images of each side: the distance between so many real images and as many other real
-ones. A distance is stated in floors, with its rank among those of the halves. Axis letters: N, L images, D features, S
-splits.
+The floor is that of a judge who sees ``judged`` images of each side, as many as there are: the distance between so many
+real images and as many other real ones. A distance is stated in floors, with its rank among those of the halves. What a
+good verdict goes by is in ``differences``. Axis letters: N, L images, D features, S splits.
 
 References:
     [1] Székely, Rizzo, *Energy statistics: a class of statistics based on distances*, 2013.
@@ -21,7 +20,8 @@ from probscene.errors import DataError
 
 Features = NDArray[np.float64]
 NEEDED = 40  # real images: two halves of twenty
-JUDGED = 250  # images that the judge sees of each side, where there are so many
+EXAMINED = 2000  # images of each side, at most: distances are between all pairs
+JUDGED = EXAMINED // 2  # images that the judge sees of each side, where there are so many
 
 
 class Apart(NamedTuple):
@@ -98,7 +98,8 @@ def apart(generated: Features, real: Features, judged: int = JUDGED, splits: int
     """The energy distance between generated ``(N, D)`` and real ``(L, D)`` features beside its floor."""
     rng = np.random.default_rng(seed)
     n = min(judged, len(generated), len(real) // 2)
-    real, generated = _some(real, 8 * n, rng), _some(generated, 8 * n, rng)
+    most = min(8 * n, EXAMINED)
+    real, generated = some(real, most, rng), some(generated, most, rng)
     within, across, theirs = cdist(real, real), cdist(real, generated), cdist(generated, generated)
     a, b, g = (np.zeros((splits, number)) for number in (len(real), len(real), len(generated)))
     for s in range(splits):
@@ -133,7 +134,7 @@ def marginals(generated: Features, real: Features, judged: int = JUDGED, splits:
     n = min(judged, len(generated), len(real) // 2)
     found, floor = np.empty((splits, real.shape[1])), np.empty((splits, real.shape[1]))
     for s in range(splits):
-        mixed = np.concatenate([_some(real, n, rng), _some(generated, n, rng)])
+        mixed = np.concatenate([some(real, n, rng), some(generated, n, rng)])
         found[s] = marginal_distances(mixed[:n], mixed[n:])
         mixed = mixed[rng.permutation(2 * n)]
         floor[s] = marginal_distances(mixed[:n], mixed[n:])
@@ -149,7 +150,7 @@ def permutation_p(
     """p-value of the energy distance under relabelling [1, 2], on up to ``most`` images of each side: whether a
     difference can be detected at all, however small it is."""
     rng = np.random.default_rng(seed)
-    real, generated = _some(real, most, rng), _some(generated, most, rng)
+    real, generated = some(real, most, rng), some(generated, most, rng)
     N, L = len(generated), len(real)
     pooled = np.concatenate([generated, real])
     label = np.repeat([1 / N, -1 / L], [N, L])
@@ -169,7 +170,8 @@ def principal(sets: list[Features], most: int = 32) -> list[Features]:
     return [(each - centre) @ axes for each in sets]
 
 
-def _some(rows: Features, most: int, rng: np.random.Generator) -> Features:
+def some(rows: Features, most: int, rng: np.random.Generator) -> Features:
+    """At most so many of ``rows (N, D)``, drawn at random."""
     return rows if len(rows) <= most else rows[rng.permutation(len(rows))[:most]]
 
 

@@ -2,23 +2,24 @@
 
 In this order, the first that holds:
 
-- another domain: more than half of the real images are farther from every scene than two random scenes are from one
-  another. Where there are features of appearance this is asked of them, for counts of a strange image may be ordinary.
+- another domain: more than half of the real images show what is unlike anything in scenes, wherever it stands
+  (``support.strange``). Without features of appearance: they are farther from every scene than two random scenes are
+  from one another.
 - out of reach: surely more than one real image in twenty is like no generated and no prior scene, and without these
   images generated and real features are less than half as far apart.
-- not fitted yet: a judge who sees 250 images of each tells generated from real ones, and cannot tell generated from
-  the prior's.
+- not fitted yet: generated and real features differ by more than is tolerated (``differences``), and generated ones
+  cannot be told from the prior's.
 - out of reach: more than half of the real images are like no scene.
 - modes lost: a cluster of the real images has surely less than a quarter of its share among the generated, and more
   among the prior's; and such clusters hold more than the generated scenes that are like no real image, which show that
   scenes are somewhere else and not just fewer kinds.
-- still apart: the judge tells generated from real.
-- good: none of these.
+- still apart: generated and real features differ by more than is tolerated.
+- good: none of these. The total variation from which on a difference would have been found is named.
 
-What a judge can tell, what a nearest neighbour is and which shares are sure comes from halves of the real set and from
-binomial limits; the limits "half", "a quarter" and "one in twenty" are the resolution of the clusters and of the
-neighbourhoods (``modes``, ``support``). A good verdict is about what the features see: a network that counts wrongly
-in real images and rightly in renders gives a good match of wrong counts.
+What the prior's scenes are told by, what a nearest neighbour is and which shares are sure comes from halves of the sets
+and from binomial limits. The limits "half", "a quarter" and "one in twenty" are the resolution of the clusters and of
+the neighbourhoods (``modes``, ``support``). A good verdict is about what the features see: a network that counts
+wrongly in real images and rightly in renders gives a good match of wrong counts.
 """
 
 from enum import StrEnum
@@ -27,10 +28,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .differences import Differences
 from .modes import Modes
 from .support import Fidelity
 from .two_sample import Apart, Marginals
 
+ALIEN, DOUBTFUL = 0.5, 0.2  # of the real images: another domain; and what is said beside "not fitted yet"
 SHARE = 0.05  # of the real images: what is smaller is a figure and no verdict
 
 
@@ -87,6 +90,7 @@ class Figures(NamedTuple):
     Attributes:
         joint: energy distance of generated and real features.
         single: the features one by one.
+        differences: whether they are more than is tolerated, and which would be seen.
         names: of the features, or of their principal components.
         from_prior: energy distance of generated and prior features; None where there is no prior.
         p_value: whether generated and real differ at all, by all images.
@@ -94,7 +98,7 @@ class Figures(NamedTuple):
         real_out_of_support: real images that no generated and no prior scene is like.
         generated_unmatched: generated scenes that no real image is like; its floor is the real images' own.
         modes: the clusters.
-        foreign: share of real images that are farther from every scene than scenes are from one another.
+        foreign: share of real images of another domain.
         by_appearance: whether ``foreign`` is by features of appearance.
         effective: ESS / N of the density ratio; ``effective_floor`` that of a real half to the other.
         fidelity, fidelity_floor: precision, recall, density, coverage, and those between real halves.
@@ -103,6 +107,7 @@ class Figures(NamedTuple):
 
     joint: Apart
     single: Marginals
+    differences: Differences
     names: tuple[str, ...]
     from_prior: Apart | None
     p_value: float
@@ -122,23 +127,17 @@ class Figures(NamedTuple):
 def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
     """The verdict and one sentence with the figures that decided; ``explained`` says whether the real images that are
     out of reach are what most of the distance comes from."""
-    joint, largest, modes, outside = found.joint, found.single.largest, found.modes, found.real_out_of_support
-    close = is_close(joint, found.single)
-    if joint.floor > 0:
-        far = (
-            f"generated and real features are {joint.ratio:.1f} floors apart (two real sets of {joint.judged} are "
-            f"{joint.low / joint.floor:.1f} to {joint.high / joint.floor:.1f}), the feature "
-            f"{found.names[found.single.worst]!r} by itself {largest.distance:.1f} (by chance up to {largest.high:.1f})"
+    modes, outside, differ = found.modes, found.real_out_of_support, found.differences
+    number = f"{differ.numbers[0]} generated and {differ.numbers[1]} real images"
+    feature = "all features together" if differ.worst is None else f"the feature {found.names[differ.worst]!r}"
+    apart = f"{number} can be told apart, most by {feature} (total variation {differ.variation:.2f})"
+    if found.foreign > ALIEN:
+        how = (
+            "show what is unlike anything in scenes"
+            if found.by_appearance
+            else "are by their features farther from every scene than two random scenes are from one another"
         )
-    else:
-        far = "the real features hardly vary"
-    if found.foreign > 0.5:
-        how = "look" if found.by_appearance else "are by their features"
-        return (
-            Verdict.ANOTHER_DOMAIN,
-            f"{_percent(found.foreign)} of the real images {how} farther from every scene than two random scenes are "
-            "from one another.",
-        )
+        return Verdict.ANOTHER_DOMAIN, f"{_percent(found.foreign)} of the real images {how}."
     lost = float(modes.real[modes.lost].sum())
     gap = outside.low > max(SHARE, outside.floor)
     if gap and explained:
@@ -146,8 +145,10 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             Verdict.OUT_OF_REACH,
             f"{_outside(outside)}; without them generated and real features are less than half as far apart.",
         )
-    if not close and found.from_prior is not None and found.from_prior.close:
-        return Verdict.NOT_FITTED, f"{_sentence(far)}, while generated and prior scenes cannot be told apart."
+    doubt = found.by_appearance and found.foreign > DOUBTFUL
+    beside = f" {_percent(found.foreign)} of the real images show what is unlike anything in scenes." if doubt else ""
+    if differ.found and found.from_prior is not None and found.from_prior.close:
+        return Verdict.NOT_FITTED, f"{apart}, while generated and prior scenes cannot be told apart.{beside}"
     if gap and outside.share > max(0.5, lost):
         return Verdict.OUT_OF_REACH, f"{_outside(outside)}."
     if lost > max(0.0, found.generated_unmatched.share - found.generated_unmatched.floor):
@@ -157,18 +158,19 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             f"{int(modes.lost.sum())} of {len(modes.real)} clusters, {_percent(lost)} of the real images, are "
             f"{_percent(left)} of the generated ones: surely less than a quarter of their share.",
         )
-    if not close:
-        return Verdict.APART, f"{_sentence(far)}."
+    if differ.found:
+        return Verdict.APART, f"{apart}.{beside}"
     return (
         Verdict.GOOD,
-        f"{_sentence(far)}; {_percent(found.real_unmatched.share)} of the real images are like no generated scene "
-        f"(between real halves up to {_percent(found.real_unmatched.floor)}).",
+        f"{number} cannot be told apart{_seen_above(differ)}; {_percent(found.real_unmatched.share)} of the real "
+        f"images are like no generated scene (between real halves up to {_percent(found.real_unmatched.floor)}).",
     )
 
 
-def is_close(joint: Apart, single: Marginals) -> bool:
-    """Whether the judge takes generated for real features."""
-    return joint.close and single.largest.close
+def _seen_above(differ: Differences) -> str:
+    if differ.visible is None:
+        return ", as far as features that hardly vary say"
+    return f": differences above a total variation of {differ.visible:.2f} in any one feature would be seen"
 
 
 def _outside(gap: Gap) -> str:
@@ -180,7 +182,3 @@ def _outside(gap: Gap) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
-
-
-def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:]

@@ -30,6 +30,7 @@ DRAWN = 200  # scenes of which a model's sites are found
 ENOUGH, POINT_MASS = 50, 0.05  # values of a site, and the share of them that are one, that show a point mass
 NEAR = 1e-6  # from 0 and 1; the logit of what is nearer is no number
 LEARN = "learn"  # of a site's ``infer``
+MEANT = "the program says so"  # why a site keeps its prior where that is False
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def why_kept(fn: Any, value: Tensor, infer: dict[str, Any] | None) -> str:
         infer: what the program says of it.
     """
     if infer and infer.get(LEARN) is False:
-        return "the program says so"
+        return MEANT
     if not value.is_floating_point() or getattr(fn.support, "is_discrete", False):
         return "it is discrete"
     if fn.event_shape:

@@ -1,9 +1,10 @@
 """Can a run be trusted? Its scenes, the prior's and the target's images through its own network, judged without labels.
 
-Structure is judged by scenes that are drawn and looked at as the fit has looked at them, layout and looks by images as
-``generate`` writes them (``judging.looked``). For another domain the looks are asked, by EfficientNet-Lite: counts of a
-strange image may be quite ordinary. They are not asked where the features were suited to the target's images and say
-what can be read in them: those are another domain, and were read as such.
+Structure is judged by scenes that are drawn and looked at as the fit has looked at them, layout and looks by half as
+many images as ``generate`` writes them (``judging.looked``). For another domain it is asked what stands out in images,
+by EfficientNet-Lite: counts of a strange image may be quite ordinary, and objects may stand where no scene has them. It
+is not asked where the features were suited to the target's images and say what can be read in them: those are another
+domain, and were read as such.
 
 Axis letters: N scenes, L images, D features.
 """
@@ -122,13 +123,14 @@ def judge(
     own = kept_features(run, target) is not None
     boxes = None if evaluation is None else evaluation.boxes
     boxes = given_boxes(run, target) if boxes is None and own else boxes
-    total = 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, looked.IMAGES)
+    images = min(looked.IMAGES, num // 2)
+    total = 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, images)
     total += 0 if boxes is None else 2 * size_figures.SCENES
     done = 0
 
-    def each(images: int) -> None:
+    def each(more: int) -> None:
         nonlocal done
-        done += images
+        done += more
         progress("judging", done, total, "")
 
     each(0)
@@ -136,8 +138,8 @@ def judge(
     draws = [1 if policy.suits else preset.draws_per_structure for policy in policies]
     scenes = [_features(run, *each_of, num, seed) for each_of in zip(policies, eyes, draws, strict=True)]
     real = _real(run, target, net, each)
-    seen = looked.look(run, target, net, EfficientNetLite(), each, looked.IMAGES, seed)
-    rendered = np.concatenate([seen[name].looks.features for name in (looked.LEARNT, looked.PRIOR)])
+    seen = looked.look(run, target, net, EfficientNetLite(), each, images, seed)
+    rendered = np.concatenate([seen[name].places for name in (looked.LEARNT, looked.PRIOR)])
     which = compared(net)
     which = torch.ones(real.shape[1], dtype=torch.bool) if which is None else which
     try:
@@ -147,7 +149,7 @@ def judge(
             scenes[1][:, which].numpy(),
             tuple(name for name, some in zip(net.names, which.tolist(), strict=True) if some),
             resolution=run.features.resolution,
-            looks=None if run.readings else (seen[looked.TARGET].looks.features, rendered),
+            places=None if run.readings else (seen[looked.TARGET].places, rendered),
             seed=seed,
             pretrained=run.features.pretrained,
         )

@@ -53,14 +53,18 @@ def longer(run: RunFolder, names: tuple[str, ...]) -> str:
     return f"Fit again for longer, such as twice the {' and '.join(map(str, had))} of this fit: {words}."
 
 
-def remedy(run: RunFolder, part: str, word: Word, figures: Nearness) -> str:
-    """What to do about ``layout`` or ``looks``, in a few sentences."""
+def remedy(run: RunFolder, part: str, word: Word, figures: Nearness, would_tell: str) -> str:
+    """What to do about ``layout`` or ``looks``, in a few sentences.
+
+    Args:
+        would_tell: what would make the comparison surer.
+    """
     if word is Word.GOOD:
         return "Use it."
     said = [_learn(run), _unread(run.parameters), _far(run.parameters)]
     said += [PHOTO] if part == "looks" else []
     if figures.left is not None and figures.left < UNSURE and figures.high > CLEARLY:
-        said.append("More photographs would make it surer.")
+        said.append(would_tell)
     return " ".join(filter(None, said))
 
 

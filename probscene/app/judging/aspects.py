@@ -15,16 +15,20 @@ from torch import Tensor
 from probscene.inference.judging.nearness import Nearness, Sample, Word, nearness, worst
 from probscene.inference.judging.trust import Trust
 from probscene.inference.judging.verdict import Verdict
+from probscene.inference.parameters.reading.tried import UNCLEAR
+from probscene.inference.parameters.sites import LEARN, MEANT, find_sites
 
 from ..evaluation.estimate import class_counts, counted_classes
 from ..fitting.learnt.outcome import compared
+from ..fitting.preset import BOTH
 from ..fitting.run import RunFolder
 from .advice import of_structure, remedy
-from .looked import ALL, LEARNT, PRIOR, STRUCTURE, TARGET, Looked
+from .looked import ALL, IMAGES, LEARNT, PRIOR, STRUCTURE, TARGET, Looked
 
-COUNTED = 500  # rows of each source whose counts are compared
+COUNTED = 1000  # rows of each source whose counts are compared
 KINDS = ("structure", "layout", "looks")
 ABSENT, UNSURE, UNREAD = "not judged", "cannot be told", "cannot be read"
+AGREES = 2.0  # floors up to which what is read of a site in the prior's renders agrees with what is read in the target
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,40 +64,48 @@ class Aspects:
         parts: by ``KINDS``.
         classes: the words for ``counts`` and ``layout`` of each class, as a person reads them.
         unread: sites that keep the prior, and why.
+        doubtful: those of them whose prior is not known to be the target's.
     """
 
     parts: dict[str, Aspect]
     classes: dict[str, dict[str, str]]
     unread: dict[str, str]
+    doubtful: tuple[str, ...] = ()
 
     @property
-    def overall(self) -> Word:
-        """The worst of the parts that are judged."""
-        return worst(part.word for part in self.parts.values() if part.word is not None)
+    def overall(self) -> Word | None:
+        """The worst of the parts; None where that cannot be judged, or where all are good and a site is in doubt."""
+        word = worst(part.word for part in self.parts.values())
+        return None if word is Word.GOOD and self.doubtful else word
 
     @property
     def head(self) -> Aspect:
-        """The part that the whole is called by: structure where it is not good, else the worst one."""
+        """The part that the whole is called by: structure where it is not good, else the worst one; or what the sites
+        leave open."""
         structure = self.parts["structure"]
         if structure.word is not Word.GOOD:
             return structure
-        return next(part for part in self.parts.values() if part.word is self.overall)
+        found = next((part for part in self.parts.values() if part.word is self.overall), None)
+        if found is None:
+            return Aspect(None, *_open(self.doubtful))
+        return found
 
     @property
     def verdict(self) -> str:
-        """Of the whole; good only where every part that is judged is."""
-        return self.head.verdict
+        """Of the whole; good only where every part is, and nothing that was to be learnt keeps a doubtful prior."""
+        return ABSENT if self.head.word is None else self.head.verdict
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "verdict": self.verdict,
-            "overall": str(self.overall),
+            "overall": ABSENT if self.overall is None else str(self.overall),
             "because": self.head.because,
             "remedy": self.head.remedy,
             "parts": {name: part.record() for name, part in self.parts.items()},
             "classes": self.classes,
             "sites_not_learnt": self.unread,
+            "sites_in_doubt": list(self.doubtful),
         }
 
 
@@ -117,17 +129,44 @@ def aspects(
     parts = {
         "structure": _structure(run, found, features, seed),
         "layout": layout,
-        "looks": _aspect(run, "looks", looks, ""),
+        "looks": _aspect(run, "looks", looks, "", _would_tell(looked)),
     }
-    return Aspects(parts, words, unread_sites(run))
+    return Aspects(parts, words, unread_sites(run), doubtful_sites(run))
 
 
 def unread_sites(run: RunFolder) -> dict[str, str]:
     """Sites that keep the prior, and why; empty where no parameters were to be learnt."""
-    return {site["name"]: site["because"] for site in run.parameters.get("sites", []) if not site["learnt"]}
+    if not run.parameters and run.preset.learn == BOTH:
+        return {site.name: f"{run.features.name} features read no parameters" for site in find_sites(run.model)}
+    kept = run.parameters.get("kept") == PRIOR
+    none = "scenes came no nearer to held-out images by what was learnt"
+    sites = run.parameters.get("sites", [])
+    return {site["name"]: site["because"] or none for site in sites if kept or not site["learnt"]}
 
 
-def called(word: Word | None, verdict: Verdict) -> Word:
+def doubtful_sites(run: RunFolder) -> tuple[str, ...]:
+    """Of the sites that keep the prior those of which nothing shows that the target has it: neither does the program
+    say that it is to be kept, nor is the same read, with some skill, in the prior's renders and in the target."""
+    of = {site["name"]: site for site in run.parameters.get("sites", [])}
+    unread = unread_sites(run)
+    return tuple(name for name in unread if unread[name] != MEANT and not _agrees(of.get(name, {})))
+
+
+def _agrees(site: dict[str, Any]) -> bool:
+    """Whether a site of a run's record has its prior in the target, too."""
+    apart = site.get("read", {}).get("distance")
+    if not apart or (site["skill"] or 0) < UNCLEAR or None in (apart["prior"], apart["floor"]):
+        return False
+    return apart["prior"] <= AGREES * apart["floor"]
+
+
+def _open(doubtful: tuple[str, ...]) -> tuple[str, str]:
+    """Why the whole is not judged for sites that keep the prior, and what to do."""
+    because = f"Every part is good, but {', '.join(doubtful)} kept the prior, and nothing shows that the target has it."
+    return because, f"Set these priors by hand, and say infer={{{LEARN!r}: False}} of those that are meant as they are."
+
+
+def called(word: Word | None, verdict: Verdict) -> Word | None:
     """The word for structure: its verdict may be worse than how near its features are."""
     if verdict is Verdict.GOOD:
         return Word.GOOD
@@ -164,20 +203,29 @@ def _layout(run: RunFolder, looked: dict[str, Looked], seed: int) -> tuple[Aspec
     whole = found.pop(ALL)
     words = {name: said(figures) for name, figures in found.items()}
     worse = [name for name, word in words.items() if word == Word.NO_BETTER]
-    return _aspect(run, "layout", whole, ", ".join(worse)), words
+    return _aspect(run, "layout", whole, ", ".join(worse), _would_tell(looked)), words
 
 
-def _aspect(run: RunFolder, name: str, figures: Nearness | None, worse: str) -> Aspect:
+def _would_tell(looked: dict[str, Looked]) -> str:
+    """What would make a comparison surer: more than there are of what there are fewer of, as long as they are looked
+    at."""
+    target, scenes = (len(looked[name].looks.features) for name in (TARGET, LEARNT))
+    if target < scenes:
+        return "More photographs would tell."
+    return "More scenes would tell: --scenes." if scenes < IMAGES else "As many images as are looked at do not tell."
+
+
+def _aspect(run: RunFolder, name: str, figures: Nearness | None, worse: str, would_tell: str) -> Aspect:
     if figures is None:
         why = "Not judged: too few learnt scenes have as many objects as the target's images."
         return Aspect(None, why, "Mend the structure first.")
     word, because = figures.word, _because(figures)
     if word is None:
         why = f"Of {figures.rows} images neither what was learnt nor the prior can be told from the target."
-        return Aspect(None, why, "More photographs would tell.", figures, UNSURE)
+        return Aspect(None, why, would_tell, figures, UNSURE)
     if worse and word is Word.GOOD:
         word, because = Word.BETTER, f"{because} By themselves these are not nearer than in the prior: {worse}."
-    return Aspect(word, because, remedy(run, name, word, figures), figures, str(word))
+    return Aspect(word, because, remedy(run, name, word, figures, would_tell), figures, str(word))
 
 
 def _because(figures: Nearness) -> str:

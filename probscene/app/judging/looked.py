@@ -7,7 +7,7 @@ features of looks, h w cells.
 
 import copy
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from probscene.errors import ModelError
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.features.counting.layout import LEAST, objects, scales
 from probscene.inference.judging.nearness import Sample
+from probscene.inference.judging.support import Places
 from probscene.policy import Policy
 from probscene.threads import threads
 
@@ -25,7 +26,7 @@ from ..fitting.parts import inner
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import images_of
 
-IMAGES = 200  # of each source
+IMAGES = 500  # of each source, at most
 TARGET, LEARNT, STRUCTURE, PRIOR = "target", "learnt", "structure alone", "prior"
 ALL = ""  # the objects of all classes
 
@@ -33,16 +34,24 @@ Each = Callable[[int], None]
 """Told how many more images are done."""
 
 
+class Appearance(Protocol):
+    """What looks are seen by: ``EfficientNetLite``."""
+
+    def places(self, images: Tensor) -> tuple[Tensor, Tensor]: ...
+
+
 class Looked(NamedTuple):
     """What is seen in the images of one source.
 
     Attributes:
         looks: ``(N, E)`` pooled features of EfficientNet-Lite.
+        places: ``(N, 1 + K, C)`` features of what stands out in each image, see ``EfficientNetLite.places``.
         layouts: of each class, and of all together, those images that have one; empty where the features do not say
             where objects are.
     """
 
     looks: Sample
+    places: Places
     layouts: dict[str, Sample]
 
 
@@ -67,7 +76,7 @@ def look(
     run: RunFolder,
     target: Images,
     net: FeatureNet,
-    appearance: FeatureNet,
+    appearance: Appearance,
     each: Each,
     num: int,
     seed: int = 0,
@@ -83,15 +92,19 @@ def look(
     """
 
     def seen(parts) -> Looked:
-        looks, cells = [], []
+        looks, places, cells = [], [], []
         for images in parts:
-            looks.append(appearance.embed(images))
+            pooled, standing_out = appearance.places(images)
+            looks.append(pooled)
+            places.append(standing_out)
             found = _cells(run, net, images)
             cells += [] if found is None else [found]
             each(len(images))
         whole = torch.cat(cells) if cells else None
         return Looked(
-            Sample(torch.cat(looks).double().numpy()), {} if whole is None else _layouts(run, located(run, net), whole)
+            Sample(torch.cat(looks).double().numpy()),
+            torch.cat(places).numpy(),
+            {} if whole is None else _layouts(run, located(run, net), whole),
         )
 
     with threads(run.record["threads"]):

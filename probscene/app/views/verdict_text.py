@@ -110,11 +110,11 @@ def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def what_to_do(record: dict[str, Any]) -> list[str]:
     """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said.
-    Sizes have their figures in any case."""
+    Structure, with the difference that would be seen, and sizes have their figures in any case."""
     return [
         f"{name.capitalize()}: {part['because']} {part['remedy'].removeprefix(record['remedy']).strip()}".strip()
         for name, part in record["parts"].items()
-        if (part["word"] != "good" or name == "sizes") and part["because"] != record["because"]
+        if (part["word"] != "good" or name in ("structure", "sizes")) and part["because"] != record["because"]
     ]
 
 
@@ -154,7 +154,9 @@ def rows(found: Trust) -> list[tuple[str, ...]]:
     ]
     if x.from_prior is not None:
         out.append(("energy distance of generated and prior", *_apart(x.from_prior)))
+    seen_from = "-" if x.differences.visible is None else f"{x.differences.visible:.2f}"
     out += [
+        ("total variation of one feature that would be seen", seen_from, ""),
         ("p-value, all images", f"{x.p_value:.3f}", ""),
         ("real like no generated", *_gap(x.real_unmatched)),
         ("real like no generated or prior", *_gap(x.real_out_of_support)),

@@ -115,8 +115,10 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
     assert all(picture.shape == (64, 64, 3) for picture in found.generated_unmatched)
     assert not found.trust.pretrained
     record = json.loads(json.dumps(found.record(), allow_nan=False))
-    assert record["verdict"] == record["parts"]["structure"]["verdict"] == str(expected) and "labels" not in record
-    assert (record["overall"] == "good") is (record["parts"]["structure"]["word"] == "good")
+    assert record["parts"]["structure"]["verdict"] == str(expected) and "labels" not in record
+    # Discs stand and look as the prior's, which few images can tell from the target's: the structure is not the whole.
+    whole = "not judged" if expected is Verdict.GOOD else str(expected)
+    assert record["verdict"] == whole and record["overall"] != "good"
     assert set(record["single_features"]) == {"red", "blue", "total"}
 
 

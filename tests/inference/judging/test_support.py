@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sklearn.neighbors import NearestNeighbors
 
-from probscene.inference.judging.support import fidelity, foreign, likeness, outside, radii, unlike_floor
+from probscene.inference.judging.support import fidelity, foreign, likeness, outside, radii, strange, unlike_floor
 
 SETS = st.tuples(st.integers(8, 25), st.integers(8, 25)).flatmap(
     lambda s: st.tuples(*(arrays(np.float64, (n, 2), elements=st.integers(-9, 9).map(float)) for n in s))
@@ -97,3 +97,25 @@ def test_images_of_another_domain_are_farther_than_scenes_are_apart():
     assert not foreign(real + 0.5, scenes).any()
     assert foreign(real + 10, scenes).all()
     assert np.array_equal(foreign(7 * real, 7 * scenes), foreign(real, scenes))
+
+
+def places(seed, images, kinds, number=6, width=20):
+    """Images that show a few objects of some kinds, whose features are unit vectors, on a ground of zeros."""
+    rng = np.random.default_rng(seed)
+    shown = (
+        np.eye(width)[rng.choice(kinds, (images, number))]
+        * (np.arange(number) < rng.integers(0, 7, (images, 1)))[..., None]
+    )
+    return np.concatenate([np.zeros((images, 1, width)), shown + 0.02 * rng.normal(size=shown.shape)], 1)
+
+
+def test_what_no_scene_shows_is_strange_however_much_there_is_of_it():
+    scenes = places(0, 200, range(8))
+    for kinds in (range(8), [3], [1, 7]):  # other numbers of them are no other domain
+        assert strange(places(1, 200, kinds), scenes).mean() < 0.2
+    empty = places(2, 200, range(8, 20))
+    shows = (empty[:, 1:] > 0.5).any((1, 2))
+    found = strange(empty, scenes)
+    assert found[shows].all() and found[~shows].mean() < 0.2  # nor are images that show nothing
+    turned = empty[:, [0, *range(6, 0, -1)]]
+    assert np.array_equal(strange(turned, scenes), found) and np.array_equal(strange(3 * empty, 3 * scenes), found)

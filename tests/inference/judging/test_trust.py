@@ -166,10 +166,15 @@ def test_looks_decide_what_domain_it_is():
     """The counts of a strange picture may be quite ordinary."""
     rng = np.random.default_rng(0)
     case = aerial("good", rng, 300, 300)
-    near, far = rng.normal(size=(60, 50)), rng.normal(size=(60, 50)) + 9
-    assert trust(*case, resolution=0.5, looks=(near, rng.normal(size=(60, 50)))).verdict == Verdict.GOOD
-    found = trust(*case, resolution=0.5, looks=(far, near))
-    assert found.verdict == Verdict.ANOTHER_DOMAIN and "look" in found.because and found.figures.by_appearance
+    near, far, scenes = rng.normal(size=(3, 60, 9, 50)) * 0.1 + np.eye(50)[:9]
+    far[:, 1:] += 1
+    assert trust(*case, resolution=0.5, places=(near, scenes)).verdict == Verdict.GOOD
+    found = trust(*case, resolution=0.5, places=(far, scenes))
+    assert found.verdict == Verdict.ANOTHER_DOMAIN and "show what is unlike" in found.because
+    assert found.figures.by_appearance
+    some = np.concatenate([far[:20], near[20:]])
+    found = trust(*aerial("the prior", rng, 300, 300), resolution=0.5, places=(some, scenes))
+    assert found.verdict == Verdict.NOT_FITTED and "% of the real images show what is unlike" in found.because
 
 
 def test_wide_features_are_judged_by_their_principal_components():

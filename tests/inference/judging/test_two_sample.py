@@ -78,7 +78,7 @@ def test_samples_of_one_distribution_are_at_the_floor():
     for seed in range(20):
         a, b = normal(seed, 400), normal(1000 + seed, 600)
         joint, single = apart(a, b), marginals(a, b)
-        assert 0.6 < joint.ratio < 1.6 and joint.low <= joint.floor <= joint.high and joint.judged == 250
+        assert 0.6 < joint.ratio < 1.6 and joint.low <= joint.floor <= joint.high and joint.judged == 300
         assert joint.close == (joint.rank > 0.05)
         assert single.each[single.worst] == pytest.approx(single.largest.distance)
         assert single.worst == single.each.argmax() and single.largest.distance < 2

@@ -1,0 +1,168 @@
+"""Do two sets of features differ by more than is tolerated, and which differences would have been seen?
+
+Differences are total variations (TV): of one feature's distribution, as of the number of cars. Seen are they by two
+statistics at once: the energy distance of all features, and the chi-squared of each feature's histogram. Their null is
+not that nothing differs, which is never so and which enough images would always show, but that one feature differs by
+``TOLERATED``. It comes from resamples of both sets as one, as do the resamples in which one feature differs by more: a
+share t of its rows in some cells of its histogram is drawn in the other cells instead, so that t is the TV. For a TV of
+t the chi-squared is at least 4 t^2, and near that where these cells hold half of the rows, as they do here.
+
+Counts are read with an error. Their cells are whole numbers, and readings are moved by up to half of the resolution
+before they are rounded, so that nothing hangs on which side of a half they lie.
+
+Axis letters: N generated, L real, M = N + L rows, D features, K cells of all histograms, R resamples.
+
+References:
+    [1] Westfall, Young, *Resampling-based multiple testing*, 1993: the maximum over statistics and its null.
+    [2] Székely, Rizzo, *Energy statistics: a class of statistics based on distances*, 2013.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from .two_sample import EXAMINED, Features, some
+
+TOLERATED = 0.03  # TV
+LEVEL = 0.05  # of the test: in so many resamples what is tolerated is not
+SURE = 0.9  # of the resamples show what would be seen
+CELL = 0.02  # of the rows are in a histogram's cell, at least
+RESAMPLES, PILOTS = 200, 30
+STEPS = 4  # of the bisection
+
+
+class Differences(NamedTuple):
+    """Of two sets.
+
+    Attributes:
+        found: whether they differ by more than is tolerated.
+        worst: the feature in which they differ most; None where it is in all together.
+        variation: TV between the histograms of that feature, of the one in which it is largest where ``worst`` is None.
+        visible: TV in any one feature from which on it is found in nine of ten resamples; None where none would be.
+        numbers: of the rows of both that were compared.
+    """
+
+    found: bool
+    worst: int | None
+    variation: float
+    visible: float | None
+    numbers: tuple[int, int]
+
+
+def differences(generated: Features, real: Features, resolution: float = 0.0, seed: int = 0) -> Differences:
+    """Compare ``(N, D)`` with ``(L, D)``, by up to ``EXAMINED`` rows of each.
+
+    Args:
+        resolution: features that differ by less mean the same: 0.5 for counts; 0 where values are continuous.
+    """
+    rng = np.random.default_rng(seed)
+    generated, real = some(generated, EXAMINED, rng), some(real, EXAMINED, rng)
+    return _Test(generated, real, resolution, rng).differences()
+
+
+class _Test:
+    def __init__(self, generated: Features, real: Features, resolution: float, rng: np.random.Generator):
+        self.rng, self.N, self.L = rng, len(generated), len(real)
+        rows = np.concatenate([generated, real])
+        read = rows + 0.5 * resolution * rng.uniform(-1, 1, rows.shape)
+        unit = 2 * resolution
+        whole, read = (np.round(x / unit) if resolution else x for x in (rows, read))
+        self.cell = [_cells(column) for column in whole.T]  # that a row is drawn by
+        seen = [_cells(column) for column in read.T]  # that it is seen in
+        self.of = np.repeat(np.arange(len(seen)), [1 + cell.max() for cell in seen])  # (K,)
+        self.seen = np.concatenate([cell[:, None] == np.arange(1 + cell.max()) for cell in seen], 1).astype(np.float32)
+        self.apart = cdist(rows, rows).astype(np.float32)
+        null = self.resampled(TOLERATED, RESAMPLES)
+        self.middle, self.spread = null.mean(0), null.std(0)
+        self.limit = np.quantile(self.scores(null).max(1), 1 - LEVEL)
+
+    def differences(self) -> Differences:
+        which = np.arange(self.N + self.L) < self.N
+        one, other = which[None] / self.N, ~which[None] / self.L
+        score = self.scores(self.statistics(one, other))[0]
+        worst = int(score.argmax())
+        each = self.sums(np.abs((one - other) @ self.seen) / 2)[0]
+        found = bool(score[worst] > self.limit)
+        variation = float(each[worst - 1] if worst else each.max())
+        return Differences(found, worst - 1 if worst else None, variation, self.visible(), (self.N, self.L))
+
+    def visible(self) -> float | None:
+        """By bisection, for the feature in which differences are seen the least."""
+        several = [j for j, cell in enumerate(self.cell) if cell.max() > 0]
+        if not several:
+            return None
+        low, high = 0.0, 2 * np.sqrt(1 / self.N + 1 / self.L)
+        least = min(several, key=lambda j: np.median(self.scores(self.resampled(high, PILOTS, j)).max(1)))
+        top = 1 - np.bincount(self.cell[least]).min() / len(self.apart)
+
+        def seen(t: float) -> bool:
+            return (self.scores(self.resampled(t, RESAMPLES, least)).max(1) > self.limit).mean() >= SURE
+
+        while not seen(high := min(high, top)):
+            if high == top:
+                return None
+            low, high = high, 1.5 * high
+        for _ in range(STEPS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if seen(middle) else (middle, high)
+        return float(high)
+
+    def resampled(self, t: float, number: int, feature: int | None = None) -> Features:
+        """Statistics ``(R, 1 + D)`` of sets drawn from all rows, of which one has a feature that differs by a TV of t.
+
+        Args:
+            feature: which; None for any.
+        """
+        M = self.N + self.L
+        real = self.rng.multinomial(self.L, np.full(M, 1 / M), number) / self.L
+        several = [j for j, cell in enumerate(self.cell) if cell.max() > 0] if feature is None else [feature]
+        drawn = []
+        for _ in range(number):
+            chance = self.moved(self.cell[self.rng.choice(several)], t) if several else np.full(M, 1 / M)
+            drawn.append(self.rng.multinomial(self.N, chance) / self.N)
+        return self.statistics(np.stack(drawn), real)
+
+    def moved(self, cell: NDArray[np.int64], t: float) -> Features:
+        """How likely each row ``(M,)`` is drawn where a share t is drawn elsewhere than in ``cell (M,)``."""
+        share = np.bincount(cell) / len(cell)
+        order = self.rng.permutation(len(share))
+        taken = order[: 1 + np.searchsorted(share[order].cumsum(), max(t, 0.5) - 1e-9)]
+        if len(taken) >= len(share):  # the last cell has to be left
+            taken = np.delete(np.arange(len(share)), share.argmin())
+        inside = np.isin(cell, taken)
+        held = inside.mean()
+        t = min(t, held)
+        return np.where(inside, 1 - t / held, 1 + t / (1 - held)) / len(cell)
+
+    def statistics(self, one: Features, other: Features) -> Features:
+        """The squared energy distance and the features' chi-squared, ``(R, 1 + D)``, of sets in which rows have weights
+        ``(R, M)``."""
+        weight = (one - other).astype(np.float32)
+        energy = -((weight @ self.apart) * weight).sum(1, dtype=np.float64)
+        p, q = one @ self.seen, other @ self.seen
+        return np.column_stack([energy, self.sums((p - q) ** 2 / np.maximum(p + q, 1e-12))])
+
+    def sums(self, cells: Features) -> Features:
+        """Of each feature's cells, ``(R, D)`` of ``(R, K)``."""
+        return np.add.reduceat(cells, np.unique(self.of, return_index=True)[1], 1)
+
+    def scores(self, statistics: Features) -> Features:
+        """By how many standard deviations they are above what is tolerated; 0 where a feature has one cell."""
+        varies = self.spread > 1e-12
+        return np.where(varies, (statistics - self.middle) / np.where(varies, self.spread, 1), 0.0)
+
+
+def _cells(values: Features) -> NDArray[np.int64]:
+    """Numbers of the cells ``(M,)`` of a histogram: neighbouring values in one until it holds ``CELL`` of the rows."""
+    _, index, count = np.unique(values, return_inverse=True, return_counts=True)
+    cell, number, held = np.zeros(len(count), np.int64), 0, 0
+    for i, rows in enumerate(count):
+        if held >= CELL * len(values):
+            number, held = number + 1, 0
+        cell[i] = number
+        held += rows
+    if held < CELL * len(values):
+        cell[cell == number] = max(0, number - 1)
+    return cell[index]
