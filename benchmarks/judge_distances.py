@@ -114,7 +114,7 @@ def main():
             sides = (case.policy(found), N), (case.policy(case.target), L), (case.model.prior, N)
             features = (read(case.model, sampled(case.model, *of, 3 * fit + i), rng) for i, of in enumerate(sides))
             verdict = trust(*features, resolution=0.5, seed=fit)
-            visible = verdict.figures.differences.visible
+            visible = verdict.figures.difference.detectable
             named.append(visible)
             rows[away].append(
                 (away * unit, verdict.verdict is Verdict.GOOD, visible is not None and away * unit > visible)

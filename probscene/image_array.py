@@ -142,7 +142,8 @@ def _of_pillow(image: Image.Image, i: int) -> np.ndarray:
     """
     try:
         file = getattr(image, "fp", None)
-        if file is not None and image.format in _READ_AS_FILES and image.tile and not image.tell():
+        undecoded = bool(getattr(image, "tile", None))
+        if file is not None and image.format in _READ_AS_FILES and undecoded and not image.tell():
             # Nothing of it is decoded, so nothing is changed: it is read as any other file is.
             place = file.tell()
             file.seek(0)

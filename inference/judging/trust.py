@@ -1,6 +1,6 @@
 """Can this fit be trusted? Figures and a verdict from features alone, without labels.
 
-Whether the sets differ, and which differences would be seen, comes from resamples of both (``differences``). What a
+Whether the sets differ, and which differences would be seen, comes from resamples of both (``difference_test``). What a
 nearest neighbour is and which shares are sure comes from halves of the real set and from binomial limits. ``verdict``
 holds the rules. Axis letters: N generated, L real, P prior, D features.
 """
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from probscene.errors import ProbsceneError
 
-from .differences import differences
+from .difference_test import difference_test
 from .modes import effective_share, interval, modes
 from .support import Fidelity, Mask, Places, fidelity, foreign, likeness, strange, unlike_floor
 from .two_sample import (
@@ -62,7 +62,7 @@ class Trust:
             "verdict": str(self.verdict),
             "because": self.because,
             "remedy": self.remedy,
-            "differences": _differences(found),
+            "difference": _difference(found),
             "images": dict(zip(("generated", "real", "prior"), found.numbers, strict=True)),
             "distance": _apart(found.joint),
             "largest_single_feature": {"name": found.names[found.single.worst], **_apart(found.single.largest)},
@@ -154,7 +154,7 @@ def trust(
     figures = Figures(
         joint=joint,
         single=single,
-        differences=differences(generated, whole, resolution, seed),
+        difference=difference_test(generated, whole, resolution, seed),
         names=names,
         from_prior=from_prior,
         p_value=permutation_p(generated, whole, seed=seed),
@@ -207,13 +207,13 @@ def _measured(unlike: Mask, nearest: Features, floor: float, index: NDArray[np.i
     return Gap(float(unlike.mean()), float(low[0]), float(high[0]), floor, worst)
 
 
-def _differences(figures: Figures) -> dict[str, Any]:
-    found = figures.differences
+def _difference(figures: Figures) -> dict[str, Any]:
+    found = figures.difference
     return {
-        "found": found.found,
-        "most_in": None if found.worst is None else figures.names[found.worst],
-        "total_variation": found.variation,
-        "seen_above": found.visible,
+        "significant": found.significant,
+        "feature": None if found.feature is None else figures.names[found.feature],
+        "total_variation": found.total_variation,
+        "detectable_total_variation": found.detectable,
         "images": dict(zip(("generated", "real"), found.numbers, strict=True)),
     }
 

@@ -2,7 +2,7 @@
 
 The floor is that of a judge who sees ``judged`` images of each side, as many as there are: the distance between so many
 real images and as many other real ones. A distance is stated in floors, with its rank among those of the halves. What a
-good verdict goes by is in ``differences``. Axis letters: N, L images, D features, S splits.
+good verdict goes by is in ``difference_test``. Axis letters: N, L images, D features, S splits.
 
 References:
     [1] Székely, Rizzo, *Energy statistics: a class of statistics based on distances*, 2013.

@@ -7,7 +7,7 @@ In this order, the first that holds:
   from one another.
 - out of reach: surely more than one real image in twenty is like no generated and no prior scene, and without these
   images generated and real features are less than half as far apart.
-- not fitted yet: generated and real features differ by more than is tolerated (``differences``), and generated ones
+- not fitted yet: generated and real features differ by more than is tolerated (``difference_test``), and generated ones
   cannot be told from the prior's.
 - out of reach: more than half of the real images are like no scene.
 - modes lost: a cluster of the real images has surely less than a quarter of its share among the generated, and more
@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .differences import Differences
+from .difference_test import DifferenceTest
 from .modes import Modes
 from .support import Fidelity
 from .two_sample import Apart, Marginals
@@ -90,7 +90,7 @@ class Figures(NamedTuple):
     Attributes:
         joint: energy distance of generated and real features.
         single: the features one by one.
-        differences: whether they are more than is tolerated, and which would be seen.
+        difference: whether it is more than is tolerated, and which would be detected.
         names: of the features, or of their principal components.
         from_prior: energy distance of generated and prior features; None where there is no prior.
         p_value: whether generated and real differ at all, by all images.
@@ -107,7 +107,7 @@ class Figures(NamedTuple):
 
     joint: Apart
     single: Marginals
-    differences: Differences
+    difference: DifferenceTest
     names: tuple[str, ...]
     from_prior: Apart | None
     p_value: float
@@ -127,10 +127,10 @@ class Figures(NamedTuple):
 def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
     """The verdict and one sentence with the figures that decided; ``explained`` says whether the real images that are
     out of reach are what most of the distance comes from."""
-    modes, outside, differ = found.modes, found.real_out_of_support, found.differences
+    modes, outside, differ = found.modes, found.real_out_of_support, found.difference
     number = f"{differ.numbers[0]} generated and {differ.numbers[1]} real images"
-    feature = "all features together" if differ.worst is None else f"the feature {found.names[differ.worst]!r}"
-    apart = f"{number} can be told apart, most by {feature} (total variation {differ.variation:.2f})"
+    feature = "all features together" if differ.feature is None else f"the feature {found.names[differ.feature]!r}"
+    apart = f"{number} can be told apart, most by {feature} (total variation {differ.total_variation:.2f})"
     if found.foreign > ALIEN:
         how = (
             "show what is unlike anything in scenes"
@@ -147,7 +147,7 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
         )
     doubt = found.by_appearance and found.foreign > DOUBTFUL
     beside = f" {_percent(found.foreign)} of the real images show what is unlike anything in scenes." if doubt else ""
-    if differ.found and found.from_prior is not None and found.from_prior.close:
+    if differ.significant and found.from_prior is not None and found.from_prior.close:
         return Verdict.NOT_FITTED, f"{apart}, while generated and prior scenes cannot be told apart.{beside}"
     if gap and outside.share > max(0.5, lost):
         return Verdict.OUT_OF_REACH, f"{_outside(outside)}."
@@ -158,19 +158,19 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             f"{int(modes.lost.sum())} of {len(modes.real)} clusters, {_percent(lost)} of the real images, are "
             f"{_percent(left)} of the generated ones: surely less than a quarter of their share.",
         )
-    if differ.found:
+    if differ.significant:
         return Verdict.APART, f"{apart}.{beside}"
     return (
         Verdict.GOOD,
-        f"{number} cannot be told apart{_seen_above(differ)}; {_percent(found.real_unmatched.share)} of the real "
+        f"{number} cannot be told apart{_detectable(differ)}; {_percent(found.real_unmatched.share)} of the real "
         f"images are like no generated scene (between real halves up to {_percent(found.real_unmatched.floor)}).",
     )
 
 
-def _seen_above(differ: Differences) -> str:
-    if differ.visible is None:
+def _detectable(differ: DifferenceTest) -> str:
+    if differ.detectable is None:
         return ", as far as features that hardly vary say"
-    return f": differences above a total variation of {differ.visible:.2f} in any one feature would be seen"
+    return f": differences above a total variation of {differ.detectable:.2f} in any one feature would be seen"
 
 
 def _outside(gap: Gap) -> str:

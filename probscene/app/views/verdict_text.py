@@ -154,9 +154,9 @@ def rows(found: Trust) -> list[tuple[str, ...]]:
     ]
     if x.from_prior is not None:
         out.append(("energy distance of generated and prior", *_apart(x.from_prior)))
-    seen_from = "-" if x.differences.visible is None else f"{x.differences.visible:.2f}"
+    detectable = "-" if x.difference.detectable is None else f"{x.difference.detectable:.2f}"
     out += [
-        ("total variation of one feature that would be seen", seen_from, ""),
+        ("total variation of one feature that would be seen", detectable, ""),
         ("p-value, all images", f"{x.p_value:.3f}", ""),
         ("real like no generated", *_gap(x.real_unmatched)),
         ("real like no generated or prior", *_gap(x.real_out_of_support)),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probscene.inference.judging.differences import TOLERATED, differences
+from probscene.inference.judging.difference_test import TOLERATED_TV, difference_test
 
 SHARES = np.array([0.1, 0.2, 0.3, 0.25, 0.15])
 
@@ -25,35 +25,35 @@ def test_what_it_names_is_found_and_what_is_alike_is_not():
     for seed in range(5):
         rng = np.random.default_rng(seed)
         real = counted(rng, 250, SHARES)
-        named = differences(counted(rng, 250, SHARES), real, 0.5, seed)
-        found[0.0] += named.found
-        assert 0.1 < named.visible < 0.3
-        found[1.0] += differences(counted(rng, 250, moved(named.visible)), real, 0.5, seed).found
+        named = difference_test(counted(rng, 250, SHARES), real, 0.5, seed)
+        found[0.0] += named.significant
+        assert 0.1 < named.detectable < 0.3
+        found[1.0] += difference_test(counted(rng, 250, moved(named.detectable)), real, 0.5, seed).significant
     assert found[0.0] <= 1 and found[1.0] >= 4
 
 
 def test_more_images_show_smaller_differences_down_to_what_is_tolerated():
     rng = np.random.default_rng(0)
-    named = [differences(counted(rng, n, SHARES), counted(rng, n, SHARES), 0.5).visible for n in (40, 100, 250)]
-    assert named == sorted(named, reverse=True) and named[-1] > TOLERATED
+    named = [difference_test(counted(rng, n, SHARES), counted(rng, n, SHARES), 0.5).detectable for n in (40, 100, 250)]
+    assert named == sorted(named, reverse=True) and named[-1] > TOLERATED_TV
 
 
 def test_it_says_where_they_differ():
     rng = np.random.default_rng(0)
     real, other = counted(rng, 300, SHARES), counted(rng, 300, np.array([0.3, 0.2, 0.02, 0.25, 0.23]))
-    found = differences(other, real, 0.5)
-    assert found.found and found.worst == 0 and found.variation == pytest.approx(0.28, abs=0.08)
-    turned = differences(other[:, ::-1], real[:, ::-1], 0.5)
-    assert turned.found and turned.worst == 1
-    assert differences(other, real, 0.5) == found  # the same for the same seed
+    found = difference_test(other, real, 0.5)
+    assert found.significant and found.feature == 0 and found.total_variation == pytest.approx(0.28, abs=0.08)
+    turned = difference_test(other[:, ::-1], real[:, ::-1], 0.5)
+    assert turned.significant and turned.feature == 1
+    assert difference_test(other, real, 0.5) == found  # the same for the same seed
 
 
 def test_features_that_agree_one_by_one_and_not_together_differ():
     rng = np.random.default_rng(0)
     one, other = rng.normal(size=(2, 300, 2))
     other[:, 1] = other[:, 0]
-    found = differences(other, one)
-    assert found.found and found.worst is None
+    found = difference_test(other, one)
+    assert found.significant and found.feature is None
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2])
@@ -61,12 +61,12 @@ def test_a_feature_that_is_constant_in_the_real_images_is_compared(share):
     rng = np.random.default_rng(0)
     real, other = (np.pad(counted(rng, 200, SHARES), ((0, 0), (0, 1))) for _ in range(2))
     other[:, 2] = rng.random(200) < share
-    found = differences(other, real, 0.5)
-    assert found.found is (share > 0) and (not share or found.worst == 2)
+    found = difference_test(other, real, 0.5)
+    assert found.significant is (share > 0) and (not share or found.feature == 2)
 
 
 def test_features_that_hardly_vary_name_nothing():
     rng = np.random.default_rng(0)
     ones = 1 + 0.01 * rng.normal(size=(2, 60, 3))
-    found = differences(*ones, 0.5)
-    assert not found.found and found.visible is None
+    found = difference_test(*ones, 0.5)
+    assert not found.significant and found.detectable is None

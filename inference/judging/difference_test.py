@@ -1,11 +1,11 @@
-"""Do two sets of features differ by more than is tolerated, and which differences would have been seen?
+"""Do two sets of features differ by more than is tolerated, and which differences would have been detected?
 
-Differences are total variations (TV): of one feature's distribution, as of the number of cars. Seen are they by two
-statistics at once: the energy distance of all features, and the chi-squared of each feature's histogram. Their null is
+Differences are total variations (TV): of one feature's distribution, as of the number of cars. They are tested by two
+statistics at once: the energy distance of all features, and the chi-squared of each feature's histogram. The null is
 not that nothing differs, which is never so and which enough images would always show, but that one feature differs by
-``TOLERATED``. It comes from resamples of both sets as one, as do the resamples in which one feature differs by more: a
-share t of its rows in some cells of its histogram is drawn in the other cells instead, so that t is the TV. For a TV of
-t the chi-squared is at least 4 t^2, and near that where these cells hold half of the rows, as they do here.
+``TOLERATED_TV``. It comes from resamples of both sets as one, as do the resamples in which one feature differs by more:
+a share t of its rows in some cells of its histogram is drawn in the other cells instead, so that t is the TV. For a TV
+of t the chi-squared is at least 4 t^2, and near that where these cells hold half of the rows, as they do here.
 
 Counts are read with an error. Their cells are whole numbers, and readings are moved by up to half of the resolution
 before they are rounded, so that nothing hangs on which side of a half they lie.
@@ -25,33 +25,33 @@ from scipy.spatial.distance import cdist
 
 from .two_sample import EXAMINED, Features, some
 
-TOLERATED = 0.03  # TV
-LEVEL = 0.05  # of the test: in so many resamples what is tolerated is not
-SURE = 0.9  # of the resamples show what would be seen
-CELL = 0.02  # of the rows are in a histogram's cell, at least
+TOLERATED_TV = 0.03
+LEVEL = 0.05  # of the test: the share of resamples of what is tolerated in which it rejects
+POWER = 0.9  # with which the smallest detectable difference is detected
+MIN_CELL_SHARE = 0.02  # of the rows, in a cell of a histogram
 RESAMPLES, PILOTS = 200, 30
 STEPS = 4  # of the bisection
 
 
-class Differences(NamedTuple):
+class DifferenceTest(NamedTuple):
     """Of two sets.
 
     Attributes:
-        found: whether they differ by more than is tolerated.
-        worst: the feature in which they differ most; None where it is in all together.
-        variation: TV between the histograms of that feature, of the one in which it is largest where ``worst`` is None.
-        visible: TV in any one feature from which on it is found in nine of ten resamples; None where none would be.
+        significant: whether they differ by more than is tolerated.
+        feature: in which they differ most; None where it is in all together.
+        total_variation: between the histograms of that feature; of the one in which it is largest where that is None.
+        detectable: TV in any one feature from which on it is detected in nine of ten resamples; None where none is.
         numbers: of the rows of both that were compared.
     """
 
-    found: bool
-    worst: int | None
-    variation: float
-    visible: float | None
+    significant: bool
+    feature: int | None
+    total_variation: float
+    detectable: float | None
     numbers: tuple[int, int]
 
 
-def differences(generated: Features, real: Features, resolution: float = 0.0, seed: int = 0) -> Differences:
+def difference_test(generated: Features, real: Features, resolution: float = 0.0, seed: int = 0) -> DifferenceTest:
     """Compare ``(N, D)`` with ``(L, D)``, by up to ``EXAMINED`` rows of each.
 
     Args:
@@ -59,7 +59,7 @@ def differences(generated: Features, real: Features, resolution: float = 0.0, se
     """
     rng = np.random.default_rng(seed)
     generated, real = some(generated, EXAMINED, rng), some(real, EXAMINED, rng)
-    return _Test(generated, real, resolution, rng).differences()
+    return _Test(generated, real, resolution, rng).result()
 
 
 class _Test:
@@ -70,43 +70,46 @@ class _Test:
         unit = 2 * resolution
         whole, read = (np.round(x / unit) if resolution else x for x in (rows, read))
         self.cell = [_cells(column) for column in whole.T]  # that a row is drawn by
-        seen = [_cells(column) for column in read.T]  # that it is seen in
-        self.of = np.repeat(np.arange(len(seen)), [1 + cell.max() for cell in seen])  # (K,)
-        self.seen = np.concatenate([cell[:, None] == np.arange(1 + cell.max()) for cell in seen], 1).astype(np.float32)
-        self.apart = cdist(rows, rows).astype(np.float32)
-        null = self.resampled(TOLERATED, RESAMPLES)
+        cells = [_cells(column) for column in read.T]  # that it is counted in
+        self.of = np.repeat(np.arange(len(cells)), [1 + cell.max() for cell in cells])  # (K,)
+        self.counted = np.concatenate([cell[:, None] == np.arange(1 + cell.max()) for cell in cells], 1).astype(
+            np.float32
+        )
+        self.distances = cdist(rows, rows).astype(np.float32)
+        null = self.resampled(TOLERATED_TV, RESAMPLES)
         self.middle, self.spread = null.mean(0), null.std(0)
         self.limit = np.quantile(self.scores(null).max(1), 1 - LEVEL)
 
-    def differences(self) -> Differences:
+    def result(self) -> DifferenceTest:
         which = np.arange(self.N + self.L) < self.N
         one, other = which[None] / self.N, ~which[None] / self.L
         score = self.scores(self.statistics(one, other))[0]
         worst = int(score.argmax())
-        each = self.sums(np.abs((one - other) @ self.seen) / 2)[0]
-        found = bool(score[worst] > self.limit)
+        each = self.sums(np.abs((one - other) @ self.counted) / 2)[0]
+        significant = bool(score[worst] > self.limit)
         variation = float(each[worst - 1] if worst else each.max())
-        return Differences(found, worst - 1 if worst else None, variation, self.visible(), (self.N, self.L))
+        feature = worst - 1 if worst else None
+        return DifferenceTest(significant, feature, variation, self.detectable(), (self.N, self.L))
 
-    def visible(self) -> float | None:
-        """By bisection, for the feature in which differences are seen the least."""
+    def detectable(self) -> float | None:
+        """By bisection, for the feature in which differences are detected least."""
         several = [j for j, cell in enumerate(self.cell) if cell.max() > 0]
         if not several:
             return None
         low, high = 0.0, 2 * np.sqrt(1 / self.N + 1 / self.L)
         least = min(several, key=lambda j: np.median(self.scores(self.resampled(high, PILOTS, j)).max(1)))
-        top = 1 - np.bincount(self.cell[least]).min() / len(self.apart)
+        top = 1 - np.bincount(self.cell[least]).min() / len(self.distances)
 
-        def seen(t: float) -> bool:
-            return (self.scores(self.resampled(t, RESAMPLES, least)).max(1) > self.limit).mean() >= SURE
+        def detected(t: float) -> bool:
+            return (self.scores(self.resampled(t, RESAMPLES, least)).max(1) > self.limit).mean() >= POWER
 
-        while not seen(high := min(high, top)):
+        while not detected(high := min(high, top)):
             if high == top:
                 return None
             low, high = high, 1.5 * high
         for _ in range(STEPS):
             middle = (low + high) / 2
-            low, high = (low, middle) if seen(middle) else (middle, high)
+            low, high = (low, middle) if detected(middle) else (middle, high)
         return float(high)
 
     def resampled(self, t: float, number: int, feature: int | None = None) -> Features:
@@ -140,8 +143,8 @@ class _Test:
         """The squared energy distance and the features' chi-squared, ``(R, 1 + D)``, of sets in which rows have weights
         ``(R, M)``."""
         weight = (one - other).astype(np.float32)
-        energy = -((weight @ self.apart) * weight).sum(1, dtype=np.float64)
-        p, q = one @ self.seen, other @ self.seen
+        energy = -((weight @ self.distances) * weight).sum(1, dtype=np.float64)
+        p, q = one @ self.counted, other @ self.counted
         return np.column_stack([energy, self.sums((p - q) ** 2 / np.maximum(p + q, 1e-12))])
 
     def sums(self, cells: Features) -> Features:
@@ -155,14 +158,15 @@ class _Test:
 
 
 def _cells(values: Features) -> NDArray[np.int64]:
-    """Numbers of the cells ``(M,)`` of a histogram: neighbouring values in one until it holds ``CELL`` of the rows."""
+    """Numbers of the cells ``(M,)`` of a histogram: neighbouring values in one until it holds ``MIN_CELL_SHARE`` of all
+    rows."""
     _, index, count = np.unique(values, return_inverse=True, return_counts=True)
     cell, number, held = np.zeros(len(count), np.int64), 0, 0
     for i, rows in enumerate(count):
-        if held >= CELL * len(values):
+        if held >= MIN_CELL_SHARE * len(values):
             number, held = number + 1, 0
         cell[i] = number
         held += rows
-    if held < CELL * len(values):
+    if held < MIN_CELL_SHARE * len(values):
         cell[cell == number] = max(0, number - 1)
     return cell[index]
