@@ -150,6 +150,14 @@ def test_labels_disagree_where_the_network_counts_wrongly():
     assert wrong.worst != "number of objects"  # that is always six
 
 
+def test_labels_that_are_all_the_same_have_no_chance_to_differ():
+    """As where each image shows one object."""
+    truth, learnt = (Source.of(np.repeat([[1, 1], [1, second]], 30, 0)) for second in (1, 2))
+    found = agreement(learnt, truth, ("a", "b"))
+    assert not found.close and found.worst != "a" and found.each["a"].close
+    assert agreement(truth, truth, ("a", "b")).close
+
+
 def test_labels_of_one_distribution_rarely_disagree():
     rng = np.random.default_rng(0)
     close = 0
