@@ -40,7 +40,7 @@ def beside_sites(
         where["where its file is imported again"] = run(1, of=again)
     # Rendered outside ``run``: a renderer of the user's may draw random numbers, too.
     seen = list(_seen(first.drawing, render))
-    differs = [words for words, again in where.items() if not _same(seen, list(_seen(again.drawing, render)))]
+    differs = [words for words, other in where.items() if not _same(seen, list(_seen(other.drawing, render)))]
     if not differs:
         return []
     return [
