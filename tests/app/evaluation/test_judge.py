@@ -12,7 +12,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation import judge as verdict
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.judge import judge
-from probscene.app.evaluation.label_agreement import Agreement, Compared, agreement
+from probscene.app.evaluation.label_agreement import agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
 from probscene.app.fitting.run import RunFolder
@@ -157,12 +157,6 @@ def test_labels_of_one_distribution_rarely_disagree():
         truth, learnt = (Source.of(rng.poisson([2, 0.3, 5], (n, 3))) for n in (120, 3000))
         close += agreement(learnt, truth, ("a", "b", "c"), seed).close
     assert close >= 38
-
-
-def test_the_worst_of_labels_that_are_all_the_same():
-    """As where each image shows one object: chance leaves them no distance."""
-    found = {"a": Compared(0.0, 0.0, 0.0, 0.0), "b": Compared(0.5, 0.5, 0.0, 0.0), "c": Compared(0.3, 0.3, 0.1, 0.2)}
-    assert Agreement.worst.fget(SimpleNamespace(each=found)) == "b"
 
 
 def test_both_commands_say_it(call, seeing, drawn, tmp_path):
