@@ -255,6 +255,8 @@ def _sixteen_bit(file: PixelFile) -> np.ndarray:
         raise Fault("does not decode")
     if pixels.ndim == 3:
         pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
+    if pixels.shape[2:] == (4,) and not file.opacity:
+        pixels = pixels[..., :3]
     if file.transparent:
         colours = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, 2)
         opacity = (colours != np.array(file.transparent)).any(2, keepdims=True) * np.uint16(2**16 - 1)
