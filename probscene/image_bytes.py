@@ -198,7 +198,7 @@ def _tiff(data: bytes) -> PixelFile:
         if tag not in of:
             return (default,)
         kind, number, value = of[tag]
-        if kind not in _INTEGERS:
+        if kind not in _INTEGERS or not number:
             raise Fault(f"is a TIFF with a damaged tag {tag}")
         form = f"{order}{number}{_INTEGERS[kind]}"
         if struct.calcsize(form) <= 4:

@@ -4,6 +4,7 @@ import io
 import itertools
 import struct
 import zlib
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -300,6 +301,14 @@ def test_channels_of_16_bits_that_lie_one_after_the_other_are_refused():
     assert (stored(wide_tiff(pixels, short(284, 1)))[0] == pixels).all()
     with pytest.raises(Fault, match="planar"):
         stored(wide_tiff(pixels, short(284, 2)))
+
+
+@given(st.integers(0, 11), st.sampled_from([0, 1, 2, 2**31, 2**32 - 1]))
+def test_tags_of_another_number_of_values_end_in_no_other_error(entry, number):
+    data = wide_tiff(np.arange(60).reshape(4, 5, 3), short(284, 1), short(338, 0), short(339, 1))
+    at = 10 + 12 * entry + 4
+    with suppress(Fault):
+        stored(data[:at] + struct.pack("<I", number) + data[at + 4 :])
 
 
 def test_a_transparent_colour_of_16_bits():
