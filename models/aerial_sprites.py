@@ -12,8 +12,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from probscene.decoding import quiet, read, stored
 from probscene.drawing import Atlas
 from probscene.errors import DataError
+from probscene.image_bytes import Fault
 
 CAR = 18.0  # pixels, the length of a car
 ROAD = 44  # pixels across
@@ -65,17 +67,29 @@ def _pictures(path: Path, size: float) -> tuple[np.ndarray, ...]:
         raise DataError(f"Expected PNG files in {path}, actual none; make the folders car, tree and house there.")
     found = []
     for file in files:
-        picture = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
-        if picture is None or picture.ndim != 3 or picture.shape[2] != 4 or picture.dtype != np.uint8:
-            raise DataError(f"Expected an RGBA picture of 8 bits, actual {file}; add an alpha channel.")
+        picture = _rgba(file)
         scale = size / max(picture.shape[:2])
         down, across = (scale if round(side * scale) else 1 / side for side in picture.shape[:2])  # at least one pixel
         picture = picture.astype(np.float64)
         alpha = picture[..., 3:] / 255.0
-        premultiplied = np.concatenate([picture[..., 2::-1] * alpha, picture[..., 3:]], 2)
+        premultiplied = np.concatenate([picture[..., :3] * alpha, picture[..., 3:]], 2)
         small = cv2.resize(premultiplied, None, fx=across, fy=down, interpolation=cv2.INTER_AREA)
         found.append(_straight(small))
     return tuple(found)
+
+
+def _rgba(file: Path) -> np.ndarray:
+    """``(h, w, 4)`` uint8."""
+    try:
+        with quiet():
+            picture, _ = stored(read(file), opacity=True)
+        if picture.shape[2:] != (4,):
+            raise Fault("has no alpha channel")
+    except Fault as fault:
+        raise DataError(
+            f"Expected an RGBA picture, actual {file}, which {fault}; mend it, or save it as PNG with an alpha channel."
+        ) from None
+    return picture if picture.dtype == np.uint8 else (picture >> 8).astype(np.uint8)
 
 
 def _straight(premultiplied: np.ndarray) -> np.ndarray:

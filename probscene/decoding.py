@@ -114,15 +114,17 @@ def decoded(
     return fitted(_of_channels(eight_bit(pixels, value_range), channels), canvas, part, size), size
 
 
-def stored(data: bytes, near: int | None = None) -> tuple[np.ndarray, tuple[int, int]]:
+def stored(data: bytes, near: int | None = None, opacity: bool = False) -> tuple[np.ndarray, tuple[int, int]]:
     """A file's pixels, upright, and their height and width.
 
     Args:
         near: a large JPEG may come at a half, a fourth or an eighth of its size, but no smaller than this.
+        opacity: keep that of 8 bits, too.
 
     Returns:
-        ``(h, w)`` or ``(h, w, 3)`` uint8, transparent pixels on black; of 16 bits a channel ``(h, w)``, ``(h, w, 3)``
-        or, with opacity, ``(h, w, 4)`` uint16. The height and width are those of the whole image.
+        ``(h, w)`` or ``(h, w, 3)`` uint8, transparent pixels on black, or ``(h, w, 4)`` where opacity is kept; of 16
+        bits a channel ``(h, w)``, ``(h, w, 3)`` or, with opacity, ``(h, w, 4)`` uint16. The height and width are those
+        of the whole image.
 
     Raises:
         Fault: what does not decode.
@@ -141,6 +143,8 @@ def stored(data: bytes, near: int | None = None) -> tuple[np.ndarray, tuple[int,
             if file.bits == 16:
                 image.load()  # finds what is cut
                 pixels = _sixteen_bit(file)
+            elif opacity and image.has_transparency_data:
+                pixels = np.array(image.convert("RGBA"))
             else:
                 pixels = opaque(image)
     except Fault:
@@ -251,6 +255,8 @@ def _sixteen_bit(file: PixelFile) -> np.ndarray:
         raise Fault("does not decode")
     if pixels.ndim == 3:
         pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
+    if pixels.shape[2:] == (4,) and not file.opacity:
+        pixels = pixels[..., :3]
     if file.transparent:
         colours = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, 2)
         opacity = (colours != np.array(file.transparent)).any(2, keepdims=True) * np.uint16(2**16 - 1)

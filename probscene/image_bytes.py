@@ -26,9 +26,11 @@ _MARKER = re.compile(rb"\xff+([^\xff])", re.DOTALL)  # of a JPEG's segment
 ORIENTATION = 0x0112  # EXIF tag
 _INTEGERS = {1: "B", 3: "H", 4: "I"}  # EXIF's and TIFF's types
 _BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLE_FORMAT, _REDUCED = 258, 259, 262, 339, 254  # TIFF tags
+_PLANAR, _EXTRA = 284, 338  # and how channels lie, and what those beyond colours are
+_OPACITY = 2  # beside colours, and not multiplied with them
 _PLACES = ((273, 279), (324, 325))  # of strips or tiles: their offsets and their lengths
-_TIFF_PIXELS = {256, 257, _BITS, _COMPRESSION, _PHOTOMETRIC, 266, 273, 277, 278, 279, 284, 292, 293, 317, 320, 322,
-                323, 324, 325, 332, 338, _SAMPLE_FORMAT, 347, 529, 530, 531, 532}  # fmt: skip
+_TIFF_PIXELS = {256, 257, _BITS, _COMPRESSION, _PHOTOMETRIC, 266, 273, 277, 278, 279, _PLANAR, 292, 293, 317, 320, 322,
+                323, 324, 325, 332, _EXTRA, _SAMPLE_FORMAT, 347, 529, 530, 531, 532}  # fmt: skip
 
 
 class Fault(Exception):
@@ -44,6 +46,7 @@ class PixelFile(NamedTuple):
         orientation: 1 to 8, as EXIF has them; 1 where the file says nothing that can be understood.
         bits: a channel, 8 or fewer, or 16.
         transparent: of a PNG of 16 bits, the grey or red, green and blue that stand for transparency; empty where none.
+        opacity: whether a fourth channel of 16 bits is opacity that colours are to be multiplied with.
     """
 
     format: str
@@ -51,6 +54,7 @@ class PixelFile(NamedTuple):
     orientation: int
     bits: int
     transparent: tuple[int, ...] = ()
+    opacity: bool = True
 
 
 def pixel_file(data: bytes) -> PixelFile:
@@ -194,7 +198,7 @@ def _tiff(data: bytes) -> PixelFile:
         if tag not in of:
             return (default,)
         kind, number, value = of[tag]
-        if kind not in _INTEGERS:
+        if kind not in _INTEGERS or not number:
             raise Fault(f"is a TIFF with a damaged tag {tag}")
         form = f"{order}{number}{_INTEGERS[kind]}"
         if struct.calcsize(form) <= 4:
@@ -204,7 +208,8 @@ def _tiff(data: bytes) -> PixelFile:
     try:
         entries, after = _entries(data, order, struct.unpack_from(order + "I", data, 4)[0])
         of = {tag: (kind, number, value) for tag, kind, number, value in reversed(entries)}
-        bits, formats, light = (values(tag, 1) for tag in (_BITS, _SAMPLE_FORMAT, _PHOTOMETRIC))
+        bits, formats, light, planar = (values(tag, 1) for tag in (_BITS, _SAMPLE_FORMAT, _PHOTOMETRIC, _PLANAR))
+        extra = values(_EXTRA, _OPACITY)
         places = [at + size for a, b in _PLACES for at, size in zip(values(a, 0), values(b, 0), strict=False)]
     except struct.error as error:
         raise Fault("is truncated") from error
@@ -215,15 +220,21 @@ def _tiff(data: bytes) -> PixelFile:
     if pages := _further_pages(data, order, after):
         raise Fault(f"is a TIFF of {1 + pages} pages; save each as a file of its own")
     if set(formats) - {1, 4} or len(set(bits)) > 1 or (bits[0] != 16 and bits[0] > 8):
-        kind = "floating-point numbers" if 3 in formats else f"{max(bits)} bits"
+        signed = "" if set(formats) <= {1, 4} else "signed "
+        kind = "floating-point numbers" if 3 in formats else f"{max(bits)} {signed}bits"
         raise Fault(f"is a TIFF with {kind} a channel; save it with 8 or 16 bits, unsigned")
     if bits[0] == 16 and light[0] not in (1, 2):
         raise Fault("is a TIFF of 16 bits that is neither grey, black being 0, nor RGB; save it as one of these")
+    if bits[0] == 16 and len(bits) > 1 and planar[0] != 1:
+        raise Fault(
+            "is a TIFF of 16 bits whose channels lie one after the other (planar); save it with them side by side"
+        )
     turned = orientation_of(data)
     kept = [struct.pack(order + "HHI", *entry[:3]) + entry[3] for entry in entries if entry[0] in _TIFF_PIXELS]
     directory = struct.pack(order + "H", len(kept)) + b"".join(kept) + bytes(4)
     data += bytes(len(data) % 2)
-    return PixelFile("TIFF", data[:4] + struct.pack(order + "I", len(data)) + data[8:] + directory, turned, bits[0])
+    data = data[:4] + struct.pack(order + "I", len(data)) + data[8:] + directory
+    return PixelFile("TIFF", data, turned, bits[0], opacity=extra[0] == _OPACITY)
 
 
 def _entries(data: bytes, order: str, at: int) -> tuple[list[tuple[int, int, int, bytes]], int]:

@@ -8,6 +8,7 @@ which may be when a program is called.
 import ast
 import builtins
 import hashlib
+import importlib
 import sys
 from functools import lru_cache, partial
 from importlib import invalidate_caches
@@ -96,16 +97,31 @@ def _import(
 ) -> ModuleType:
     """``__import__`` of the modules of a folder."""
     top = name.partition(".")[0]
+    if top == "importlib" and not level and (name == top or not fromlist):
+        builtins.__import__(name, globals, locals, fromlist)
+        return _importlib(package, folder)
     if level or not _is_beside(folder, top):
         return builtins.__import__(name, globals, locals, fromlist, level)
     found = builtins.__import__(f"{package}.{name}", globals, locals, fromlist, 0)
     return found if fromlist else sys.modules[f"{package}.{top}"]
 
 
+def _importlib(package: str, folder: Path) -> ModuleType:
+    """``importlib``, whose ``import_module`` finds the modules of a folder, too."""
+
+    def import_module(name: str, of: str | None = None) -> ModuleType:
+        beside = _is_beside(folder, name.partition(".")[0])
+        return importlib.import_module(f"{package}.{name}" if beside else name, of)
+
+    own = ModuleType("importlib")
+    vars(own).update(import_module=import_module, __getattr__=partial(getattr, importlib))
+    return own
+
+
 @lru_cache(1024)
 def _is_beside(folder: Path, name: str) -> bool:
     """Whether a module lies in the folder; what is installed goes before it, and any module before a mere folder."""
-    if name in sys.stdlib_module_names or name == "probscene":
+    if not name or name in sys.stdlib_module_names or name == "probscene":
         return False
     spec = PathFinder.find_spec(name, [str(folder)])
     if spec is None:
@@ -132,6 +148,9 @@ def _imported(source: Path, package: str, folder: Path) -> set[str]:
             elif not _is_beside(folder, base.partition(".")[0]):
                 continue
             names |= {".".join(filter(None, [base, alias.name])) for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+            said = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
+            names |= {name for name in map(str, said) if _is_beside(folder, name.partition(".")[0])}
     return names
 
 

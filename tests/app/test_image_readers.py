@@ -20,7 +20,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.labelling.sheet import write_sheet
 from probscene.app.progress import Display
 from probscene.app.trial.jobs import Job
-from probscene.app.trial.sets import read_image, read_set
+from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures
 from probscene.app.trial.trial import trial
 from probscene.dataset import ImageFolder
@@ -106,7 +106,6 @@ def test_all_read_the_same_pixels(folder):
         expected = pixels(target, i)
         assert (pixels(listed, i) == expected).all(), file.name
         assert (read_rgb(file, target.value_range) == expected).all(), file.name
-        assert (read_image(file) == read_rgb(file)).all() and read_image(file).shape == expected.shape
         example = read_set_of(file)
         assert (shown(example)[0] == expected).all() and example.size == CANVAS
         assert expected[4, 4, 0] > 200, file.name
@@ -174,7 +173,7 @@ def test_all_refuse_the_same_files(tmp_path, name):
     data, fault = BROKEN[name]
     (tmp_path / name).write_bytes(data)
     readers = [lambda file: ImageFolder(file.parent, CANVAS, 3), lambda file: ImageFolder([file], CANVAS, 3),
-               read_image, read_rgb, read_set_of]  # fmt: skip
+               read_rgb, read_set_of]  # fmt: skip
     for reader in readers:
         with pytest.raises(DataError, match=rf"{name}.*{fault}"):
             reader(tmp_path / name)

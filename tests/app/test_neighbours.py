@@ -100,6 +100,10 @@ IMPORTS = {
     "from looks.colours import RG as rg": "rg",
     "from plain import inner": "inner.X",
     "import plain.inner": "plain.inner.X",
+    "h = __import__('helper')": "h.BLUE",
+    "import importlib; h = importlib.import_module('helper')": "h.BLUE",
+    "import importlib.util; c = importlib.import_module('looks.colours')": "c.RG",
+    "from importlib import import_module, util; c = import_module('looks.colours')": "c.RG",
 }
 
 

@@ -4,6 +4,7 @@ import io
 import itertools
 import struct
 import zlib
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -272,6 +273,44 @@ def test_16_bits_come_back(kind, shape):
         assert abs(seen.transpose(1, 2, 0) - upper[..., :3] * (upper[..., 3:] / 255)).max() <= 1
 
 
+def short(tag: int, *values: int) -> tuple[int, int, int, bytes]:
+    return tag, SHORT, len(values), struct.pack(f"<{len(values)}H", *values)
+
+
+def wide_tiff(pixels: np.ndarray, *more: tuple[int, int, int, bytes]) -> bytes:
+    """Colours of 16 bits, not compressed, with some tags more."""
+    height, width, channels = pixels.shape
+    data = pixels.astype("<u2").tobytes()
+    tags = (short(256, width), short(257, height), short(258, *[16] * channels), short(259, 1), short(262, 2),
+            short(277, channels), short(278, height), short(279, len(data)), *more)  # fmt: skip
+    return exif(*tags, short(273, len(exif(*tags, short(273, 0))) - 6))[6:] + data
+
+
+@pytest.mark.parametrize("extra", [0, 1, 2])
+def test_a_fourth_channel_of_a_tiff_hides_only_where_it_is_opacity_beside_colours(extra):
+    """As of 8 bits: 0 is of another meaning, 1 opacity that colours are multiplied with already, 2 opacity."""
+    pixels = np.full((4, 5, 4), 40_000, np.uint16)
+    pixels[..., 3] = 0
+    data = wide_tiff(pixels, short(338, extra))
+    assert (decoded(data, (4, 5), 3, value_range=(0, 65535))[0] == (0 if extra == 2 else 40_000 >> 8)).all()
+
+
+def test_channels_of_16_bits_that_lie_one_after_the_other_are_refused():
+    """OpenCV reads them as if they lay side by side."""
+    pixels = np.arange(60).reshape(4, 5, 3)
+    assert (stored(wide_tiff(pixels, short(284, 1)))[0] == pixels).all()
+    with pytest.raises(Fault, match="planar"):
+        stored(wide_tiff(pixels, short(284, 2)))
+
+
+@given(st.integers(0, 11), st.sampled_from([0, 1, 2, 2**31, 2**32 - 1]))
+def test_tags_of_another_number_of_values_end_in_no_other_error(entry, number):
+    data = wide_tiff(np.arange(60).reshape(4, 5, 3), short(284, 1), short(338, 0), short(339, 1))
+    at = 10 + 12 * entry + 4
+    with suppress(Fault):
+        stored(data[:at] + struct.pack("<I", number) + data[at + 4 :])
+
+
 def test_a_transparent_colour_of_16_bits():
     grey = (np.arange(6).reshape(2, 3) * 9000).astype(">u2")
     rows = b"".join(b"\0" + row.tobytes() for row in grey)
@@ -285,7 +324,7 @@ def test_a_transparent_colour_of_16_bits():
     "image, options, fault",
     {
         "floating point": (Image.new("F", (3, 3)), {}, "floating-point numbers a channel; save it with 8 or 16 bits"),
-        "32 bits": (Image.new("I", (3, 3)), {}, "TIFF with 32 bits"),
+        "32 bits": (Image.new("I", (3, 3)), {}, "TIFF with 32 signed bits"),
         "pages": (Image.new("L", (3, 3)), {"save_all": True, "append_images": [Image.new("L", (3, 3))]}, "of 2 pages"),
     }.values(),
 )

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.stats import chisquare, kstest, poisson
 
 from probscene.app.loading import load_model
@@ -166,18 +167,47 @@ def test_hidden_files_are_no_pictures(tmp_path):
     assert len(folder(str(path)).cars.sprites) == 1
 
 
-@pytest.mark.parametrize("wrong", ["missing", "no alpha", "no picture"])
-def test_a_folder_that_is_no_folder_of_pictures(wrong, tmp_path):
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("missing", "Expected PNG files in .*tree"),
+        ("no alpha", r"tree/one\.png, which has no alpha channel;"),
+        ("no picture", r"tree/one\.png, which is not a PNG"),
+        ("web", r"tree/one\.png, which is a WebP file"),
+        ("cut", r"tree/one\.png, which is truncated"),
+    ],
+)
+def test_a_folder_that_is_no_folder_of_pictures(wrong, said, tmp_path):
     path = pictures(tmp_path)
     file = path / "tree" / "one.png"
     if wrong == "missing":
         file.unlink()
     elif wrong == "no alpha":
         cv2.imwrite(str(file), np.zeros((8, 8, 3), np.uint8))
+    elif wrong == "web":
+        Image.new("RGBA", (8, 8)).save(file, "WEBP")
     else:
-        file.write_bytes(b"tree")
-    with pytest.raises(DataError, match="tree"):
+        file.write_bytes(file.read_bytes()[:-20] if wrong == "cut" else b"tree")
+    with pytest.raises(DataError, match=said):
         folder(str(path))
+
+
+def test_pictures_are_read_as_photographs_are(tmp_path):
+    """Upright, of 16 bits as of 8, whatever is wrong with a comment."""
+    path = pictures(tmp_path)
+    file = path / "car" / "one.png"
+    half = np.zeros((24, 48, 4), np.uint8)
+    half[:, 24:] = (250, 20, 10, 255)  # on the right
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(np.rot90(half)).save(path / "car" / "lying.png", exif=exif)
+    Image.fromarray(half).save(file)
+    cv2.imwrite(str(path / "car" / "wide.png"), half[..., [2, 1, 0, 3]].astype(np.uint16) * 257)
+    whole = file.read_bytes()
+    (path / "car" / "comment.png").write_bytes(whole[:33] + b"\0\0\0\4tEXta\0bc\1\2\3\4" + whole[33:])
+    first, *others = folder(str(path)).cars.sprites
+    assert len(others) == 3 and all((sprite == first).all() for sprite in others)
+    assert (first[:, 10:] == (250, 20, 10, 255)).all() and not first[:, :8].any()
 
 
 @pytest.mark.parametrize("size", [(2, 900), (900, 2), (1, 40_000), (7, 500), (1, 1), (3, 4)])

@@ -19,6 +19,7 @@ from PIL import Image
 from probscene.errors import DataError
 from probscene.models.assets.catalogue import DECORATION, KINDS, street
 from probscene.models.assets.meshes.folder import SIZES, described, folder
+from probscene.models.assets.meshes.part import decoded, opened
 
 TO_Y_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # x forward, y left, z up to z forward, x left, y up
 CAR = (4.4, 1.8, 1.5)
@@ -91,6 +92,16 @@ def test_textures_come_back(tmp_path, kind):
     assert (back.texture == own.texture).all() and (back.colour == 255).all()
     assert np.abs(own.positions[own.triangles] - back.positions[back.triangles]).max() < 1e-4
     assert np.abs(back.uv - own.uv).max() < 1e-4
+
+
+def test_a_texture_is_read_whatever_is_wrong_with_a_comment(tmp_path):
+    texture = io.BytesIO()
+    Image.new("RGB", (4, 4), (200, 0, 0)).save(texture, "PNG")
+    data = texture.getvalue()
+    data = data[:33] + b"\0\0\0\4tEXta\0bc\1\2\3\4" + data[33:]
+    file = write(tmp_path, "car", "a.png", data)
+    for source in (str(file), io.BytesIO(data)):
+        assert (decoded(file, "a.png", opened(file, "a.png", source)) == (200, 0, 0)).all()
 
 
 def test_kinds_that_are_lacking_are_the_projects_own(tmp_path):

@@ -1,6 +1,7 @@
 """One piece of a mesh file, as every format is read, and what is checked of it."""
 
 import io
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from probscene.errors import DataError
+from probscene.image_bytes import Fault, pixel_file
 
 MOST_TRIANGLES = 200_000
 
@@ -62,7 +64,10 @@ def opened(file: Path, name: str, source: str | io.BytesIO) -> Image.Image:
         DataError: it is no picture.
     """
     try:
-        return Image.open(source)
+        data = source.getvalue() if isinstance(source, io.BytesIO) else Path(source).read_bytes()
+        with suppress(Fault):
+            data = pixel_file(data).data  # Pillow stumbles over what lies beside the pixels
+        return Image.open(io.BytesIO(data))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         raise DataError(
             f"Expected a picture, actual {name}, which {file} names; replace it by a PNG or JPEG."

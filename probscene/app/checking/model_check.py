@@ -40,7 +40,9 @@ class Findings(NamedTuple):
     sizes: dict[str, Tensor]
 
 
-def check_model(model: SceneModel, scenes: int = SCENES, rendered: int = RENDERED) -> Report:
+def check_model(
+    model: SceneModel, scenes: int = SCENES, rendered: int = RENDERED, again: SceneModel | None = None
+) -> Report:
     """``check``, and where that finds no faults, what running the program and rendering its scenes shows.
 
     The state of all generators of random numbers and Pyro's parameters are left as they were.
@@ -49,6 +51,7 @@ def check_model(model: SceneModel, scenes: int = SCENES, rendered: int = RENDERE
         scenes: how many the program is run on, shared out between scenarios, and between the prior and the policy of
             pretraining where the model has one.
         rendered: how many of them are rendered, those first that hold each class.
+        again: the model of the same file, imported a second time, where that is to be the same.
     """
     report = check(model)
     if report.faults:
@@ -56,9 +59,10 @@ def check_model(model: SceneModel, scenes: int = SCENES, rendered: int = RENDERE
     faults, warnings = [], list(report.warnings)
     sizes: dict[str, list[Tensor]] = {name: [] for name in model.classes}
     each = dict(model.scenarios) or {"": model}
+    others = {} if again is None else dict(again.scenarios) or {"": again}
     for name, part in each.items():
         part = replace(part, renderer=model.renderer)
-        found = check_program(part, -(-scenes // len(each)), -(-rendered // len(each)))
+        found = check_program(part, -(-scenes // len(each)), -(-rendered // len(each)), others.get(name))
         before = f"Scenario {name!r}: " if name else ""
         faults += [before + text for text in found.faults]
         warnings += [before + text for text in found.warnings]
@@ -68,7 +72,7 @@ def check_model(model: SceneModel, scenes: int = SCENES, rendered: int = RENDERE
     return replace(report, faults=tuple(faults), warnings=tuple(warnings))
 
 
-def check_program(model: SceneModel, scenes: int, rendered: int) -> Findings:
+def check_program(model: SceneModel, scenes: int, rendered: int, again: SceneModel | None = None) -> Findings:
     """Run a model's program and render some of its scenes; arguments as of ``check_model``."""
     watch, store = Watch(model.grammar), pyro.get_param_store()
     with store.scope(store.get_state()), chunk_randomness(0, 0):
@@ -84,7 +88,7 @@ def check_program(model: SceneModel, scenes: int, rendered: int) -> Findings:
                 render = renderer_for(model)
                 batches = _rendered(model, render, drawn, rendered)
                 few = drawn[0].derivation[_telling(model, drawn[0], randomness.SCENES)]
-                random = randomness.beside_sites(model, few, render)
+                random = randomness.beside_sites(model, few, render, again)
         except MachineError:
             raise
         except ProbsceneError as error:

@@ -18,13 +18,16 @@ from ..chunks import chunk_randomness
 SCENES = 4
 
 
-def beside_sites(model: SceneModel, derivation: Derivation, render: Renderer) -> list[str]:
-    """A fault where a few scenes are drawn otherwise a second time: by the same seed, or from the values of their sites
-    by another seed. Each scene is rendered three times; of a generator's, what it is asked for is compared."""
+def beside_sites(
+    model: SceneModel, derivation: Derivation, render: Renderer, again: SceneModel | None = None
+) -> list[str]:
+    """A fault where a few scenes are drawn otherwise a second time: by the same seed, also from the model's file
+    imported ``again``, or from the values of their sites by another seed. Each scene is rendered three or four times;
+    of a generator's, what it is asked for is compared."""
 
-    def run(seed: int, values: dict[str, Tensor] | None = None) -> Scenes:
+    def run(seed: int, values: dict[str, Tensor] | None = None, of: SceneModel = model) -> Scenes:
         with chunk_randomness(seed, 0):
-            return run_program(model, derivation, values, density=False)
+            return run_program(of, derivation, values, density=False)
 
     first = run(1)
     where = {
@@ -33,9 +36,11 @@ def beside_sites(model: SceneModel, derivation: Derivation, render: Renderer) ->
             2, first.parameters
         ),
     }
+    if again is not None:
+        where["where its file is imported again"] = run(1, of=again)
     # Rendered outside ``run``: a renderer of the user's may draw random numbers, too.
     seen = list(_seen(first.drawing, render))
-    differs = [words for words, again in where.items() if not _same(seen, list(_seen(again.drawing, render)))]
+    differs = [words for words, other in where.items() if not _same(seen, list(_seen(other.drawing, render)))]
     if not differs:
         return []
     return [

@@ -23,7 +23,8 @@ def check(
     from ..checking.model_check import check_model
     from ..loading import load_model
 
-    report = check_model(loaded := load_model(model, assets))
+    loaded, again = load_model(model, assets), load_model(model, assets)
+    report = check_model(loaded, again=again)
     print(report)
     if render and not report.faults:
         found = check_generator(loaded)

@@ -62,7 +62,7 @@ class Agreement(NamedTuple):
 
     @property
     def worst(self) -> str:
-        return max(self.each, key=lambda name: self.each[name].seen / self.each[name].high)
+        return max(self.each, key=lambda name: self.each[name].seen / max(self.each[name].high, 1e-9))
 
     def agrees(self, verdict: Verdict) -> bool:
         """Whether the labels say of the structures what the verdict says of the features."""

@@ -50,7 +50,7 @@ def read_coco(path: Path) -> Annotated:
                 f"Expected {images[i].name} to be {said[1]:.9g}x{said[0]:.9g} as {images[i].where}, actual "
                 f"{size[1]}x{size[0]}; give labels of these images, not of images of another size."
             )
-        return [_annotation(*each) for each in of_image[keys[i]]]
+        return [_annotation(*each, size) for each in of_image[keys[i]]]
 
     return Annotated(path, (path,), images, read, tuple(categories.values()))
 
@@ -106,11 +106,17 @@ def _known(entry: Any, key: str, known: dict[str, str], where: str) -> str:
     return found
 
 
-def _annotation(name: str, where: str, entry: dict[str, Any]) -> Annotation:
+def _annotation(name: str, where: str, entry: dict[str, Any], size: Size) -> Annotation:
     said = entry.get("bbox")
     box = _numbers(said, 4)
-    if (said is None or said == [] or box == [0, 0, 0, 0]) and entry.get("segmentation"):
-        box = around(entry["segmentation"], where)
+    if (said is None or said == [] or box == [0, 0, 0, 0]) and (shape := entry.get("segmentation")):
+        box = around(shape, where)
+        height, width = map(number_of, shape["size"]) if isinstance(shape, dict) else size
+        if (height, width) != size:
+            raise DataError(
+                f"Expected a mask of {size[1]}x{size[0]} {where}, as its image is, actual {width:.9g}x{height:.9g}; "
+                "mend or delete it."
+            )
     if box is None or min(box[2:]) <= 0:
         raise DataError(
             f"Expected bbox: x, y, and a width and height above 0 {where}, actual {json.dumps(said)}; mend or delete "

@@ -21,7 +21,7 @@ from probscene.dataset import Images
 from probscene.errors import DataError
 
 from ..files import write_text
-from .naming import Entry, composed, labelled_classes, match_target
+from .naming import Entry, composed, labelled_classes, match_target, printable
 from .text import text_of
 
 
@@ -83,7 +83,8 @@ def write_counts(path: Path, names: list[str], counts: NDArray[np.int64], classe
 def write_cells(path: Path, rows: list[list[str]], classes: tuple[str, ...]) -> None:
     """A ``counts.csv`` of rows that begin with an image's name, whole or not at all."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([["image", *classes], *rows])
+    named = [[printable(name), *counts] for name, *counts in rows]
+    csv.writer(text, lineterminator="\n").writerows([["image", *classes], *named])
     write_text(path, text.getvalue())
 
 

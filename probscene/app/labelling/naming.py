@@ -1,8 +1,8 @@
 """The names that labels have for images and classes, matched with files and with a model's classes.
 
 Names match when they are the same, also where their letters are composed otherwise (Unicode's NFC and NFD), where one
-has folders before it, and where only one of them has white space at its ends. Bytes that are no UTF-8 are written as
-``printable`` has them, and match as such.
+has folders before it, and where only one of them has white space at its ends. Bytes that are no UTF-8 and line ends are
+written as ``printable`` has them, and match as such.
 """
 
 import re
@@ -151,8 +151,8 @@ def labelled_classes(
 
 
 def printable(name: str) -> str:
-    r"""A file's name as text that UTF-8 can hold: a byte that is none, such as E9, becomes ``\udce9``."""
-    return name.encode("utf-8", "backslashreplace").decode("utf-8")
+    r"""A file's name as one line of UTF-8: a byte that is none, such as E9, becomes ``\udce9``, a line's end ``\r``."""
+    return name.encode("utf-8", "backslashreplace").decode("utf-8").replace("\r", r"\r").replace("\n", r"\n")
 
 
 class _Names:
@@ -182,8 +182,7 @@ def _last(name: str) -> str:
 
 
 def _keys(name: str) -> tuple[str, str, str]:
-    text = composed(printable(name))
-    return name, text, text.strip()
+    return name, composed(printable(name)), composed(printable(name.strip()))
 
 
 def _folders_alike(name: str, file: Path) -> int:

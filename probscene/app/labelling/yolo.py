@@ -64,7 +64,8 @@ def _images_of(folder: Path) -> Path:
     if LABELS not in parts:
         return folder
     last = len(parts) - 1 - parts[::-1].index(LABELS)
-    return Path(*parts[:last], IMAGES, *parts[last + 1 :])
+    images = Path(*parts[:last], IMAGES, *parts[last + 1 :])
+    return images if images.is_dir() else folder
 
 
 def _label_files(folder: Path) -> list[Path]:
@@ -86,8 +87,12 @@ def _classes(file: Path) -> tuple[dict[int, str], int]:
     numbered = dict(enumerate(names)) if isinstance(names, list) else names
     if not isinstance(numbered, Mapping) or not numbered or not all(str(key).isdecimal() for key in numbered):
         raise DataError(f"Expected names: a list of the classes, in {file}, actual {names!r}; write it.")
-    shape = whole.get("kpt_shape")
-    return {int(key): str(name) for key, name in numbered.items()}, shape[0] * shape[1] if shape else 0
+    shape = whole.get("kpt_shape") or [0, 0]
+    if not isinstance(shape, list) or [type(number) for number in shape] != [int, int]:
+        raise DataError(
+            f"Expected kpt_shape: how many keypoints, and numbers each, in {file}, actual {shape!r}; mend or delete it."
+        )
+    return {int(key): str(name) for key, name in numbered.items()}, shape[0] * shape[1]
 
 
 def _object(fields: list[str], where: str, classes: dict[int, str], keypoints: int, size: Size) -> Annotation:

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probscene.dataset import is_image
-from probscene.decoding import read_rgb
+from probscene.decoding import quiet, read, stored
 from probscene.errors import DataError
+from probscene.image_bytes import Fault
 
 from ..labelling.annotations import Annotated, Annotation
 from ..labelling.kitti import DONT_CARE, TYPES, class_of
@@ -33,6 +34,7 @@ LEVELS = {EASY: (40.0, 0, 0.15), MODERATE: (25.0, 1, 0.30), HARD: (25.0, 2, 0.50
 """KITTI's levels: least height in pixels, most occluded, most truncated."""
 ALIKE = {"Van": "Car", "Person_sitting": "Pedestrian"}
 """Whom KITTI's protocol does not count as the other, nor as a mistake."""
+NAMED = 5  # images in a message
 
 
 class Example(NamedTuple):
@@ -45,7 +47,7 @@ class Example(NamedTuple):
         levels: ``(N,)`` int64, of ``LEVELS``, or ``BEYOND``.
         real: ``(N,)`` bool: are objects of their class; else they are only like it, see ``ALIKE``, or regions.
         size: height and width.
-        digest: of its pixels.
+        digest: of its pixels as they are stored, upright and in RGB.
     """
 
     path: Path
@@ -121,23 +123,26 @@ def read_set(
         there = tuple(sorted(map(composed, labels.classes)))
         of_name = {name: composed(name) for name in labels.classes if composed(name) in (wanted or there)}
     kept = _kept(path, wanted, there, same and not labels.kitti)
-    examples = []
+    examples, bad = list[Example](), list[str]()
     for number, i in enumerate(order, 1):
-        pixels = read_image(files[i])
-        objects = labels.read(found.entries[i], pixels.shape[:2])
-        entries = [entry for one in objects for entry in _entries(one, of_name, labels.kitti)]
+        try:
+            with quiet():
+                pixels, size = stored(read(files[i]))
+        except Fault as fault:
+            bad.append(f"{files[i].name} {fault}")
+            continue
+        entries = [
+            entry for one in labels.read(found.entries[i], size) for entry in _entries(one, of_name, labels.kitti)
+        ]
         examples.append(_example(files[i], pixels, entries, kept))
         progress(number, len(order))
+    if bad:
+        more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+        raise DataError(
+            f"Expected images that decode in {path}, actual {len(bad)} of {len(order)} bad: "
+            f"{', '.join(bad[:NAMED])}{more}; mend or delete them."
+        )
     return LabelledSet(path, kept, tuple(examples), labels.kitti, found.notes)
-
-
-def read_image(path: Path) -> NDArray[np.uint8]:
-    """Its pixels ``(H, W, 3)``, see ``decoding.read_rgb``.
-
-    Raises:
-        DataError: it is missing or cannot be decoded.
-    """
-    return read_rgb(path)
 
 
 def digest_of(found: LabelledSet) -> str:
@@ -225,8 +230,8 @@ def _kept(path: Path, wanted: tuple[str, ...] | None, there: tuple[str, ...], sa
     return there if wanted is None else wanted
 
 
-def _example(path: Path, pixels: NDArray[np.uint8], objects: list[_Object], classes: tuple[str, ...]) -> Example:
-    """An example whose boxes are on its image, and cut to it."""
+def _example(path: Path, pixels: NDArray, objects: list[_Object], classes: tuple[str, ...]) -> Example:
+    """An example whose boxes are on its image, and cut to it; ``pixels`` are those of ``decoding.stored``."""
     height, width = pixels.shape[:2]
     sides = [[one.left, one.top, one.right, one.bottom] for one, *_ in objects]
     boxes = np.array(sides, np.float32).reshape(-1, 4)
@@ -241,5 +246,6 @@ def _example(path: Path, pixels: NDArray[np.uint8], objects: list[_Object], clas
         )
     of_class = np.array([-1 if name is None else classes.index(name) for _, name, *_ in objects], np.int64)
     levels = np.array([each.level for each in objects], np.int64)
+    pixels = np.dstack([pixels] * 3) if pixels.ndim == 2 else pixels
     digest = hashlib.sha256(f"{height}x{width}".encode() + pixels.tobytes()).hexdigest()
     return Example(path, cut, of_class, levels, real, (height, width), digest)

@@ -122,6 +122,15 @@ def test_what_is_random_beside_sites_is_a_fault(how, tmp_path):
     assert (TWICE in fault) == twice and RECORDED in fault and "pyro.sample('shift'" in fault
 
 
+@pytest.mark.parametrize("seed", ["", "0"])
+def test_so_is_what_is_drawn_when_the_file_is_imported(seed, tmp_path, call):
+    """Each process would have its own."""
+    file = written(tmp_path, 'Sprites.disc("red", x,', 'Sprites.disc("red", x + 20 * SHIFT,')
+    file.write_text(f"import random\nSHIFT = random.Random({seed}).random()\n" + file.read_text())
+    done = call("check", file)
+    assert ("actual other ones where its file is imported again:" in done.out) == (not seed) == (done.code != 0)
+
+
 def noisy(canvas, threads):
     inner = SpriteRenderer(canvas, threads)
 

@@ -201,6 +201,15 @@ def test_sets_of_yolo_that_are_split_in_folders(tmp_path):
             ] * 2
 
 
+def test_images_of_yolo_lie_beside_their_labels_in_any_folder(tmp_path):
+    """Also where one above is called labels."""
+    folder = pictures(tmp_path / "labels" / "mine", ["0.png", "1.png"])
+    (folder / "classes.txt").write_text("rbc\nwbc\n")
+    for i in range(2):
+        (folder / f"{i}.txt").write_text("1 .5 .5 .5 .5\n" * i)
+    assert [len(example.boxes) for example in read_set(folder).examples] == [0, 1]
+
+
 YOLO = {
     "a score": ("0 .5 .5 .1 .1 .9", "line 2", "no score"),
     "three numbers": ("0 .5 .5 .1", "at least three corners", "actual 4 numbers"),
@@ -231,6 +240,8 @@ def test_names_of_yolos_classes_are_needed(tmp_path):
         ("nc: 1", "actual None"),
         ("a: [", "YAML"),
         ("names: {a: b}", "names"),
+        ("names: [a]\nkpt_shape: 3", "kpt_shape.*actual 3"),
+        ("names: [a]\nkpt_shape: [2, x]", "kpt_shape"),
     ):
         (folder / "data.yaml").write_text(text)
         with pytest.raises(DataError, match=said) as error:
@@ -301,6 +312,11 @@ WRONG = {
     "case": (changed(file_name="0.PNG"), "'0.PNG'", "did you mean '0.png'"),
     "no polygon": (lambda whole: whole["annotations"][0].update(bbox=None, segmentation=[[1, 2, 3]]), "three corners"),
     "no mask": (lambda whole: whole["annotations"][0].update(bbox=None, segmentation={"a": 1}), "size and counts"),
+    "a mask of another size": (
+        lambda whole: whole["annotations"][0].update(bbox=None, segmentation={"size": [2, 4], "counts": [1, 7]}),
+        "a mask of 128x96 in annotations[0]",
+        "actual 4x2",
+    ),
     "no box": (lambda whole: whole["annotations"][0].update(bbox=None), "annotations[0]", "actual null"),
     "a class twice": (lambda whole: whole["categories"][0].update(name="wbc"), "'wbc' more than once"),
 }

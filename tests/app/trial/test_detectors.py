@@ -11,9 +11,10 @@ from torchvision.models import resnet50
 
 import probscene as ps
 from probscene.app.trial.detector import RECIPES, build
-from probscene.app.trial.sets import read_image, read_set
+from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures, Stage, augmented, detect, fitted, order, train
 from probscene.app.trial.trial import Budget, trial
+from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
 SMALL = {"budget": Budget(presentations=8), "seeds": 2, "resamples": 20, "size": (64, 64)}
@@ -69,7 +70,7 @@ def test_boxes_go_with_the_image(drawn):
 
 
 def test_an_image_keeps_its_shape_in_a_frame_of_another(drawn):
-    image = read_image(read_set(drawn / "train").examples[0].path)[:40]
+    image = read_rgb(read_set(drawn / "train").examples[0].path)[:40]
     frame, scale = fitted(image, (64, 128))
     assert frame.shape == (64, 128, 3) and scale == pytest.approx(1.6)
     assert (frame[:, 103:] == 127).all() and frame[:, :102].std() > 1

@@ -75,10 +75,21 @@ def test_faults_of_coco_are_named(folder, how, said):
         read_set(change(folder, how))
 
 
-def test_an_image_that_does_not_decode_is_named(folder):
+def test_images_that_do_not_decode_are_named(folder):
     (folder / "images" / "001.png").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"001\.png, actual a file that is not a PNG, JPEG or TIFF"):
+    (folder / "images" / "002.png").write_bytes(b"")
+    said = r"actual 2 of 3 bad: 001\.png is not a PNG, JPEG or TIFF image, 002\.png is empty; mend or delete them\."
+    with pytest.raises(DataError, match=said):
         read_set(folder)
+
+
+def test_images_are_the_same_by_all_their_bits(folder):
+    """Of 16 bits, not by those that are shown; a grey image is one in colours, too."""
+    wide = np.arange(SIDE * SIDE, dtype=np.uint16).reshape(SIDE, SIDE) * 16
+    for i, image in enumerate((wide, np.dstack([wide] * 3), wide + 1)):
+        cv2.imwrite(str(folder / "images" / f"{i:03d}.png"), image)
+    one, same, other = (example.digest for example in read_set(folder).examples)
+    assert one == same != other
 
 
 def test_classes_that_differ_are_named_and_case_is(folder):
