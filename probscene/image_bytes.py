@@ -209,7 +209,7 @@ def _tiff(data: bytes) -> PixelFile:
         entries, after = _entries(data, order, struct.unpack_from(order + "I", data, 4)[0])
         of = {tag: (kind, number, value) for tag, kind, number, value in reversed(entries)}
         bits, formats, light, planar = (values(tag, 1) for tag in (_BITS, _SAMPLE_FORMAT, _PHOTOMETRIC, _PLANAR))
-        extra = values(_EXTRA, _OPACITY)
+        extra, channels = values(_EXTRA, _OPACITY), len(bits)
         places = [at + size for a, b in _PLACES for at, size in zip(values(a, 0), values(b, 0), strict=False)]
     except struct.error as error:
         raise Fault("is truncated") from error
@@ -225,7 +225,7 @@ def _tiff(data: bytes) -> PixelFile:
         raise Fault(f"is a TIFF with {kind} a channel; save it with 8 or 16 bits, unsigned")
     if bits[0] == 16 and light[0] not in (1, 2):
         raise Fault("is a TIFF of 16 bits that is neither grey, black being 0, nor RGB; save it as one of these")
-    if bits[0] == 16 and len(bits) > 1 and planar[0] != 1:
+    if bits[0] == 16 and channels > 1 and planar[0] != 1:
         raise Fault(
             "is a TIFF of 16 bits whose channels lie one after the other (planar); save it with them side by side"
         )

@@ -40,7 +40,7 @@ def count_errors(read: NDArray[np.float64], labelled: Counts, seed: int = 0) -> 
     whole, drawn = (_correlation(one, other, each) for each in (every, weight))
     correlation = None if np.isnan(whole[0]) else around(float(whole[0]), drawn, least=-1.0)
     if correlation is not None:
-        correlation = correlation._replace(high=min(correlation.high, 1.0))
+        correlation = Interval(*(min(end, 1.0) for end in correlation))
     return CountErrors(len(one), around(float(error.mean()), weight @ error, least=0.0), correlation)
 
 
