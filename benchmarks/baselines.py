@@ -1,6 +1,7 @@
 """The baselines at their best: each guide and objective gets the same search over its settings, beside the default.
 
     python benchmarks/baselines.py [--fits lstm pcfg grammar-vae mmd witness js] [--draws 24] [--seeds 0]
+        [--set variance=20 num_scenes=50]
 
 Structures of Aerial 2D, with true counts of roads and of cars by road instead of images: what is compared is how a
 distribution is learnt, and not how images are read. The search draws step size, steps a batch, baseline and number of
@@ -79,6 +80,12 @@ def drawn(fit: str, num: int) -> list[Settings]:
     scenes = preset.batches * preset.num_scenes
     own = Settings(preset.learning_rate, preset.updates, preset.baseline, scenes, preset.num_scenes, preset.variance)
     return [own, *(each for each in useful if each != own)][:num]
+
+
+def changed(settings: Settings, words: list[str]) -> Settings:
+    """Settings with other values, such as ``variance=20``."""
+    values = dict(word.split("=") for word in words)
+    return replace(settings, **{key: type(getattr(settings, key))(value) for key, value in values.items()})
 
 
 def search_target(seed: int) -> Truth:
@@ -189,17 +196,22 @@ def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     out_option(parser, __file__)
     parser.add_argument("--fits", nargs="+", default=["lstm", "pcfg"], choices=["lstm", *GUIDES, *OBJECTIVES])
-    parser.add_argument("--draws", type=int, default=24, help="settings that are tried")
+    parser.add_argument("--draws", type=int, default=24, help="settings that are tried; 0 for no search")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="a row of the default but for these")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
     search, table = Search(args.out / "results.json"), {}
     for fit in args.fits:
-        best = search.best(fit, args.draws)
-        for name, settings in ((f"{fit}, default", drawn(fit, 1)[0]), (f"{fit}, best", best)):
+        named = {f"{fit}, default": drawn(fit, 1)[0]}
+        if args.set:
+            named[f"{fit}, {' '.join(args.set)}"] = changed(drawn(fit, 1)[0], args.set)
+        if args.draws:
+            named[f"{fit}, best"] = search.best(fit, args.draws)
+            print(f"{fit}: {named[f'{fit}, best']}", flush=True)
+        for name, settings in named.items():
             table[name] = [search.row(fit, settings, None, seed) for seed in args.seeds]
-        print(f"{fit}: {best}", flush=True)
     others = {
         "prior": MODEL.prior,
         "start": MODEL.pretraining_policy,
