@@ -38,7 +38,7 @@ from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, weights
 
 LOW, HIGH = multi_mnist.MARGIN, multi_mnist.CANVAS - multi_mnist.MARGIN
-ANY, EACH = (1,) * (multi_mnist.MOST + 1), (1,) * 10
+UNIFORM_NUMBER, UNIFORM_CLASS = (1,) * (multi_mnist.MOST + 1), (1,) * 10
 FONTS = cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX
 WITHIN, BEYOND = "not learnt", "another domain"
 Place = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor | float, Tensor | float]]
@@ -68,7 +68,7 @@ LAYOUTS: dict[str, Place] = {
 }
 
 
-def digits(place: Place = anywhere, number=ANY, share=EACH, angle: float = 0.0) -> SceneModel:
+def digits(place: Place = anywhere, number=UNIFORM_NUMBER, share=UNIFORM_CLASS, angle: float = 0.0) -> SceneModel:
     """Digits of exemplars that the prior does not have."""
 
     def program(num_scenes, structure):
@@ -99,7 +99,7 @@ def letters(number: int, seed: int, row: bool) -> Tensor:
     return torch.from_numpy(images)
 
 
-def drawn(model: SceneModel, number: int, seed: int, policy: Policy | None = None) -> Tensor:
+def render_scenes(model: SceneModel, number: int, seed: int, policy: Policy | None = None) -> Tensor:
     return torch.cat(list(images_of(model, policy or model.prior, number, seed)))
 
 
@@ -116,21 +116,25 @@ def changed(images: Tensor, seed: int) -> Iterator[tuple[str, Tensor]]:
 def cases_of_digits(number: int, seed: int, folders: list[Path]) -> Iterator[tuple[str, str, Tensor]]:
     model = load_model("multi_mnist")
     assert model.target is not None
-    yield WITHIN, "the model's own target", drawn(model.target(seed), number, seed)
+    yield WITHIN, "the model's own target", render_scenes(model.target(seed), number, seed)
     for name, place in LAYOUTS.items():
-        yield WITHIN, name, drawn(digits(place), number, seed)
-    yield WITHIN, "only sevens", drawn(digits(share=np.eye(10)[7]), number, seed)
-    yield WITHIN, "nine or ten", drawn(digits(number=[0] * 9 + [1, 1]), number, seed)
-    yield WITHIN, "one or two", drawn(digits(number=[0, 1, 1]), number, seed)
-    yield WITHIN, "all turned by 30 degrees", drawn(digits(angle=multi_mnist.TURN), number, seed)
+        yield WITHIN, name, render_scenes(digits(place), number, seed)
+    yield WITHIN, "only sevens", render_scenes(digits(share=np.eye(10)[7]), number, seed)
+    yield WITHIN, "nine or ten", render_scenes(digits(number=[0] * 9 + [1, 1]), number, seed)
+    yield WITHIN, "one or two", render_scenes(digits(number=[0, 1, 1]), number, seed)
+    yield WITHIN, "all turned by 30 degrees", render_scenes(digits(angle=multi_mnist.TURN), number, seed)
     yield BEYOND, "letters", letters(number, seed, False)
     yield BEYOND, "letters in a row", letters(number, seed, True)
-    yield BEYOND, "all turned by 90 degrees", drawn(digits(angle=math.pi / 2), number, seed)
-    images = drawn(model, number, seed + 1)
+    yield BEYOND, "all turned by 90 degrees", render_scenes(digits(angle=math.pi / 2), number, seed)
+    images = render_scenes(model, number, seed + 1)
     yield BEYOND, "half as bright", images // 2
     for name, others in changed(images, seed):
         yield BEYOND, name, others
-    yield BEYOND, "aerial images", drawn(load_model("aerial2d"), number, seed).float().mean(1, keepdim=True).byte()
+    yield (
+        BEYOND,
+        "aerial images",
+        render_scenes(load_model("aerial2d"), number, seed).float().mean(1, keepdim=True).byte(),
+    )
     for folder in folders:
         files = ImageFolder(folder, model.canvas, model.channels, skip_bad=True)
         yield BEYOND, folder.name, torch.stack([files.load(i) for i in range(min(number, len(files)))])
@@ -141,18 +145,20 @@ def cases_of_roads(number: int, seed: int) -> Iterator[tuple[str, str, Tensor]]:
     assert model.target is not None
 
     def roads(roads, cars) -> Tensor:
-        return drawn(model, number, seed, StructurePrior(model.grammar, Roads=counts(*roads), Cars=counts(*cars)))
+        return render_scenes(
+            model, number, seed, StructurePrior(model.grammar, Roads=counts(*roads), Cars=counts(*cars))
+        )
 
-    yield WITHIN, "the model's own target", drawn(model.target(seed), number, seed)
+    yield WITHIN, "the model's own target", render_scenes(model.target(seed), number, seed)
     yield WITHIN, "one road without cars", roads([0, 1], [1])
     yield WITHIN, "three full roads", roads([0, 0, 0, 1], [0] * 7 + [1, 1])
     yield WITHIN, "four roads, a car each", roads([0, 0, 0, 0, 1], [0, 1])
-    images = drawn(model, number, seed + 1)
+    images = render_scenes(model, number, seed + 1)
     yield BEYOND, "red and blue exchanged", images.flip(1)
     yield BEYOND, "turned by 90 degrees", images.transpose(2, 3).contiguous()
     for name, others in changed(images, seed):
         yield BEYOND, name, others
-    yield BEYOND, "digits", drawn(load_model("multi_mnist"), number, seed).expand(-1, 3, -1, -1).contiguous()
+    yield BEYOND, "digits", render_scenes(load_model("multi_mnist"), number, seed).expand(-1, 3, -1, -1).contiguous()
 
 
 def main():
@@ -168,7 +174,7 @@ def main():
         "aerial2d": cases_of_roads(args.images, args.seed),
     }
     for name, each in cases.items():
-        scenes = look.places(drawn(load_model(name), args.scenes, 100 + args.seed))
+        scenes = look.places(render_scenes(load_model(name), args.scenes, 100 + args.seed))
         for expected, case, images in each:
             sides = zip(look.places(images), scenes, (foreign, strange), strict=True)
             shares = [float(by(real.numpy(), drawn.numpy()).mean()) for real, drawn, by in sides]

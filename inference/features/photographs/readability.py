@@ -30,13 +30,13 @@ from .reading import LARGE, RULES, SCOPES, SMALL
 
 AGREE = 0.25  # largest disagreement of heads, a mean difference over the mean count and ``BASE``
 CLOSE = 0.7  # largest difference of the means that rules read, over their own mean and ``BASE``
-AS_WELL, NEARLY = 1.1, 0.02  # by which factor, and how many objects, errors that are as good may exceed the least
+AS_WELL, TIE_SLACK = 1.1, 0.02  # by which factor, and how many objects, errors that are as good may exceed the least
 MOSTLY = 0.7  # of a class's objects must be in the scope of large ones for this to be read
 SKILL = 0.8  # least correlation with the true counts of renders
 BASE = 0.3  # objects
 RENDERS = 1.0  # how many labelled images the error on renders is worth
 ENOUGH = 5  # labelled images from which on rules are chosen by them
-MUCH, LITTLE = 1.25, 0.1  # by which factor, and how many objects, errors on so few labels must differ
+ERROR_RATIO, ERROR_SLACK = 1.25, 0.1  # by which factor, and how many objects, errors on so few labels must differ
 BIASED = 2  # standard errors by which the mean of a reading may differ from that of labels which bear it out
 GOES_WITH = 0.4  # least correlation of labels with a reading that is believed without them
 APART = 0.25  # relative difference of means from which on labels and such a reading are of different things
@@ -131,7 +131,7 @@ def without_labels(read: Read, c: int) -> Reading:
     s = int(scopes_without_labels(read.true)[c])
     true = read.true[:, s, c]
     error = (read.renders[:, s, :, c] - true[:, None]).abs().mean(0)
-    rules = (error <= AS_WELL * error.min() + NEARLY).nonzero().flatten()
+    rules = (error <= AS_WELL * error.min() + TIE_SLACK).nonzero().flatten()
     counts = read.photographs[:, s, rules, c].double().quantile(0.5, 1)
     mean, means = float(counts.mean()), read.photographs[:, s, rules, c].double().mean(0)
     apart = float(read.apart[s, rules, c].mean())
@@ -179,7 +179,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     figures = f"leave-one-out error {error:.2f} an image, {of_histogram}"
     off = (of_free - labels).double().numpy()
     without, surely = float(np.abs(off).mean()), BIASED * float(off.std(ddof=1)) / math.sqrt(len(y))
-    as_by_labels = without <= MUCH * error + LITTLE and abs(off.mean()) <= surely + LITTLE
+    as_by_labels = without <= ERROR_RATIO * error + ERROR_SLACK and abs(off.mean()) <= surely + ERROR_SLACK
     if free.readable and as_by_labels and _no_worse(without, scores(all_of_free, y).mean(), histogram):
         because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image, {of_histogram})"
         return free._replace(by="labels", error=without, because=because)
@@ -223,9 +223,9 @@ def _no_worse(error: float, score: float, histogram: float) -> bool:
         error: of what is read in an image, from its label.
         score: with which the histogram of all that is read predicts a label.
     """
-    if error <= histogram + NEARLY:
+    if error <= histogram + TIE_SLACK:
         return True
-    return error <= MUCH * histogram + LITTLE and score <= histogram + NEARLY
+    return error <= ERROR_RATIO * histogram + ERROR_SLACK and score <= histogram + TIE_SLACK
 
 
 def _unlike(labelled: Array, photographs: Array) -> tuple[float, float] | None:
@@ -243,7 +243,7 @@ def _choose(seen: Array, labels: Array, drawn: Array, first: int) -> tuple[int, 
     """The scope, from the ``first`` on, and the rule with the least error on labelled images ``(K, S, R)`` and on
     renders ``(S, R)``; of scopes that do about as well the earliest, which asks least of where objects stand."""
     cost = (_errors(seen, labels[:, None, None]) + RENDERS / len(labels) * drawn)[first:]
-    scope = int(np.argmax(cost.min(1) <= MUCH * cost.min() + LITTLE))
+    scope = int(np.argmax(cost.min(1) <= ERROR_RATIO * cost.min() + ERROR_SLACK))
     return first + scope, int(np.argmin(cost[scope]))
 
 

@@ -70,7 +70,7 @@ def _chunks(file: Path) -> tuple[dict[str, Any], bytes]:
         raise DataError(f"Expected a glTF file, actual {file} ({error}); export it again.") from None
 
 
-class _Placed(NamedTuple):
+class _PlacedNode(NamedTuple):
     """A node that is shown, and its matrix in the scene."""
 
     node: dict[str, Any]
@@ -111,12 +111,12 @@ class _Gltf:
 
     # Nodes
 
-    def _placed(self) -> dict[int, _Placed]:
+    def _placed(self) -> dict[int, _PlacedNode]:
         """Nodes of the scene by their number."""
         nodes, scenes = self.tree.get("nodes", []), self.tree.get("scenes")
         below = {child for node in nodes for child in node.get("children", [])}
         roots = scenes[self.tree.get("scene", 0)].get("nodes", []) if scenes else sorted(set(range(len(nodes))) - below)
-        found: dict[int, _Placed] = {}
+        found: dict[int, _PlacedNode] = {}
         todo = [(root, np.eye(4)) for root in roots]
         while todo:
             index, above = todo.pop()
@@ -131,7 +131,7 @@ class _Gltf:
             matrix = np.reshape(node.get("matrix", np.eye(4)), (4, 4)).T @ _matrices(
                 *(np.array([node.get(name, default)], float) for name, default in _AT_REST.items())
             )
-            found[index] = _Placed(node, above @ matrix[0])
+            found[index] = _PlacedNode(node, above @ matrix[0])
             todo += [(child, found[index].matrix) for child in node.get("children", [])]
         return found
 
@@ -144,7 +144,7 @@ class _Gltf:
             *(values.get(name, np.tile(default, (number, 1)))[:number] for name, default in _AT_REST.items())
         )
 
-    def _skin(self, index: int, placed: dict[int, _Placed]) -> np.ndarray:
+    def _skin(self, index: int, placed: dict[int, _PlacedNode]) -> np.ndarray:
         """``(J, 4, 4)`` from a skin's bind pose to the scene."""
         skin = self.tree["skins"][index]
         joints = np.stack([placed[joint].matrix for joint in skin["joints"]])
@@ -169,7 +169,7 @@ class _Gltf:
         positions = positions @ instances[:, :3, :3].swapaxes(1, 2) + instances[:, None, :3, 3]  # (I, V, 3)
         number, V = positions.shape[:2]
         check_geometry(self.file, positions.reshape(-1, 3), triangles)
-        colour, tinted, uv, texture = self._look(primitive, weights, triangles)
+        colour, tinted, uv, texture = self._base_colours(primitive, weights, triangles)
         triangles = np.tile(triangles, (number, 1, 1)) + V * np.arange(number)[:, None, None]
         colour, uv = np.tile(colour, (number, 1, 1)), None if uv is None else np.tile(uv, (number, 1, 1, 1))
         mirrored = np.linalg.det(instances[:, :3, :3]) < 0
@@ -216,7 +216,7 @@ class _Gltf:
 
     # Materials
 
-    def _look(self, primitive, weights, triangles: np.ndarray):
+    def _base_colours(self, primitive, weights, triangles: np.ndarray):
         """Colour ``(F, 3)`` of 255, tint, uv ``(F, 3, 2)`` and texture of a primitive."""
         material = self.tree["materials"][primitive["material"]] if "material" in primitive else None
         factor, info = _base(material or {})

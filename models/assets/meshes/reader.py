@@ -123,7 +123,7 @@ def _parts(file: Path, scene, textures: dict[str, Texture], triangular: type) ->
             )
         check_geometry(file, positions, triangles)
         positions = positions @ transform[:3, :3].T + transform[:3, 3]
-        colour, tinted, uv, texture = _look(file, piece, textures)
+        colour, tinted, uv, texture = _base_colours(file, piece, textures)
         if np.linalg.det(transform[:3, :3]) < 0:
             triangles, uv = triangles[:, ::-1], None if uv is None else uv[:, ::-1]
         parts.append(Part(positions, triangles, colour, tinted, uv, texture))
@@ -143,7 +143,7 @@ def _ply_faces(file: Path, piece) -> Polygons:
     return corners
 
 
-def _look(file: Path, piece, textures: dict[str, Texture]):
+def _base_colours(file: Path, piece, textures: dict[str, Texture]):
     """Colour, tint, uv and texture of one piece of geometry."""
     triangles, visual = np.asarray(piece.faces), piece.visual
     white = np.full((len(triangles), 3), 255.0)

@@ -39,8 +39,8 @@ def beside_sites(
     if again is not None:
         where["where its file is imported again"] = run(1, of=again)
     # Rendered outside ``run``: a renderer of the user's may draw random numbers, too.
-    seen = list(_seen(first.drawing, render))
-    differs = [words for words, other in where.items() if not _same(seen, list(_seen(other.drawing, render)))]
+    rendered = list(_rendered(first.drawing, render))
+    differs = [words for words, other in where.items() if not _same(rendered, list(_rendered(other.drawing, render)))]
     if not differs:
         return []
     return [
@@ -54,7 +54,7 @@ def _same(one: list, other: list) -> bool:
     return all(_equal(*pair) for pair in zip(one, other, strict=True))
 
 
-def _seen(drawing: Renderable, render: Renderer) -> Iterator[Any]:
+def _rendered(drawing: Renderable, render: Renderer) -> Iterator[Any]:
     if isinstance(drawing, Request):
         yield drawing.records((0, 0))
         yield from vars(drawing.photo).values() if drawing.photo is not None else ()
