@@ -39,7 +39,7 @@ from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.inference.judging.metrics import histogram, total_variation
+from probscene.inference.statistics.metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything

@@ -29,8 +29,8 @@ from probscene.app.chunks import CHUNK
 from probscene.app.datasets.generate import generate
 from probscene.app.files import write_json
 from probscene.app.fitting.run import RunFolder
+from probscene.app.workers.actor_pool import Crew
 from probscene.app.workers.cluster import Cluster
-from probscene.app.workers.crew import Crew
 
 SHORT = {"count.steps": 60, "batches": 8, "num_scenes": 300, "pretrain_derivations": 500, "learn": "structure"}
 

@@ -15,8 +15,8 @@ import time
 
 import torch
 
-from probscene.app.fitting.observer import Observer
 from probscene.app.fitting.presets import QUICK
+from probscene.app.fitting.rendered_features import Observer
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.inference.features.counting.batches import CountSchedule

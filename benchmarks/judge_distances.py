@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from probscene.app.evaluation.structure_counts import StructureCounts, sampled
 from probscene.app.loading import load_model
 from probscene.inference.features.counting.grouping import ABSENT
-from probscene.inference.judging.trust import trust
-from probscene.inference.judging.verdict import Verdict
+from probscene.inference.statistics.trust import trust
+from probscene.inference.statistics.verdict import Verdict
 from probscene.model import SceneModel
 from probscene.models.aerial2d import poisson
 from probscene.structure import StructurePrior, counts, ranked, weights

@@ -26,9 +26,9 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
 from probscene.app.fitting.preset import STRUCTURE, Preset
 from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL, QUICK
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.derive import derive_complete
-from probscene.inference.judging.metrics import total_variation
+from probscene.inference.statistics.metrics import total_variation
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET, poisson
 from probscene.policy import Policy
 from probscene.relations import per_parent

@@ -25,17 +25,17 @@ from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.sources import FITTED, LEARNT, START, before
 from probscene.app.files import write_json
-from probscene.app.fitting.observer import RENDERED_AT_ONCE, Observer
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, Observer
+from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.derive import derive_complete
 from probscene.inference.features.base import FeatureNet
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
-from probscene.inference.judging.tally import around
+from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.tally import around
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything

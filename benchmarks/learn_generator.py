@@ -24,10 +24,10 @@ from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
 from probscene.derive import derive_complete
-from probscene.inference.judging.metrics import histogram, total_variation
+from probscene.inference.statistics.metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import per_parent

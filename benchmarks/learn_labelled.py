@@ -31,11 +31,11 @@ from probscene.app.evaluation.structure_counts import StructureCounts
 from probscene.app.files import make_folder, write_json
 from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import PRESETS
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
 
 SCENES, RESAMPLES = 2000, 200
 COUNTS = "count=efficientnet"

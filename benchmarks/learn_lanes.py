@@ -27,11 +27,11 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import kid
+from probscene.inference.statistics.image_metrics import kid
 from probscene.models.aerial2d import CANVAS, GRAMMAR, MODEL
 from probscene.sampling import Scenes, sample, seed_everything
 

@@ -32,16 +32,16 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
+from probscene.app.fitting.parameter_stage import NAME, beside, learnt_by
 from probscene.app.fitting.preset import BOTH
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import kid
-from probscene.inference.judging.metrics import histogram, total_variation
 from probscene.inference.parameters.sites import NEAR, quantiles_of, site_name, within
+from probscene.inference.statistics.image_metrics import kid
+from probscene.inference.statistics.metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything

@@ -21,9 +21,9 @@ from learn_parameters import SIDE, picture, row_errors
 from torch import Tensor
 
 from probscene.app.files import write_json
-from probscene.app.fitting.observer import Observer
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
+from probscene.app.fitting.rendered_features import Observer
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning

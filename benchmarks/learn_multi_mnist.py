@@ -28,14 +28,14 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
 from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
+from probscene.inference.statistics.metrics import histogram, pooled_shares, total_variation
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL
 from probscene.sampling import seed_everything
 from probscene.structure import StructurePrior, counts, weights

@@ -29,16 +29,16 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.chunks import CHUNK, draw_chunk
 from probscene.app.files import write_json
-from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
-from probscene.app.fitting.learnt.structure import BEFORE
+from probscene.app.fitting.parameter_stage import NAME, beside, learnt_by
 from probscene.app.fitting.preset import LIKELIHOOD
 from probscene.app.fitting.run import RunFolder
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
+from probscene.app.fitting.structure_stage import BEFORE
 from probscene.app.loading import renderer_for
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import Figure, kid
+from probscene.inference.statistics.image_metrics import Figure, kid
 from probscene.policy import Policy
 from probscene.sampling import Scenes
 

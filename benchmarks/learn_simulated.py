@@ -25,10 +25,10 @@ from torch import Tensor
 
 from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.files import make_folder, write_json
-from probscene.app.fitting.learnt.structure import score_function
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE, Preset
 from probscene.app.fitting.presets import preset
+from probscene.app.fitting.structure_stage import score_function
 from probscene.app.loading import load_model
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete

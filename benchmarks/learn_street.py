@@ -49,12 +49,12 @@ from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.kitti import DONT_CARE, read_objects
+from probscene.app.labels.kitti import DONT_CARE, read_objects
 from probscene.app.memory import keep_freed_memory
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import fid, kid
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.image_metrics import fid, kid
+from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -25,20 +25,20 @@ from torch import Tensor
 
 import probscene as ps
 from probscene.app.files import make_folder, write_json
-from probscene.app.fitting.learnt.parameters import HELD
-from probscene.app.fitting.observer import RENDERED_AT_ONCE, Observer
 from probscene.app.fitting.overrides import override
+from probscene.app.fitting.parameter_stage import HELD
 from probscene.app.fitting.preset import TILTING
 from probscene.app.fitting.presets import preset
+from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, Observer
 from probscene.app.loading import load_model
 from probscene.app.memory import keep_freed_memory
 from probscene.app.progress import Display
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.tally import around, resamples
-from probscene.inference.judging.two_sample import Features
+from probscene.inference.parameters.tilting.image_statistics import plain
 from probscene.inference.parameters.tilting.learning import TiltingLearning
-from probscene.inference.parameters.tilting.plain import plain
+from probscene.inference.statistics.tally import around, resamples
+from probscene.inference.statistics.two_sample import Features
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything

@@ -12,8 +12,8 @@ import time
 
 import torch
 
-from probscene.app.fitting.observer import Observer
 from probscene.app.fitting.presets import QUICK
+from probscene.app.fitting.rendered_features import Observer
 from probscene.app.loading import load_model, renderer_for
 from probscene.derive import derive_complete
 from probscene.inference.guides.lstm import make_guide

@@ -29,7 +29,7 @@ from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.derive import derive
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.support import foreign, strange
+from probscene.inference.statistics.domain_shift import foreign, strange
 from probscene.model import SceneModel
 from probscene.models import multi_mnist
 from probscene.models.digits import shipped

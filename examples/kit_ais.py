@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 
 from probscene.app.files import make_folder
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.dataset import is_image
 from probscene.decoding import read_rgb
 from probscene.errors import DataError, ProbsceneError

@@ -22,6 +22,7 @@ from torch import Tensor
 from probscene.errors import ProbsceneError
 
 BLOCK = 2**18  # kernels in memory at once
+SHARE = 0.1  # of the density at a scene that is its own kernel's
 
 
 class Divergence(Protocol):
@@ -247,3 +248,22 @@ def _check(generated: Tensor, real: Tensor) -> None:
         )
     if not torch.isfinite(generated.sum() + real.sum()):  # NaN and infinity stay in a sum
         raise ProbsceneError("Expected finite features, actual NaN or infinity; lower the learning rate.")
+
+
+def self_share(points: Tensor) -> float:
+    """The mean share that a point's own kernel, Gaussian of variance 1, has in the density estimated at it from all.
+
+    Args:
+        points: ``(N, d)``.
+    """
+    return float((1 / torch.exp(-0.5 * torch.cdist(points, points).square()).sum(1)).mean())
+
+
+def bandwidth(points: Tensor) -> float:
+    """The least standard deviation of a Gaussian kernel at which ``points (N, d)`` have a self share of ``SHARE``, or
+    of two points' worth where there are too few for that."""
+    share, low, high = max(SHARE, 2 / len(points)), -20.0, 20.0  # powers of two
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if self_share(points / 2**middle) > share else (low, middle)
+    return 2**high

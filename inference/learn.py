@@ -15,7 +15,7 @@ from probscene.sampling import seed_everything
 
 from .guides.base import Guide
 from .objective import ScoreFunction
-from .reuse import RenderPool
+from .render_cache import RenderPool
 from .training import Report, batch_seed, check_finite, of_prefix, restore_training, training_state
 
 

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .ahead import ahead
 from .decoding import (
     Part,
     Window,
@@ -29,6 +28,7 @@ from .decoding import (
 )
 from .errors import DataError
 from .image_bytes import Fault
+from .prefetch import ahead
 from .threads import cores
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")

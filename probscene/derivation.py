@@ -275,3 +275,18 @@ def _scene_graph(grammar: Grammar, rules: Tensor, base: Tensor, owner: Tensor, n
     kind = torch.full((N, M + 1), -1).scatter(1, at, objects.flatten(1))
     parent = torch.full((N, M + 1), -1).scatter(1, at, parents.flatten(1))
     return kind[:, :M].contiguous(), parent[:, :M].contiguous()
+
+
+def group_of(kind: Tensor, parent: Tensor, group: int) -> Tensor:
+    """The node of kind ``group`` that each node is or belongs to, ``(N, M)`` int64, -1 for none.
+
+    Args:
+        kind, parent: ``(N, M)`` int64 of a derivation.
+    """
+    own = torch.arange(kind.shape[1]).expand_as(kind)
+    found, above = torch.where(kind == group, own, -1), parent
+    while ((found < 0) & (above >= 0)).any():
+        at = above.clamp(min=0)
+        found = torch.where((found < 0) & (above >= 0) & (kind.gather(1, at) == group), above, found)
+        above = torch.where(above >= 0, parent.gather(1, at), above)
+    return found

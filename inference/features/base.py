@@ -213,7 +213,7 @@ def examples(batch: RenderBatch, classes: Tensor, group: Tensor | None = None, a
     Args:
         batch: from a renderer.
         classes: ``(kinds + 1,)`` int64, the class of each kind of the grammar, -1 for none; the last entry is -1.
-        group: ``(N, M)`` int64, the node that each node is counted with, -1 for none; see ``grouping.group_of``.
+        group: ``(N, M)`` int64, the node that each node is counted with, -1 for none; see ``derivation.group_of``.
         along: the axis along which groups follow one another, ``"x"`` or ``"y"``.
     """
     label = classes[batch.kind].masked_fill(batch.pixels == 0, -1)
@@ -282,3 +282,18 @@ def embed_all(
     if not torch.isfinite(features).all():
         raise ProbsceneError("Expected finite features, actual NaN or infinity; train the feature network again.")
     return features
+
+
+def slow_settings(preset: Any) -> dict[str, Any]:
+    """What suits a network that takes about 20 ms an image on one core where a preset's own takes 1: fewer scenes, each
+    drawn once, and at so noisy a gradient half the step. Marginals, far sharper than the joint density, say of
+    photographs only that they are none. Features come in units of their bandwidth, and the kernel takes them so."""
+    return {
+        "batches": 40,
+        "num_scenes": 150,
+        "draws_per_structure": 1,
+        "learning_rate": min(preset.learning_rate, 5e-3),
+        "marginal_variance": None,
+        "stabilised": False,
+        "variance": None if preset.variance is None else 1.0,
+    }

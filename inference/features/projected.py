@@ -12,11 +12,11 @@ from torch import Tensor
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 
+from ..divergence import self_share
 from ..training import Report, batch_seed
-from .base import Features, Photographs, Renders
-from .counting.choices import slow_settings
+from .base import Features, Photographs, Renders, slow_settings
 from .names import network_name
-from .projection import Projected, discriminant, self_share
+from .projection import Projected, discriminant
 
 DRAWN_AT_ONCE = 64  # structures
 

@@ -22,9 +22,9 @@ from torch import Tensor, nn
 
 from probscene.errors import ProbsceneError, RunError
 
+from ..divergence import bandwidth
 from .base import FeatureNet
 
-SHARE = 0.1  # of the density at a scene that is its own kernel's
 LEADING = 100  # principal components that the discriminant is sought in, and no more than a quarter of the pairs
 SHRINK = 1e-6  # of the mean within-structure variance, added to each direction's
 
@@ -80,25 +80,6 @@ def discriminant(one: Tensor, other: Tensor, directions: int, scenes: int) -> Pr
     weight = axes @ (whiten.T @ turn.flip(1)[:, :directions])
     weight = weight / bandwidth((other[:scenes] - mean) @ weight)
     return Projection(mean.float(), weight.float(), ratio.flip(0)[:directions].float())
-
-
-def self_share(points: Tensor) -> float:
-    """The mean share that a point's own kernel, Gaussian of variance 1, has in the density estimated at it from all.
-
-    Args:
-        points: ``(N, d)``.
-    """
-    return float((1 / torch.exp(-0.5 * torch.cdist(points, points).square()).sum(1)).mean())
-
-
-def bandwidth(points: Tensor) -> float:
-    """The least standard deviation of a Gaussian kernel at which ``points (N, d)`` have a self share of ``SHARE``, or
-    of two points' worth where there are too few for that."""
-    share, low, high = max(SHARE, 2 / len(points)), -20.0, 20.0  # powers of two
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if self_share(points / 2**middle) > share else (low, middle)
-    return 2**high
 
 
 class Projected(nn.Module):

@@ -27,19 +27,19 @@ from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
 from ..training import Report, Training, batch_seed, of_prefix
-from .best import Best, HeldOut
+from .backbone import Eye
+from .calibration import TriedReader
+from .checkpoint_selection import Best, HeldOut
 from .energy import EnergyDistance, OwnReadings, WeightedEnergyDistance, site_rows
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
-from .reading.assembly import Assembly, along_the_widest
-from .reading.eyes import Eye
-from .reading.missing import Missing
-from .reading.reader import Reader
-from .reading.training import OverallTraining, ReaderTraining, Valued
-from .reading.tried import TriedReader
-from .reading.valued import Label, ValuedRenders, joined
+from .missed_objects import Missing
+from .reader import Reader
+from .reader_training import OverallTraining, ReaderTraining, Valued
+from .scene_graph_builder import Assembly, along_the_widest
 from .schedule import EACH, ENERGY, LIKELIHOOD, OF_GUIDE, READING, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
 from .sites import Site, find_sites
+from .supervised_renders import Label, ValuedRenders, joined
 
 TRIED = 500  # renders that a reader is tried on, and that are drawn at once at most, as they take memory
 ASSEMBLED, MISSED = 200, 400  # renders in which it is seen how objects of a scene go together; what is not found

@@ -22,7 +22,7 @@ from torch import Tensor
 from ..steps import StepTraining
 from .graph import Graph
 from .net import Chosen, Given, ParameterNet
-from .reading.reader import cut_draw
+from .reader import cut_draw
 from .sites import NEAR
 
 ALONE = 0.4  # of the steps, the first ones, take what was read as it is

@@ -16,8 +16,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .graph import Graph
-from .mates import LOGITS, Mates, Ties
 from .mixture import LogisticMixture
+from .sibling_encoder import LOGITS, Mates, Ties
 
 COMPONENTS = 6
 MOST = 40  # ranks and numbers of siblings from here on are one

@@ -21,9 +21,9 @@ from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.generator import Command
 from probscene.model import SceneModel
 from probscene.render_check import check_renderer
-from probscene.renderers.generated import GeneratedRenderer
-from probscene.renderers.meshes import MeshRenderer
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.generator.renderer import GeneratedRenderer
+from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.request import Renderable, Request
 from probscene.scenarios import join
 from probscene.world import World

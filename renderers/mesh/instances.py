@@ -10,9 +10,9 @@ import numpy as np
 from probscene.errors import ModelError
 from probscene.world import World
 
-from . import tables
-from .atlas import MeshAtlas
 from .scenes import MAX_POSITION, Sight, dot, fit, ground_tables, product, scene_table, view
+from .tables import layout
+from .tables.atlas import MeshAtlas
 
 MAX_NODES, MAX_INSTANCES, MAX_SCALE = 32767, 65535, 1e4
 
@@ -88,19 +88,19 @@ def instances(world: World, atlas: MeshAtlas, canvas: tuple[int, int], map_size:
 
     sight = view(world)
     rows = max(1, len(order))
-    whole, real = np.zeros((rows, tables.INTEGERS), np.int64), np.zeros((rows, tables.REALS))
+    whole, real = np.zeros((rows, layout.INTEGERS), np.int64), np.zeros((rows, layout.REALS))
     shadow = _fill(whole, real, placed, sight, canvas, map_size)
     first_surface = 1 + len(world.kinds)
     if len(order):
         kind = world.kind.cpu().numpy()[placed.scene, np.maximum(placed.node, 0)] if M else placed.node
         unknown = (placed.node < 0) | (kind < 0)
-        whole[:, tables.SEMANTIC] = np.where(unknown, len(classes) - 1, 1 + kind)
+        whole[:, layout.SEMANTIC] = np.where(unknown, len(classes) - 1, 1 + kind)
     semantic = {name: first_surface + i for i, name in enumerate(classes[first_surface:-1])}
     drawn = np.zeros((N, M), bool)
     labelled = placed.node >= 0
     drawn[placed.scene[labelled], placed.node[labelled]] = True
     in_sight = np.zeros(max(1, N), np.int64)
-    np.add.at(in_sight, placed.scene, (whole[:, tables.TRIANGLES] * whole[:, tables.SEEN])[: len(order)])
+    np.add.at(in_sight, placed.scene, (whole[:, layout.TRIANGLES] * whole[:, layout.SEEN])[: len(order)])
     return Instances(
         whole=whole.ravel(),
         real=real.ravel(),
@@ -109,7 +109,7 @@ def instances(world: World, atlas: MeshAtlas, canvas: tuple[int, int], map_size:
         first=np.searchsorted(placed.scene, np.arange(N + 1)).astype(np.int32),
         drawn=drawn,
         box=_boxes(placed, sight, N, M),
-        most=(int(whole[:, tables.VERTICES].max()), int(in_sight.max())),
+        most=(int(whole[:, layout.VERTICES].max()), int(in_sight.max())),
     )
 
 
@@ -204,23 +204,23 @@ def _fill(whole, real, placed: Placed, sight: Sight, canvas: tuple[int, int], ma
     sides = np.stack([u + 0.5 * z, (width - 0.5) * z - u, v + 0.5 * z, (height - 0.5) * z - v, z], 1)
     u, v, z = image_at[:, 0], image_at[:, 1], image_at[:, 2]
     sides_at = np.stack([u + 0.5 * z, (width - 0.5) * z - u, v + 0.5 * z, (height - 0.5) * z - v, z], 1)
-    seen = (extent(sides, sides_at)[1] >= [0, 0, 0, 0, tables.NEAR]).all(1)
+    seen = (extent(sides, sides_at)[1] >= [0, 0, 0, 0, layout.NEAR]).all(1)
     last = first + map_size / per_metre
     casts = mapped[scene] & (cast_high >= first[scene]).all(1) & (cast_low <= last[scene]).all(1)
 
     lit[:, :2] *= per_metre[scene][..., None]
     lit_at[:, :2] = (lit_at[:, :2] - first[scene]) * per_metre[scene]
-    whole[:, : tables.CLOSED + 1] = placed.rows
+    whole[:, : layout.CLOSED + 1] = placed.rows
     least, largest = ((across - first[scene]) * per_metre[scene] for across in (cast_low, cast_high))
     reach = np.concatenate([np.floor(least) - 1, largest + 1], 1)
     reach = np.clip(reach, [0, 0, -1, -1], [map_size, map_size, map_size - 1, map_size - 1])
-    whole[:, tables.MAP_BOX : tables.MAP_BOX + 4] = np.where(casts[:, None], reach, [0, 0, -1, -1])
-    whole[:, tables.NODE], whole[:, tables.SEEN], whole[:, tables.CASTS] = placed.node, seen, casts
-    real[:, tables.TO_IMAGE : tables.TO_IMAGE + 12] = np.dstack([image, image_at]).reshape(-1, 12)
-    real[:, tables.TO_MAP : tables.TO_MAP + 12] = np.dstack([lit, lit_at]).reshape(-1, 12)
-    real[:, tables.TO_SUN : tables.TO_SUN + 3] = dot(np.swapaxes(turned, 1, 2), sun[:, 2:]) / scale
-    real[:, tables.UNSCALE : tables.UNSCALE + 3] = 1 / scale
-    real[:, tables.TINT : tables.TINT + 3] = np.clip(placed.tint, 0, 1)
+    whole[:, layout.MAP_BOX : layout.MAP_BOX + 4] = np.where(casts[:, None], reach, [0, 0, -1, -1])
+    whole[:, layout.NODE], whole[:, layout.SEEN], whole[:, layout.CASTS] = placed.node, seen, casts
+    real[:, layout.TO_IMAGE : layout.TO_IMAGE + 12] = np.dstack([image, image_at]).reshape(-1, 12)
+    real[:, layout.TO_MAP : layout.TO_MAP + 12] = np.dstack([lit, lit_at]).reshape(-1, 12)
+    real[:, layout.TO_SUN : layout.TO_SUN + 3] = dot(np.swapaxes(turned, 1, 2), sun[:, 2:]) / scale
+    real[:, layout.UNSCALE : layout.UNSCALE + 3] = 1 / scale
+    real[:, layout.TINT : layout.TINT + 3] = np.clip(placed.tint, 0, 1)
     return mapped, first, per_metre
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from probscene.app.cli import app
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import counts_of_dataset
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 
 DISCS = Path(__file__).with_name("discs.py")
@@ -58,8 +58,8 @@ def _own_cache(tmp_path_factory):
 def _few_images_are_looked_at():
     """By a verdict."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("probscene.app.judging.looked.IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.judge.SCENES", 60)
+        patch.setattr("probscene.app.evaluation.source_features.IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.SCENES", 60)
         yield
 
 

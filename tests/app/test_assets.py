@@ -14,7 +14,7 @@ from PIL import Image
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import folder_digest, load_model, same_assets
 from probscene.errors import DataError, ModelError, RunError
-from probscene.models.assets.catalogue import street
+from probscene.models.assets.things.catalogue import street
 from probscene.sampling import sample
 
 SLAB = "".join(f"v {x} {y} {z}\n" for x in (-0.9, 0.9) for y in (0, 1.5) for z in (-2.2, 2.2)) + (

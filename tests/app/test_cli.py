@@ -12,7 +12,7 @@ from PIL import Image
 
 import probscene
 from probscene.app.cli.options import PresetName
-from probscene.app.fitting import fit
+from probscene.app.fitting import pipeline as fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import OBJECTIVES
 from probscene.app.fitting.presets import PRESETS, QUICK

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from probscene.app import demo as module
-from probscene.app.demo import demo
-from probscene.app.fitting import fit
+from probscene.app.api import demo as module
+from probscene.app.api.demo import demo
+from probscene.app.evaluation import source_features as looked
+from probscene.app.fitting import pipeline as fit
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
-from probscene.app.judging import looked
 from probscene.errors import DataError, ModelError
 
 SHORT = override(

@@ -14,10 +14,10 @@ from PIL import Image
 
 from probscene.app.arguments import range_given
 from probscene.app.fitting import session
-from probscene.app.fitting.fit import open_target
+from probscene.app.fitting.pipeline import open_target
 from probscene.app.fitting.preset import Preset
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.sheet import write_sheet
+from probscene.app.labels.sheet import write_sheet
 from probscene.app.progress import Display
 from probscene.app.trial.jobs import Job
 from probscene.app.trial.sets import read_set

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from probscene.app import progress
 from probscene.app.fitting import session
-from probscene.app.fitting.storage import OTHER, timing
+from probscene.app.fitting.store import OTHER, timing
 from probscene.app.progress import EVERY, STAGES, Display
 
 

@@ -88,7 +88,7 @@ def goes_on(tmp_path, tables, monkeypatch):
     """Checks that a fit with parts of one's own, interrupted in a stage of its log, goes on to the same bytes."""
 
     def check(stage, **options):
-        from probscene.app.fitting import storage as checkpoints
+        from probscene.app.fitting import store as checkpoints
 
         class Interrupted(Exception):
             pass

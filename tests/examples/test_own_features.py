@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import probscene as ps
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import Observer
 from probscene.app.modules import import_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.ahead import ahead
+from probscene.prefetch import ahead
 
 
 @given(st.lists(st.integers(), max_size=12), st.integers(1, 4))

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from probscene.derive import derive_complete
+from probscene.inference.count_penalty import Held
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.holding import Held
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain

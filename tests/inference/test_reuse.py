@@ -14,7 +14,7 @@ from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
-from probscene.inference.reuse import RenderPool
+from probscene.inference.render_cache import RenderPool
 from probscene.model import Groups, SceneModel
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts

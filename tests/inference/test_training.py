@@ -10,7 +10,7 @@ from pyro.infer import SVI
 from pyro.optim.lr_scheduler import PyroLRScheduler
 from torch.optim.lr_scheduler import LambdaLR
 
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import Observer
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features.counting.batches import CountSchedule

@@ -17,9 +17,9 @@ import trimesh
 from PIL import Image
 
 from probscene.errors import DataError
-from probscene.models.assets.catalogue import DECORATION, KINDS, street
 from probscene.models.assets.meshes.folder import SIZES, described, folder
 from probscene.models.assets.meshes.part import decoded, opened
+from probscene.models.assets.things.catalogue import DECORATION, KINDS, street
 
 TO_Y_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # x forward, y left, z up to z forward, x left, y up
 CAR = (4.4, 1.8, 1.5)

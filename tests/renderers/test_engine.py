@@ -10,7 +10,7 @@ import os, torch
 from probscene.drawing import Drawing, Sprites, resolve
 from probscene.errors import ProbsceneError
 from probscene.renderers import engine
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 one = torch.ones(1, 1)
 layer = resolve(Sprites.disc("a", 9 * one, 9 * one, 5 * one), one > 0)
 drawing = Drawing(torch.zeros(1, 1, dtype=torch.int64), ("a",), (layer,))
@@ -60,8 +60,8 @@ from collections import defaultdict
 import numpy as np
 from probscene.mesh import Mesh
 from probscene.photo import Photo
-from probscene.renderers.meshes import MeshRenderer
-from probscene.renderers.photo import photographed
+from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.camera.effects import photographed
 from probscene.world import Camera, Light, Meshes, World, resolve_meshes, resolve_scene
 
 function, called = engine.ti.lang.kernel_impl.Func, defaultdict(set)

@@ -15,9 +15,9 @@ from reference.photo import photographed
 from probscene.drawing import Atlas, Drawing, Sprites, resolve
 from probscene.errors import ModelError
 from probscene.photo import Photo
-from probscene.renderers import photo as photo_module
-from probscene.renderers.meshes import MeshRenderer
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.camera import effects as photo_module
+from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.world import Camera, Light, Meshes, resolve_scene
 
 SEED = st.integers(0, 2**32 - 1)
@@ -263,7 +263,7 @@ import hashlib, sys
 import torch
 from probscene.photo import Photo
 from probscene.renderers import engine
-from probscene.renderers.photo import photographed
+from probscene.renderers.camera.effects import photographed
 from probscene.world import resolve_scene
 if sys.argv[1] == "own":
     engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)

@@ -10,8 +10,8 @@ from reference.sprites import ReferenceRenderer, spread
 from probscene.batch import RenderBatch
 from probscene.drawing import Atlas, Drawing, Layer, Sprites, box, disc, resolve
 from probscene.errors import ModelError
-from probscene.renderers import sprites as sprites_module
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite import renderer as sprites_module
+from probscene.renderers.sprite.renderer import SpriteRenderer
 
 CANVAS = (37, 43)
 RENDERER = SpriteRenderer(CANVAS, threads=1)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from probscene.ahead import ahead
+from probscene.prefetch import ahead
 from probscene.sampling import seed_everything
 
 from ...training import batch_seed

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
@@ -49,18 +48,3 @@ class CountFeatures(Features):
         net.fit_to(renders.object_size())
         draw = partial(renders.draw, beyond_prior=self.schedule.beyond_prior)
         return CountTraining(net, draw, self.schedule, seed=batch_seed(seed, 1))
-
-
-def slow_settings(preset: Any) -> dict[str, Any]:
-    """What suits a network that takes about 20 ms an image on one core where a preset's own takes 1: fewer scenes, each
-    drawn once, and at so noisy a gradient half the step. Marginals, far sharper than the joint density, say of
-    photographs only that they are none. Features come in units of their bandwidth, and the kernel takes them so."""
-    return {
-        "batches": 40,
-        "num_scenes": 150,
-        "draws_per_structure": 1,
-        "learning_rate": min(preset.learning_rate, 5e-3),
-        "marginal_variance": None,
-        "stabilised": False,
-        "variance": None if preset.variance is None else 1.0,
-    }

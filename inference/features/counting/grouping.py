@@ -18,21 +18,6 @@ SHARE = 0.25  # of an ordinary group's votes that a peak must have
 ABSENT = -1.0  # the count of a group that is not there, so that it is none of those that are there and empty
 
 
-def group_of(kind: Tensor, parent: Tensor, group: int) -> Tensor:
-    """The node of kind ``group`` that each node is or belongs to, ``(N, M)`` int64, -1 for none.
-
-    Args:
-        kind, parent: ``(N, M)`` int64 of a derivation.
-    """
-    own = torch.arange(kind.shape[1]).expand_as(kind)
-    found, above = torch.where(kind == group, own, -1), parent
-    while ((found < 0) & (above >= 0)).any():
-        at = above.clamp(min=0)
-        found = torch.where((found < 0) & (above >= 0) & (kind.gather(1, at) == group), above, found)
-        above = torch.where(above >= 0, parent.gather(1, at), above)
-    return found
-
-
 def tally_groups(
     objects: Tensor, surface: Tensor, vote: Tensor, object_vote: Tensor, length: int, mass: float, max_groups: int
 ) -> Tensor:

@@ -22,9 +22,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ...divergence import bandwidth
 from ..base import Examples
 from ..pretrained import AT_ONCE, LAST, EfficientNetLite
-from ..projection import bandwidth
 from .head import KINDS, Head, Maps
 from .readability import rules_for_renders, scopes_without_labels
 from .reading import RULES, SCOPES, Rule, Scope, by_steps, read_all, read_each, whole

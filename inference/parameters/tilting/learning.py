@@ -43,13 +43,13 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
-from ...judging.two_sample import Features
+from ...statistics.two_sample import Features
 from ...training import Report, batch_seed, check_finite, of_prefix
 from ..guide import ParameterGuide
 from ..likelihood import MaximumLikelihood, Values, log_density
 from ..net import ParameterNet
-from ..reading.valued import Label, ValuedRenders, joined
 from ..sites import NEAR, Site, find_sites
+from ..supervised_renders import Label, ValuedRenders, joined
 from .schedule import TiltingSchedule
 
 AT_ONCE = 100  # scenes that are drawn and rendered together

@@ -22,7 +22,7 @@ import numpy as np
 from probscene.errors import DataError
 from probscene.mesh import Mesh
 
-from ..catalogue import DECORATION, KINDS, street
+from ..things.catalogue import DECORATION, KINDS, street
 from .reader import SUFFIXES, Fields, read
 
 

@@ -20,7 +20,7 @@ from ..evaluation.compare import Comparison
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.labels import Labels, read_labels
 from ..evaluation.visible import Visible
-from ..fitting.fit import open_target
+from ..fitting.pipeline import open_target
 from ..fitting.run import RunFolder, is_run
 from ..loading import load_model, renderer_for
 from ..progress import Display

@@ -15,14 +15,14 @@ from probscene.inference.features.base import FeatureNet, Features
 from probscene.model import SceneModel
 
 from ..arguments import checked_seed
+from ..evaluation.list_warnings import tell
 from ..fitting import session
 from ..fitting.overrides import override
-from ..fitting.parts import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
+from ..fitting.plugins import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
 from ..fitting.preset import BOTH, FOR_PHOTOGRAPHS, FOR_RENDERS, STRUCTURE, Preset
 from ..fitting.presets import preset as preset_of
 from ..loading import load_model
 from ..targets import Target
-from ..walls.warn import tell
 from ..workers.cluster import connected
 from ..workers.processes import end_if_starting
 from .calls import display

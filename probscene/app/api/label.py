@@ -14,9 +14,9 @@ from probscene.model import SceneModel
 from ..arguments import checked_seed, positive
 from ..evaluation.estimate import class_counts
 from ..fitting.run import RunFolder, is_run
-from ..labelling.choosing import propose
-from ..labelling.few import FewLabels, read_few
-from ..labelling.sheet import Sheet, check_empty, write_sheet
+from ..labels.partial_labels import FewLabels, read_few
+from ..labels.selection import propose
+from ..labels.sheet import Sheet, check_empty, write_sheet
 from ..loading import load_model
 from ..progress import Display, Progress
 from ..targets import Target, open_images

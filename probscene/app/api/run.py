@@ -18,9 +18,9 @@ from ..datasets.generate import Dataset
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.labels import Labels
 from ..files import make_folder
-from ..fitting.parts import GuideMaker, Parts, as_divergence, as_features, as_guide_maker
+from ..fitting.plugins import GuideMaker, Parts, as_divergence, as_features, as_guide_maker
 from ..fitting.run import RunFolder
-from ..fitting.storage import check_free
+from ..fitting.store import check_free
 from ..targets import Target
 from . import calls
 

@@ -74,13 +74,13 @@ def fit(
     from rich.console import Console
 
     from ..api.fit import chosen_preset, preset_for_photographs, with_learn
-    from ..evaluation.judge import judge
+    from ..evaluation.diagnose import judge
+    from ..evaluation.list_warnings import tell
     from ..fitting import session
-    from ..fitting.fit import open_target
+    from ..fitting.pipeline import open_target
     from ..loading import split_reference
     from ..progress import Display
     from ..views.verdict_text import show_parts
-    from ..walls.warn import tell
     from ..workers.cluster import connected
 
     if seed is not None:
@@ -145,7 +145,7 @@ def demo(
     no_cache: NoCache = False,
 ) -> None:
     """The whole path on handwritten digits that come with the install; about a quarter of an hour on two cores."""
-    from ..demo import demo
+    from ..api.demo import demo
 
     demo(out, checked_seed(seed), cache=cache, use_cache=not no_cache)
 

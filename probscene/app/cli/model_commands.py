@@ -21,13 +21,14 @@ def check(
     """Say whether a model's grammar is sound and its program runs, what can be seen of it, and what to mend."""
     from ..checking.generator_check import check_generator
     from ..checking.model_check import check_model
+    from ..fitting.presets import images_drawn
     from ..loading import load_model
 
     loaded, again = load_model(model, assets), load_model(model, assets)
     report = check_model(loaded, again=again)
     print(report)
     if render and not report.faults:
-        found = check_generator(loaded)
+        found = check_generator(loaded, images_drawn())
         print(found)
         if found.fault:
             raise ModelError(found.fault)

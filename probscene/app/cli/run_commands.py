@@ -100,7 +100,7 @@ def evaluate(
     from rich.console import Console
 
     from ..arguments import number_or_all, range_given
-    from ..evaluation import judge as verdict
+    from ..evaluation import diagnose as verdict
     from ..evaluation.evaluate import evaluate
     from ..evaluation.labels import read_labels
     from ..files import make_folder, write_json

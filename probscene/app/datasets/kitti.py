@@ -38,7 +38,7 @@ from probscene.batch import RenderBatch
 from probscene.errors import ProbsceneError
 from probscene.model import SceneModel
 
-from ..labelling.kitti import TYPES
+from ..labels.kitti import TYPES
 from .coco import labelled
 
 MOST = 255  # classes, and instances of a class: 8 bits each

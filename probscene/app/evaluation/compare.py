@@ -15,10 +15,10 @@ import numpy as np
 import probscene
 from probscene.dataset import Images
 from probscene.errors import ProbsceneError, RunError
-from probscene.inference.judging.metrics import Shares, histogram, pooled_shares, total_variation, wasserstein
-from probscene.inference.judging.tally import Tally
+from probscene.inference.statistics.metrics import Shares, histogram, pooled_shares, total_variation, wasserstein
+from probscene.inference.statistics.tally import Tally
 
-from ..fitting.fit import Progress
+from ..fitting.pipeline import Progress
 from ..fitting.run import RunFolder
 from ..loading import drawn_alike
 from .evaluate import Evaluation, network_counts, renders_read

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.inference.judging.tally import Interval, around, resamples
+from probscene.inference.statistics.tally import Interval, around, resamples
 
 from .structure_counts import Counts
 

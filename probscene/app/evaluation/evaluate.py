@@ -23,23 +23,23 @@ import torch
 import probscene
 from probscene.dataset import Images
 from probscene.errors import ProbsceneError
-from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation, wasserstein
-from probscene.inference.judging.tally import Tally
+from probscene.inference.statistics.metrics import histogram, pooled_shares, total_variation, wasserstein
+from probscene.inference.statistics.tally import Tally
 from probscene.policy import Policy
 
-from ..fitting.fit import Progress
+from ..fitting.pipeline import Progress
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, features_of, kept_features, own_net
-from ..labelling.boxes import Boxes
-from ..walls.inexpressible import Inexpressible, inexpressible
-from ..walls.piled import Piled, piled, sentences
+from ..labels.boxes import Boxes
 from .count_errors import CountErrors, count_errors
 from .estimate import class_counts, counted_classes, estimated
 from .image_distances import IMAGES, Distances, image_distances
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
+from .saturated_lists import Piled, piled, sentences
 from .sources import ESTIMATE, FITTED, LEARNT, READ, Source, before
 from .structure_counts import Relation
+from .unreachable_counts import Inexpressible, inexpressible
 from .visible import Visible, counted, number_of, seen_by, whole_note
 
 IN_RENDERS = 1000  # renders of each source, at most, that the network reads

@@ -26,7 +26,7 @@ from ..fitting.scene_features import features_in, features_of, network
 from .sources import LEARNT, before
 
 if TYPE_CHECKING:
-    from probscene.inference.judging.image_metrics import Figure
+    from probscene.inference.statistics.image_metrics import Figure
 
 IMAGES = 1000
 MORE = 4  # generated images for each one of the target; of further ones KID's interval hardly gets narrower
@@ -58,7 +58,7 @@ def image_distances(
         raise ProbsceneError(f"Expected at least 2 images to compare, actual {num}.")
     if len(target) < 4:
         raise DataError(f"Expected at least 4 images in {target.path} for KID and FID, actual {len(target)}.")
-    from probscene.inference.judging.image_metrics import fid, kid  # torchmetrics takes seconds to import
+    from probscene.inference.statistics.image_metrics import fid, kid  # torchmetrics takes seconds to import
 
     nets = [network(choice, run) for choice in choices]
     L, half = len(target), len(target) // 2

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.inference.judging.nearness import Word
-from probscene.inference.judging.two_sample import JUDGED
-from probscene.inference.judging.verdict import Verdict
+from probscene.inference.statistics.residual import Word
+from probscene.inference.statistics.two_sample import JUDGED
+from probscene.inference.statistics.verdict import Verdict
 
 from .sources import Source
 

@@ -21,11 +21,11 @@ from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
-from ..labelling.boxes import Boxes, read_boxes
-from ..labelling.counts import read_table
-from ..labelling.naming import Entry, match_target
-from ..labelling.reading import has_boxes
-from ..labelling.text import text_of
+from ..labels.boxes import Boxes, read_boxes
+from ..labels.counts import read_table
+from ..labels.naming import Entry, match_target
+from ..labels.reading import has_boxes
+from ..labels.text import text_of
 from .structure_counts import Counts, StructureCounts, count
 
 SEEN = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."

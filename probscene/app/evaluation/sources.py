@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.inference.judging.metrics import Histogram, histogram_interval, pooled_shares_interval
-from probscene.inference.judging.tally import Tally, resamples, tally_images
+from probscene.inference.statistics.metrics import Histogram, histogram_interval, pooled_shares_interval
+from probscene.inference.statistics.tally import Tally, resamples, tally_images
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import PerParent

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.inference.judging.tally import Tally, tally, tally_images
+from probscene.inference.statistics.tally import Tally, tally, tally_images
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import PerParent, per_parent, relations

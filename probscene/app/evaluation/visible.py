@@ -19,7 +19,7 @@ from probscene.policy import Policy
 
 from ..chunks import CHUNK, draw_chunk
 from ..datasets.coco import labelled
-from ..fitting.storage import Storage
+from ..fitting.store import Storage
 from ..loading import renderer_for
 from .labels import Labels
 from .structure_counts import Counts, StructureCounts, sampled

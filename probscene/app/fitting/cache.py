@@ -19,9 +19,9 @@ from probscene.inference.features.base import FeatureNet
 
 from ..files import make_folder, write_text
 from ..loading import assets_folder, folder_digest
-from .parts import IN_MEMORY, is_file_part
+from .plugins import IN_MEMORY, is_file_part
 from .run import RunFolder
-from .storage import load_tensors, save_tensors, state_of
+from .store import load_tensors, save_tensors, state_of
 
 
 class Cached(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from probscene.errors import ProbsceneError
 from probscene.inference.objective import BASELINES
 
-from .parts import lasting_word
+from .plugins import lasting_word
 from .preset import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, TILTING, Preset
 
 CHOICES = {

@@ -17,7 +17,7 @@ from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.schedule import ParameterSchedule
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 
-from .parts import IN_MEMORY, CheckedDivergence, as_divergence, as_features, is_file_part, load_part
+from .plugins import IN_MEMORY, CheckedDivergence, as_divergence, as_features, is_file_part, load_part
 
 FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
 TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, PRESENCE, PRESENCE_COUNTS)  # on the prior's renders

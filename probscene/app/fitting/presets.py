@@ -92,6 +92,12 @@ def preset(name: str) -> Preset:
     return PRESETS[name]
 
 
+def images_drawn() -> dict[str, int]:
+    """About how many images a fit has drawn, by preset."""
+    on_photographs = {"quick with count=efficientnet": QUICK.with_features("count=efficientnet")}
+    return {name: preset.images for name, preset in (PRESETS | on_photographs).items()}
+
+
 def takers_of_labels() -> list[str]:
     """The words for features that can make use of labels."""
     names = (*TRAINED, *PRETRAINED)

@@ -16,12 +16,12 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 
 from ..files import make_folder, write_json, write_whole
-from ..labelling.few import FewLabels
+from ..labels.partial_labels import FewLabels
 from ..loading import BUILT_IN, assets_record, lasting_reference, load_model, recorded_model, split_reference
 from ..modules import file_digest
 from ..neighbours import neighbours
-from .learnt.parameters import apart, with_parameters
-from .parts import (
+from .parameter_stage import apart, with_parameters
+from .plugins import (
     IN_MEMORY,
     CheckedDivergence,
     CheckedNet,
@@ -34,7 +34,7 @@ from .parts import (
     part_file,
 )
 from .preset import Preset
-from .storage import FORMAT, Storage, check_free, load_state, read_record
+from .store import FORMAT, Storage, check_free, load_state, read_record
 
 WHOLE_MODEL = "model"  # folder
 PRIOR_KEPT = "prior_kept"  # the only tensor of a guide that was given up

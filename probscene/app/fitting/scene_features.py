@@ -14,14 +14,14 @@ from probscene.dataset import Images
 from probscene.errors import RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
-from probscene.inference.judging.support import outside
+from probscene.inference.statistics.domain_shift import outside
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.threads import threads
 
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..loading import renderer_for
-from .observer import RENDERED_AT_ONCE
+from .rendered_features import RENDERED_AT_ONCE
 from .run import RunFolder
 
 RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``unlike`` judges

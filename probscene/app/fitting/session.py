@@ -23,20 +23,20 @@ from probscene.threads import default_threads
 from ..checking.generator_check import cost
 from ..checking.model_check import QUICK, check_model
 from ..files import write_json
-from ..labelling.few import FewLabels, labels_record, read_few
+from ..labels.partial_labels import FewLabels, labels_record, read_few
 from ..loading import drawn_with, folder_digest, lasting_reference, load_model, split_reference
 from ..modules import file_digest, module_digests
 from ..neighbours import neighbours
 from ..progress import Display
 from ..targets import Target, lasting_target, open_images, say_notes
 from ..workers.cluster import Cluster
-from .fit import check_target, fit, open_target
-from .parts import Parts, in_memory, is_file_part, part_file
+from .pipeline import check_target, fit, open_target
+from .plugins import Parts, in_memory, is_file_part, part_file
 from .preset import Preset
 from .presets import takers_of_labels
 from .run import RunFolder
 from .scene_features import UNLIKE, unlike
-from .storage import OTHER, TIMING, check_free, timing
+from .store import OTHER, TIMING, check_free, timing
 
 BEFORE = ("reading", "likeness", "looking", "features", "readings", "target", "pretraining")
 STAGES = (*BEFORE, "structure", "parameters", "structure-again", "outcome")
@@ -94,7 +94,7 @@ def begin(
     check_target(images)
     if photographs is not None:
         preset = _suited(preset, photographs, loaded, images, labels is not None, show)
-    if told := cost(loaded, preset):
+    if told := cost(loaded, preset.images):
         show.say(told)
     files = {part_file(word) for word in (preset.features, preset.objective, preset.guide) if is_file_part(word)}
     record = {
@@ -119,7 +119,7 @@ def begin(
         record["labels"] = labels_record(labels)
         check_takes_labels(run.features)
         few = read_few(labels, loaded, images)
-        say_notes(few, show)
+        say_notes(few.notes, show)
     seed_everything(batch_seed(seed, 0))
     net = run.build_network()
     if is_file_part(preset.guide) or (parts is not None and parts.guide is not None):
@@ -200,7 +200,7 @@ def resume(
                 "by now, name that folder with --target."
             )
         images = open_target(run, show)
-        say_notes(images, show)
+        say_notes(images.notes, show)
     run.few = _same_labels(run, images)
     return run, images
 

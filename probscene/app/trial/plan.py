@@ -19,7 +19,7 @@ import numpy as np
 
 from probscene.errors import DataError, ProbsceneError
 
-from ..labelling.naming import composed
+from ..labels.naming import composed
 from .sets import Example, LabelledSet
 
 REAL = "real"

@@ -20,11 +20,11 @@ from probscene.decoding import quiet, read, stored
 from probscene.errors import DataError
 from probscene.image_bytes import Fault
 
-from ..labelling.annotations import Annotated, Annotation
-from ..labelling.kitti import DONT_CARE, TYPES, class_of
-from ..labelling.naming import composed, matched
-from ..labelling.reading import read_annotations
-from ..labelling.yolo import images_beside
+from ..labels.annotations import Annotated, Annotation
+from ..labels.kitti import DONT_CARE, TYPES, class_of
+from ..labels.naming import composed, matched
+from ..labels.reading import read_annotations
+from ..labels.yolo import images_beside
 
 Progress = Callable[[int, int], None]
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.textpath import TextPath
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from probscene.inference.judging.metrics import Histogram
+from probscene.inference.statistics.metrics import Histogram
 
 from ..evaluation.evaluate import Evaluation
 from .tables import nested_counts

@@ -20,16 +20,16 @@ from probscene.sampling import sample
 from probscene.threads import threads
 
 from ..chunks import chunk_randomness
+from ..evaluation.diagnose import Judged, judge
 from ..evaluation.evaluate import Evaluation, evaluate
-from ..evaluation.judge import Judged, judge
 from ..evaluation.labels import read_labels
+from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
 from ..evaluation.sources import ESTIMATE, READ, START
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
-from ..fitting.fit import open_target
+from ..fitting.pipeline import open_target
 from ..fitting.run import RunFolder
-from ..fitting.storage import OTHER, timing
-from ..judging.looked import LEARNT, PRIOR, STRUCTURE, policies
+from ..fitting.store import OTHER, timing
 from ..pictures import Pixels, grid, pixels, shrunk
 from ..progress import STAGES, Display
 from . import charts, tables, verdict_text

@@ -9,8 +9,8 @@ from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 
-from probscene.inference.judging.metrics import Histogram, histogram_interval, ranges
-from probscene.inference.judging.tally import Interval, Tally
+from probscene.inference.statistics.metrics import Histogram, histogram_interval, ranges
+from probscene.inference.statistics.tally import Interval, Tally
 
 from ..evaluation.compare import Comparison, Row
 from ..evaluation.evaluate import Evaluation

@@ -7,13 +7,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from probscene.inference.judging.trust import Trust
-from probscene.inference.judging.two_sample import Apart
-from probscene.inference.judging.verdict import Gap
+from probscene.inference.statistics.trust import Trust
+from probscene.inference.statistics.two_sample import Apart
+from probscene.inference.statistics.verdict import Gap
 
-from ..evaluation.judge import Judged
-from ..judging.aspects import ABSENT
-from ..judging.looked import LEARNT, PRIOR, STRUCTURE
+from ..evaluation.components import ABSENT
+from ..evaluation.diagnose import Judged
+from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE
 
 HEAD = ("", "this fit", "the floor")
 FLOOR = "The floor is what chance alone leaves between two halves of the real images."

@@ -19,7 +19,7 @@ from typing import Any, Self
 from probscene.errors import MachineError, ProbsceneError
 from probscene.threads import cores
 
-from .crew import Crew, first_line
+from .actor_pool import Crew, first_line
 
 AUTO = "auto"
 CONNECT = 10.0  # seconds

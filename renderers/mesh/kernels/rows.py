@@ -2,7 +2,7 @@
 
 from ...engine import ti
 from ...kernels.lanes import LANES, SHIFT, floats, high, whole, words
-from .. import tables
+from ..tables import layout
 from . import shading
 from .raster import LEAST
 from .shading import nearness, record_of
@@ -68,12 +68,12 @@ def clear(at: i32, count: i32, seen: ti.template()):
 @ti.func
 def name_run(first: i32, last: i32, column: i32, row: i32, node: i32, result: ti.template()):
     """Pixels ``first`` to ``last`` from a column on are a node's."""
-    t = node * tables.RESULTS
-    result[t + tables.BOX] = ti.min(result[t + tables.BOX], column + first)
-    result[t + tables.BOX + 1] = ti.min(result[t + tables.BOX + 1], row)
-    result[t + tables.BOX + 2] = ti.max(result[t + tables.BOX + 2], column + last)
-    result[t + tables.BOX + 3] = row + i32(1)
-    result[t + tables.PIXELS] = result[t + tables.PIXELS] + last - first
+    t = node * layout.RESULTS
+    result[t + layout.BOX] = ti.min(result[t + layout.BOX], column + first)
+    result[t + layout.BOX + 1] = ti.min(result[t + layout.BOX + 1], row)
+    result[t + layout.BOX + 2] = ti.max(result[t + layout.BOX + 2], column + last)
+    result[t + layout.BOX + 3] = row + i32(1)
+    result[t + layout.PIXELS] = result[t + layout.PIXELS] + last - first
 
 
 @ti.func

@@ -196,7 +196,7 @@ def test_a_fit_of_objects_goes_on_with_them(quick, discs, target, tmp_path, monk
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
         patch.setattr(
-            "probscene.app.fitting.learnt.structure.pretrain", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt)
+            "probscene.app.fitting.structure_stage.pretrain", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt)
         )
         with pytest.raises(KeyboardInterrupt):
             quick(model, images, features=Means(), out=out)

@@ -18,7 +18,7 @@ from PIL import Image
 from probscene.app.chunks import CHUNK
 from probscene.app.datasets import coco, kitti
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.labelling.boxes import read_boxes
+from probscene.app.labels.boxes import read_boxes
 from probscene.app.loading import load_model
 from probscene.batch import RenderBatch, Space
 from probscene.dataset import ImageFolder

@@ -22,7 +22,7 @@ from probscene.app.evaluation.labels import Labels, counts_of_dataset
 from probscene.app.evaluation.sources import Source
 from probscene.app.evaluation.structure_counts import StructureCounts, sampled
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.counts import read_table, write_counts
+from probscene.app.labels.counts import read_table, write_counts
 from probscene.app.loading import load_model
 from probscene.app.views.comparison import draw
 from probscene.app.views.tables import show

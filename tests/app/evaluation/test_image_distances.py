@@ -11,7 +11,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import features_in, features_of, own_net
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.judging.image_metrics import fid, kid
+from probscene.inference.statistics.image_metrics import fid, kid
 
 
 @pytest.fixture(scope="module")

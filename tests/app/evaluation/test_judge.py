@@ -12,20 +12,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation import judge as verdict
+from probscene.app.evaluation import diagnose as verdict
+from probscene.app.evaluation.diagnose import judge
 from probscene.app.evaluation.evaluate import evaluate
-from probscene.app.evaluation.judge import judge
 from probscene.app.evaluation.label_agreement import DISAGREE, agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features import pretrained
-from probscene.inference.judging.nearness import Word, worst
-from probscene.inference.judging.verdict import Verdict
+from probscene.inference.statistics.residual import Word, worst
+from probscene.inference.statistics.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
 
 IMAGES, SCENES = 200, 300

@@ -19,7 +19,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model, renderer_for
 from probscene.dataset import ImageFolder
 from probscene.errors import ProbsceneError, RunError
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
 
 CLASSES = ("red", "blue")
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from probscene.app.fitting.learnt import judged
+from probscene.app.fitting import site_selection as judged
 
 
 def rows(mean, number):

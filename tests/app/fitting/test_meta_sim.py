@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from probscene.app.fitting import storage
-from probscene.app.fitting.learnt import judged
+from probscene.app.fitting import site_selection as judged
+from probscene.app.fitting import store as storage
 from probscene.app.fitting.preset import Preset
 from probscene.app.fitting.run import RunFolder
-from probscene.inference.judging.farther import Farther
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
+from probscene.inference.statistics.bootstrap_test import Farther
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"steps": 4, "scenes": 6, "values": 10, "rate": 0.05, "feature_size": 96, "images": 20, "hidden": 8}

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import Observer
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.sampling import sample, seed_everything

@@ -5,8 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fitting.learnt.outcome import _said, _worse_said, moved, worse_than_labels
-from probscene.app.labelling.few import FewLabels
+from probscene.app.fitting.outcome import _said, _worse_said, moved, worse_than_labels
+from probscene.app.labels.partial_labels import FewLabels
 
 N = 500
 

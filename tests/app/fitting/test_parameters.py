@@ -12,14 +12,15 @@ from pyro.util import get_rng_state, set_rng_state
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.fitting import storage
-from probscene.app.fitting.learnt import judged, parameters, structure
+from probscene.app.fitting import parameter_stage as parameters
+from probscene.app.fitting import site_selection as judged
+from probscene.app.fitting import store as storage
+from probscene.app.fitting import structure_stage as structure
 from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
-from probscene.inference.judging.farther import Farther
-from probscene.inference.parameters import learning
-from probscene.inference.parameters.reading import reader, skill
+from probscene.inference.parameters import learning, reader, skill
+from probscene.inference.statistics.bootstrap_test import Farther
 from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
 from probscene.structure import StructurePrior, counts

@@ -8,15 +8,15 @@ import safetensors.torch
 import torch
 from torchvision.models import inception_v3
 
-from probscene.app.evaluation.judge import judge
+from probscene.app.evaluation.diagnose import judge
 from probscene.app.fitting.presets import QUICK, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import own_net
 from probscene.dataset import ImageFolder
 from probscene.errors import RunError
+from probscene.inference.divergence import SHARE
 from probscene.inference.features.base import embed_all
 from probscene.inference.features.photographs import readability
-from probscene.inference.features.projection import SHARE
 
 FEW = {"batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
 WORDS = ["--preset", "quick", "--threads", "1", "--no-verdict"]

@@ -9,7 +9,7 @@ import torch
 
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
-from probscene.app.fitting.storage import check_free
+from probscene.app.fitting.store import check_free
 from probscene.errors import DataError, MachineError, RunError
 from probscene.inference.guides.lstm import GUIDES, make_guide
 

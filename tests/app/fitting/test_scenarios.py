@@ -11,7 +11,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.evaluation.labels import counts_of_dataset
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.errors import ModelError
 from probscene.inference.guides.scenario import ScenarioGuide

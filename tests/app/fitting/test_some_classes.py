@@ -10,7 +10,7 @@ from probscene.app.evaluation.structure_counts import sampled
 from probscene.app.fitting.run import RunFolder
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
-from probscene.inference.judging.metrics import histogram, total_variation
+from probscene.inference.statistics.metrics import histogram, total_variation
 
 RED, BLUE = 0, 1
 

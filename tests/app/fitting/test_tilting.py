@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from probscene.app.fitting import storage
-from probscene.app.fitting.learnt import judged
+from probscene.app.fitting import site_selection as judged
+from probscene.app.fitting import store as storage
 from probscene.app.fitting.preset import Preset
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
-from probscene.inference.judging.farther import Farther
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.tilting import learning
+from probscene.inference.statistics.bootstrap_test import Farther
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"rounds": 3, "first": 50, "scenes": 20, "steps": 4, "images": 20}

@@ -17,8 +17,8 @@ import torch
 
 from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
-from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import pool_for
+from probscene.renderers.generator.renderer import GeneratedRenderer
 
 SCENES = 24
 

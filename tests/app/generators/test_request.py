@@ -15,7 +15,7 @@ from probscene.app.loading import load_model, renderer_for
 from probscene.derive import derive_complete
 from probscene.errors import ModelError
 from probscene.model import scene_model
-from probscene.renderers.generated import GeneratedRenderer
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.request import Objects
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.scenarios import join

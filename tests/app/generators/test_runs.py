@@ -19,13 +19,13 @@ from probscene.app.datasets.generate import generate, generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.datasets.scene_dataset import SceneDataset
 from probscene.app.fitting.overrides import override
-from probscene.app.fitting.presets import PRESETS, preset
+from probscene.app.fitting.presets import PRESETS, images_drawn, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.errors import DataError, GeneratorError, ModelError, ProbsceneError, RunError
 from probscene.generator import Command
-from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import pool_for
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.sampling import sample
 
 HERE = Path(__file__).parent
@@ -142,7 +142,7 @@ def test_a_command_is_checked(settings, said):
 
 
 def test_the_check_draws_again_in_another_order(model, call):
-    report = check_generator(model)
+    report = check_generator(model, images_drawn())
     assert report.differs == () and not report.fault and report.seconds > 0
     told = call("check", HERE / "boxes.py", "--render")
     assert told.code == 0 and "by fresh processes and in another order: the same bytes" in told.out
@@ -152,13 +152,13 @@ def test_the_check_draws_again_in_another_order(model, call):
         drawn.append(scene)
         return {"image": np.full((32, 40, 3), len(drawn), np.uint8), "instance": np.zeros((32, 40), int)}
 
-    assert "another image" in check_generator(replace(model, generator=counting)).fault
+    assert "another image" in check_generator(replace(model, generator=counting), images_drawn()).fault
     with pytest.raises(ModelError, match="Expected a model with a generator, actual 'multi_mnist'"):
-        check_generator(load_model("multi_mnist"))
+        check_generator(load_model("multi_mnist"), images_drawn())
     assert all(f"{name} " in str(report) for name in PRESETS)
     command = replace(model.generator, files=(HERE / "none.png",))
     with pytest.raises(DataError, match="none.png.*take it out of files="):
-        check_generator(replace(model, generator=command))
+        check_generator(replace(model, generator=command), images_drawn())
 
 
 def test_the_page_says_what_a_fit_has_drawn():
@@ -183,28 +183,30 @@ def test_a_generator_may_say_that_it_is_not_reproducible(copied, model, tmp_path
     script = copied.with_name("draw_boxes.py")
     script.write_text(script.read_text().replace("random.Random(scene.seed)", "random.Random()"))
     command = Command([sys.executable, str(script)])
-    assert "another image" in check_generator(replace(model, generator=command)).fault
+    assert "another image" in check_generator(replace(model, generator=command), images_drawn()).fault
     kept = replace(command, keep=tmp_path / "kept")
     GeneratedRenderer(kept, model.canvas)(sample(model, model.prior, 2).drawing)
-    assert "another image" in check_generator(replace(model, generator=kept)).fault  # not those that are kept
-    open_ = check_generator(replace(model, generator=replace(command, reproducible=False)))
+    assert (
+        "another image" in check_generator(replace(model, generator=kept), images_drawn()).fault
+    )  # not those that are kept
+    open_ = check_generator(replace(model, generator=replace(command, reproducible=False)), images_drawn())
     assert not open_.fault and "no image can be made again" in str(open_)
 
 
 def test_hours_are_told_before_a_fit(model, monkeypatch):
     measured = "probscene.app.checking.generator_check._drawn"
     monkeypatch.setattr(measured, lambda *args: (0.001, []))
-    assert not cost(model, preset("quick"))
+    assert not cost(model, preset("quick").images)
     monkeypatch.setattr(measured, lambda *args: (1.2, []))
-    told = cost(replace(model, generator=replace(model.generator, workers=2)), preset("quick"))
+    told = cost(replace(model, generator=replace(model.generator, workers=2)), preset("quick").images)
     assert "needs" in told and " h (1.2e+03 ms an image, 2 at once)" in told
-    assert not cost(load_model("multi_mnist"), preset("quick"))
+    assert not cost(load_model("multi_mnist"), preset("quick").images)
 
 
 def test_telling_the_hours_leaves_the_workers_at_work(model):
     GeneratedRenderer(model.generator, model.canvas)(sample(model, model.prior, 4).drawing)
     before = pool_for(model.generator, 1).processes()
-    cost(model, preset("quick"))
+    cost(model, preset("quick").images)
     assert before and set(before) <= set(pool_for(model.generator, 1).processes())
 
 

@@ -16,8 +16,8 @@ from probscene.app.api.fit import fit
 from probscene.app.datasets import generate as datasets
 from probscene.app.datasets.generate import _actor, generate
 from probscene.app.fitting.run import RunFolder
+from probscene.app.workers import actor_pool as crews
 from probscene.app.workers import cluster as clusters
-from probscene.app.workers import crew as crews
 from probscene.app.workers.cluster import Cluster
 from probscene.errors import MachineError, ModelError, ProbsceneError
 from probscene.generator import Command

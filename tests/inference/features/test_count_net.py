@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene import load_model
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import Observer
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import enter
 from probscene.inference.features.counting.batches import FEWEST, FULL, CountBatches, CountSchedule, cells

@@ -9,14 +9,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fitting.observer import Observer
-from probscene.derivation import Derivation
+from probscene.app.fitting.rendered_features import Observer
+from probscene.derivation import Derivation, group_of
 from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.inference.features.counting.batches import CountSchedule, object_targets
-from probscene.inference.features.counting.grouping import ABSENT, group_of, tally_groups
+from probscene.inference.features.counting.grouping import ABSENT, tally_groups
 from probscene.inference.features.counting.net import STRIDE, CountNet
 from probscene.inference.features.counting.training import CountTraining
 from probscene.model import Groups, SceneModel

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from probscene.errors import ProbsceneError, RunError
-from probscene.inference.divergence import KDELogRatio
-from probscene.inference.features.projection import SHARE, Projected, bandwidth, discriminant, self_share
+from probscene.inference.divergence import SHARE, KDELogRatio, bandwidth, self_share
+from probscene.inference.features.projection import Projected, discriminant
 
 
 def pairs(number, dimensions=12, structures=3, noise=0.3, seed=0):

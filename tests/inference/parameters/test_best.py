@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from probscene.inference.parameters.best import Best, HeldOut, useless
+from probscene.inference.parameters.checkpoint_selection import Best, HeldOut, useless
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.sites import find_sites, quantiles_of
 from probscene.sampling import sample, seed_everything

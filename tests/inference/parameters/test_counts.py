@@ -3,9 +3,9 @@
 import torch
 
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.parameters.reading.counts import ReaderCounts, of_counts
-from probscene.inference.parameters.reading.eyes import RenderEye
-from probscene.inference.parameters.reading.reader import Reader
+from probscene.inference.parameters.backbone import RenderEye
+from probscene.inference.parameters.reader import Reader
+from probscene.inference.parameters.reader_counts import ReaderCounts, of_counts
 
 CLASSES = ("red", "blue", "green")
 

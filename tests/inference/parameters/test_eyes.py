@@ -7,9 +7,9 @@ import torch
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.features.photographs.heads import PretrainedCountNet
 from probscene.inference.features.presence import PresenceNet
-from probscene.inference.parameters.reading.eyes import WIDTH, Eye, RenderEye, cell_colours
-from probscene.inference.parameters.reading.reader import Reader
-from probscene.inference.parameters.reading.training import ReaderTraining
+from probscene.inference.parameters.backbone import WIDTH, Eye, RenderEye, cell_colours
+from probscene.inference.parameters.reader import Reader
+from probscene.inference.parameters.reader_training import ReaderTraining
 
 CLASSES = ("red", "blue")
 

@@ -9,11 +9,11 @@ from pyro import poutine
 from pyro.infer import SVI, Predictive, Trace_ELBO
 from pyro.optim import Adam
 
-from probscene.inference.parameters import mates as module
+from probscene.inference.parameters import sibling_encoder as module
 from probscene.inference.parameters.graph import Graph, Seen
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.likelihood import Values, log_density
-from probscene.inference.parameters.mates import Mates
+from probscene.inference.parameters.sibling_encoder import Mates
 from probscene.inference.parameters.sites import Site, find_sites, of_scenes, quantiles_of, site_name
 from probscene.sampling import run_program, sample, seed_everything
 

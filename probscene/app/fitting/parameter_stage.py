@@ -1,0 +1,197 @@
+"""The stage of a fit that learns parameters, and what a run keeps of it.
+
+``parameters.json`` says of each site whether it is learnt, and why not. The learnt network is kept with the guide, so
+that one digest is of both. Axis letters: L images, C H W.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from probscene.dataset import Images
+from probscene.inference.features.base import FeatureNet
+from probscene.inference.guides.base import Guide
+from probscene.inference.parameters.backbone import Eye, RenderEye
+from probscene.inference.parameters.guide import ParameterGuide
+from probscene.inference.parameters.learning import ParameterLearning
+from probscene.inference.parameters.meta_sim.transform import ParameterTransform
+from probscene.inference.parameters.reader_counts import of_counts
+from probscene.inference.parameters.sites import Site
+from probscene.inference.training import Training, batch_seed
+from probscene.policy import Policy
+from probscene.sampling import seed_everything
+from probscene.scenarios import JointGrammar
+
+from ..progress import Progress
+from .image_level import WholeLearning, meta_sim_learning, sites_record, tilting_learning
+from .plugins import inner
+from .preset import LIKELIHOOD, META_SIM
+from .rendered_features import Observer
+from .site_selection import held_out, judged, settling
+from .store import Keeper
+
+if TYPE_CHECKING:
+    from .run import RunFolder
+
+NAME = "parameters"  # of the file with the record, and before the names of tensors beside a guide's
+READER = "reader"  # of the file with what finds objects, until structure was learnt again
+HELD = 5  # one image of the target in so many is not learnt from, and judges
+JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and where these are too few to tell which sites are learnt
+
+
+def learn_parameters(
+    run: "RunFolder",
+    observer: Observer,
+    net: FeatureNet,
+    guide: Guide,
+    images: Callable[[], Images],
+    progress: Progress,
+    say: Callable[[str], None],
+) -> None:
+    """Learn the parameters of the model's sites; from now on the guide's scenes have them, where they are kept.
+
+    Args:
+        net: what structure was learnt by.
+        guide: of the structures; its scenes are rendered.
+        images: opens the target.
+        say: is told which sites were learnt.
+
+    Raises:
+        ProbsceneError: a loss is no longer finite.
+    """
+    seed_everything(batch_seed(run.record["seed"], 5))
+    eye, method = Eye.of(inner(net)), run.preset.parameter_method
+    by_reading, joint = method == LIKELIHOOD, method == META_SIM and isinstance(run.model.grammar, JointGrammar)
+    if joint or (by_reading and eye is None):
+        who = "models of several scenarios are" if joint else f"{run.features.name} features are"
+        say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
+        return
+    kept = run.read_tensors(NAME)
+    if kept is None:
+        target = images()
+        held = torch.arange(len(target)) % HELD == HELD - 1
+        if by_reading and eye is not None:
+            learning = ParameterLearning(
+                run.model,
+                guide,
+                eye,
+                observer.labelled,
+                cache(lambda: _some(target, ~held, run.preset.parameters.images)),
+                run.preset.parameters,
+                batch_seed(run.record["seed"], 5),
+                held_out(run, guide, _some(target, held, JUDGED)),
+                settling(run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED)),
+            )
+        elif method == META_SIM:
+            learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
+        else:
+            learning = tilting_learning(run, observer, guide, _some(target, ~held, run.preset.tilting.images))
+        keep = Keeper(run, NAME, learning)
+
+        def each(training: Training, line: dict[str, float]) -> None:
+            keep({"stage": NAME, "step": training.done, **line})
+            progress(NAME, training.done, training.total, f"loss {line['loss']:.3f}")
+
+        learning.run(each)
+        keep.finish()
+        if isinstance(learning, ParameterLearning) and isinstance(eye, RenderEye):
+            run.write_tensors(READER, of_counts(learning.tried.reader))
+        kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
+        judges = _some(target, held, JUDGED), lambda: _some(target, held, DOUBTFUL)
+        run.write_parameters(_record(run, guide, learning, *judges))
+        run.write_tensors(NAME, kept)
+        (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
+    say(_said(run.parameters))
+    with_parameters(run, guide, beside(kept))
+
+
+def beside(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors of learnt parameters under the names that they have beside a guide's."""
+    return {f"{NAME}.{key}": value for key, value in tensors.items()}
+
+
+def apart(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """A guide's own tensors, and those of parameters beside them."""
+    own = {key: value for key, value in tensors.items() if not key.startswith(f"{NAME}.")}
+    return own, {key: value for key, value in tensors.items() if key not in own}
+
+
+def with_parameters(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> Policy:
+    """A policy whose scenes have the run's learnt parameters, in place; as it is where none are kept."""
+    if tensors and run.parameters.get("kept") == "learnt":
+        policy.suits = learnt_by(run, policy, tensors).suited
+    return policy
+
+
+def learnt_by(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> ParameterGuide | ParameterTransform:
+    """What a run has learnt of parameters, whether it is kept or not.
+
+    Args:
+        policy: of the structures.
+        tensors: see ``beside``.
+    """
+    record, schedule = run.parameters, run.preset.meta_sim
+    fitted = [site for site in record["sites"] if site.get("fitted", site["learnt"])]
+    sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in fitted)
+    if record.get("method") == META_SIM:
+        guide = ParameterTransform(run.model, sites, policy, schedule.hidden, schedule.rounds)
+    else:
+        guide = ParameterGuide(run.model, sites, policy)
+        guide.passed = frozenset(site["name"] for site in fitted if not site["learnt"])
+    guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
+    return guide.eval()
+
+
+def _some(images: Images, which: Tensor, most: int) -> Tensor:
+    """At most so many of the chosen images, evenly spread, ``(L, C, H, W)`` uint8."""
+    rows = which.nonzero().flatten()
+    rows = rows[torch.linspace(0, len(rows) - 1, min(most, len(rows))).round().long()]
+    return torch.stack([images.load(row) for row in rows.tolist()])
+
+
+def _record(
+    run: "RunFolder",
+    guide: Guide,
+    learning: ParameterLearning | WholeLearning,
+    held: Tensor,
+    more: Callable[[], Tensor],
+) -> dict[str, Any]:
+    """For JSON, see ``judged``."""
+    method = {"method": run.preset.parameter_method}
+    if not isinstance(learning, ParameterLearning):
+        return method | {"sites": sites_record(learning), **judged(run, guide, learning, held, more).distances}
+    assert learning.tried.skill is not None
+    shares = learning.tried.skill.share.tolist()
+    skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
+    found = judged(run, guide, learning, held, more)
+    passed = frozenset() if learning.guide is None else learning.guide.passed
+    sites = []  # in the program's order, which is that of the network's columns
+    for site in learning.sites:
+        share, fitted = skill.get(site, torch.nan), site in learning.learnt
+        because = site.keeps or learning.tried.why_not(site)
+        if site.name in passed:
+            because = found.because.get(site.name, "scenes come no nearer to held-out images by it")
+        about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}
+        about |= {"fitted": fitted, "skill": share if share == share else None, "because": because}
+        sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
+    return method | {"sites": sites, **found.distances}
+
+
+def _said(record: dict[str, Any]) -> str:
+    sites, read = record["sites"], record.get("method", LIKELIHOOD) == LIKELIHOOD
+    named = [site["name"] + (f" ({site['skill']:.2f})" if read else "") for site in sites if site["learnt"]]
+    others = ", ".join(site["name"] for site in sites if not site["learnt"])
+    if not named:
+        why = "read in renders" if read else "moved"
+        return f"No site can be {why}, so where things stand and how they look keeps the prior."
+    said = f"Sites that are learnt{', with the share of their variance that is read' * read}: {', '.join(named)}."
+    said += f" Keeping the prior: {others}." if others else ""
+    if record["kept"] != "learnt":
+        said += (
+            f" All keep the prior, as learnt scenes come no nearer to held-out images, {record['learnt']:.2f} against "
+            f"{record['prior']:.2f} in energy distance."
+        )
+    return said
