@@ -67,7 +67,7 @@ def main():
         run = RunFolder.at(path)
         net = run.network()
         if not isinstance(net, PretrainedCountNet):
-            parser.error(f"expected runs with features count=efficientnet, actual others in {path}")
+            parser.error(f"expected runs with features count=efficientnet, got others in {path}")
         folder = ImageFolder(args.images, run.model.canvas, run.model.channels)
         every = read_labels(args.labels, run.model, folder, min_height=args.min_height)
         labelled = [run.model.classes[c] for c in every.columns(run.model)]

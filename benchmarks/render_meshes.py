@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("--pictures", help="a folder for the first scene as both draw it")
     arguments = parser.parse_args()
     if importlib.util.find_spec("moderngl") is None:
-        print("Skipped: expected moderngl, actual none; make benchmark installs it.")
+        print("Skipped: expected moderngl, got none; make benchmark installs it.")
         return
     from opengl_peer import Peer
 

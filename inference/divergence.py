@@ -239,15 +239,12 @@ def _compared(generated: Tensor, real: Tensor, stabilised: bool) -> tuple[Tensor
 def _check(generated: Tensor, real: Tensor) -> None:
     if generated.ndim != 2 or real.ndim != 2 or generated.shape[1] != real.shape[1]:
         raise ProbsceneError(
-            f"Expected generated (N, D) and real (L, D) features, actual {tuple(generated.shape)} and "
-            f"{tuple(real.shape)}."
+            f"expected generated (N, D) and real (L, D) features, got {tuple(generated.shape)} and {tuple(real.shape)}."
         )
     if len(generated) < 2 or len(real) < 1:
-        raise ProbsceneError(
-            f"Expected at least 2 generated and 1 real scene, actual {len(generated)} and {len(real)}."
-        )
+        raise ProbsceneError(f"expected at least 2 generated and 1 real scene, got {len(generated)} and {len(real)}.")
     if not torch.isfinite(generated.sum() + real.sum()):  # NaN and infinity stay in a sum
-        raise ProbsceneError("Expected finite features, actual NaN or infinity; lower the learning rate.")
+        raise ProbsceneError("expected finite features, got NaN or infinity; lower the learning rate.")
 
 
 def self_share(points: Tensor) -> float:

@@ -84,7 +84,7 @@ def _check(guide: object) -> None:
     missing = [name for name in NEEDED if not hasattr(guide, name)]
     if missing:
         raise ModelError(
-            f"Expected a guide with {', '.join(NEEDED[:-1])} and {NEEDED[-1]}, actual {type(guide).__name__} without "
+            f"expected a guide with {', '.join(NEEDED[:-1])} and {NEEDED[-1]}, got {type(guide).__name__} without "
             f"{', '.join(missing)}; derive it from probscene.inference.guides.base.Guide."
         )
 
@@ -136,15 +136,13 @@ class ScoreFunction:
         strata: Callable[[Derivation], Tensor] | None = None,
     ):
         if baseline not in BASELINES:
-            raise ProbsceneError(f"Expected a baseline among {', '.join(BASELINES)}, actual {baseline!r}.")
+            raise ProbsceneError(f"expected a baseline among {', '.join(BASELINES)}, got {baseline!r}.")
         if updates < 1 or not 0 < decay <= 1 or clip <= 0:
             raise ProbsceneError(
-                f"Expected updates >= 1, decay in (0, 1] and clip > 0, actual {updates}, {decay} and {clip}."
+                f"expected updates >= 1, decay in (0, 1] and clip > 0, got {updates}, {decay} and {clip}."
             )
         if reject_threshold < 0:
-            raise ProbsceneError(
-                f"Expected a reject_threshold of at least 0 failed attempts, actual {reject_threshold}."
-            )
+            raise ProbsceneError(f"expected a reject_threshold of at least 0 failed attempts, got {reject_threshold}.")
         self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
         self.updates, self.clip, self.scale = updates, clip, scale
         self.reject_weight, self.reject_threshold = reject_weight, reject_threshold

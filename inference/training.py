@@ -67,7 +67,7 @@ def check_finite(loss: float, parameters: Iterable[Tensor], what: str, where: st
     """
     if not math.isfinite(loss) or not all(torch.isfinite(p).all() for p in parameters):
         raise ProbsceneError(
-            f"Expected a finite loss and finite parameters of {what}, actual a loss of {loss} {where} or parameters "
+            f"expected a finite loss and finite parameters of {what}, got a loss of {loss} {where} or parameters "
             f"that are NaN or infinite; {remedy}."
         )
 

@@ -64,10 +64,10 @@ class Derivation:
         given, K = rules.long(), len(grammar.rules)
         if ((given < -1) | (given >= K)).any():
             raise GrammarError(
-                f"Expected rules among 0..{K - 1}, or -1 for padding, actual {int(given.min())}..{int(given.max())}."
+                f"expected rules among 0..{K - 1}, or -1 for padding, got {int(given.min())}..{int(given.max())}."
             )
         if ((given[:, 1:] >= 0) & (given[:, :-1] < 0)).any():
-            raise GrammarError("Expected padding (-1) only after a scene's last rule, actual rules after padding.")
+            raise GrammarError("expected padding (-1) only after a scene's last rule, got rules after padding.")
 
         def choose(t, frontier, previous):
             rule = given[:, t]
@@ -77,8 +77,8 @@ class Derivation:
                 i = int(wrong.nonzero()[0])
                 names = (*grammar.nonterminals, "the end of the derivation")
                 raise GrammarError(
-                    f"Expected a rule of {names[int(frontier.symbol[i])]} at step {t} of scene {i}, "
-                    f"actual {int(rule[i])} ({grammar.rules[int(rule[i])]})."
+                    f"expected a rule of {names[int(frontier.symbol[i])]} at step {t} of scene {i}, "
+                    f"got {int(rule[i])} ({grammar.rules[int(rule[i])]})."
                 )
             return rule
 
@@ -227,7 +227,7 @@ class Fields(NamedTuple):
         parent_repeat = repeat + max_steps.bit_length()
         node = parent_repeat + max_steps.bit_length()
         if node + (1 + max_steps * grammar.objects.shape[1]).bit_length() > 63:
-            raise GrammarError(f"Expected a max_steps of some thousands at most, actual {max_steps}; lower it.")
+            raise GrammarError(f"expected a max_steps of some thousands at most, got {max_steps}; lower it.")
         return Fields(repeat, parent_repeat, node)
 
     def frontier(self, entry: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -58,8 +58,8 @@ class Given(Messenger):
         longest = self.derivation.rules.shape[1]
         if longest > max_steps and not self.any_length:
             raise ModelError(
-                f"Expected the program to derive with a max_steps of at least {longest}, the rules of the longest of "
-                f"these scenes, actual max_steps = {max_steps}: it would draw fewer objects than they have. Give "
+                f"expected the program to derive with a max_steps of at least {longest}, the rules of the longest of "
+                f"these scenes, got max_steps = {max_steps}: it would draw fewer objects than they have. Give "
                 "derive(...) the max_steps of the SceneModel, or say it once with scene_model."
             )
         msg["value"], msg["done"] = self.derivation, True
@@ -137,7 +137,7 @@ class _Sampled(Messenger):
     def _pyro_post_sample(self, msg):
         if msg["infer"].get("enumerate") == "sequential":
             raise ModelError(
-                f"Expected site {msg['name']!r} to be sampled, actual sequential enumeration; for a sum over "
+                f"expected site {msg['name']!r} to be sampled, got sequential enumeration; for a sum over "
                 "structures take enumerate_derivations(grammar, max_steps), and to enumerate other sites name them "
                 "alone: pyro.sample(..., infer={'enumerate': 'parallel'})."
             )
@@ -148,7 +148,7 @@ def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> No
     shape = len(frontier.symbol), 1
     if value.shape != shape:
         raise ModelError(
-            f"Expected site {site!r} of shape {shape}, one rule a scene, actual {tuple(value.shape)}. Call derive "
+            f"expected site {site!r} of shape {shape}, one rule a scene, got {tuple(value.shape)}. Call derive "
             f"inside pyro.plate('scenes', {shape[0]}, dim=-2), and outside vectorised particles and enumeration: take "
             "num_particles without vectorize_particles, Predictive without parallel, and for a sum over structures "
             "enumerate_derivations(grammar, max_steps)."
@@ -158,7 +158,7 @@ def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> No
     if wrong.any():
         i = int(wrong.nonzero()[0])
         raise ModelError(
-            f"Expected at site {site!r} a rule of {grammar.nonterminals[int(frontier.symbol[i])]} in scene {i}, actual "
+            f"expected at site {site!r} a rule of {grammar.nonterminals[int(frontier.symbol[i])]} in scene {i}, got "
             f"{int(rule[i])} ({grammar.rules[int(rule[i])]}); condition on Derivation.sites(), and for a sum over "
             "structures take enumerate_derivations(grammar, max_steps)."
         )
@@ -197,7 +197,7 @@ def derive_complete(
             failures[todo] += 1
     if len(todo):
         raise SamplingError(
-            f"Expected every scene to end within max_steps = {max_steps}, actual {len(todo)} of {num_scenes} scenes "
+            f"expected every scene to end within max_steps = {max_steps}, got {len(todo)} of {num_scenes} scenes "
             f"still open after {attempts} attempts; raise max_steps or make the lists shorter."
         )
     if not parts:

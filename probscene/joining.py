@@ -34,9 +34,7 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
     if len(drawings) == len(drawn):
         backgrounds = {(red, green, blue) for _, drawing in drawings for red, green, blue in [drawing.background]}
         if len(backgrounds) > 1:
-            raise ModelError(
-                f"Expected scenarios with one background, actual {sorted(backgrounds)}; draw it as a layer."
-            )
+            raise ModelError(f"expected scenarios with one background, got {sorted(backgrounds)}; draw it as a layer.")
         layers = _layers(kind, [(own, drawing.kind.shape[1], drawing.layers) for own, drawing in drawings])
         return Drawing(kind, kinds, layers, backgrounds.pop(), _photo([(own, d.photo) for own, d in drawings]))
     requests = [(own, request) for own, request in drawn if isinstance(request, Request)]
@@ -44,8 +42,8 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
         return _request(kind, kinds, requests)
     if len(worlds) != len(drawn):
         raise ModelError(
-            "Expected scenarios that all draw sprites, or all build worlds, or all request images of a generator, "
-            "actual several of these; join those alike."
+            "expected scenarios that all draw sprites, or all build worlds, or all request images of a generator, "
+            "got several of these; join those alike."
         )
     return World(
         kind,
@@ -112,7 +110,7 @@ def _ground(parts: list[tuple[Tensor, Ground | None]]) -> Ground | None:
     if not grounds:
         return None
     if len(grounds) < len(parts):
-        raise ModelError("Expected scenarios that all have a ground, or none, actual both; give every scenario one.")
+        raise ModelError("expected scenarios that all have a ground, or none, got both; give every scenario one.")
     strips = max(ground.surface.shape[1] for _, ground in grounds)
     surfaces, wide = (), []
     for own, ground in grounds:

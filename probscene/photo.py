@@ -74,7 +74,7 @@ def check_photo(values: dict[str, Tensor]) -> None:
         if not ((value >= low) & (value <= high)).all():  # also where it is NaN
             worst = value[~((value >= low) & (value <= high))][0]
             raise ModelError(
-                f"Expected Photo.{name} {_within(name)}, actual {float(worst):g}; give scene.photo(...) a range or a "
+                f"expected Photo.{name} {_within(name)}, got {float(worst):g}; give scene.photo(...) a range or a "
                 "distribution that stays there."
             )
 
@@ -109,7 +109,7 @@ def _uniform(name: str, ends: tuple[float, float] | list[float]) -> Any:
         first = last = torch.nan
     if not (low <= first < last <= high and last < torch.inf):
         raise ModelError(
-            f"Expected {name} of scene.photo(...) as a range (lowest, highest) {_within(name)}, actual {ends!r}; write "
+            f"expected {name} of scene.photo(...) as a range (lowest, highest) {_within(name)}, got {ends!r}; write "
             "one number for a value that is the same in all images."
         )
     return dist.Uniform(first, last)

@@ -39,7 +39,7 @@ class Policy:
 
     def step(self, memory: Any, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, Any]:
         """Logits ``(N, K)`` and the next memory; ``previous_rule (N,)`` is -1 before the first step."""
-        raise TypeError(f"Expected a policy with a 'step' method, actual {type(self).__name__}.")
+        raise TypeError(f"expected a policy with a 'step' method, got {type(self).__name__}.")
 
     def logits(self, derivation: Derivation) -> Tensor:
         """Logits ``(N, T, K)`` at every step of given derivations, unmasked."""

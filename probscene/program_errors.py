@@ -65,7 +65,7 @@ def told(what: str, program: Any = None) -> Iterator[None]:
         if place is None:
             raise
         raise ModelError(
-            f"Expected {what} to run, actual {type(error).__name__} in {place}: {useful_text(error)}; {remedy(error)}."
+            f"expected {what} to run, got {type(error).__name__} in {place}: {useful_text(error)}; {remedy(error)}."
         ) from error
 
 
@@ -97,7 +97,7 @@ def useful_text(error: BaseException) -> str:
 def remedy(error: BaseException) -> str:
     """What to do about an error of the user's code."""
     text = str(error)
-    return next((what for part, what in _REMEDIES.items() if part in text), "mend that line")
+    return next((what for part, what in _REMEDIES.items() if part in text), "fix that line")
 
 
 def source_file(program: Any) -> str | None:

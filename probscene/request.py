@@ -122,19 +122,19 @@ def resolve_values(what: str, values: Mapping[str, Any], present: Tensor) -> Val
             value = torch.as_tensor(given).detach()
         except (TypeError, ValueError, RuntimeError):
             raise ModelError(
-                f"Expected {name} of {what} as a number or a tensor, actual {given!r}; a generator is sent the values "
+                f"expected {name} of {what} as a number or a tensor, got {given!r}; a generator is sent the values "
                 "of sites, such as x = pyro.sample(...)."
             ) from None
         try:
             value = value.expand(*present.shape, *value.shape[2:])
         except RuntimeError:
             raise ModelError(
-                f"Expected {name} of {what} to broadcast to (scenes, nodes) = {tuple(present.shape)}, with one more "
-                f"axis for a list of numbers, actual shape {tuple(value.shape)}."
+                f"expected {name} of {what} to broadcast to (scenes, nodes) = {tuple(present.shape)}, with one more "
+                f"axis for a list of numbers, got shape {tuple(value.shape)}."
             ) from None
         if value.ndim > 3 or (value.is_floating_point() and not torch.isfinite(value[present]).all()):
             fault = f"shape {tuple(value.shape)}" if value.ndim > 3 else "NaN or infinity"
-            raise ModelError(f"Expected {name} of {what} as finite numbers or lists of them, actual {fault}.")
+            raise ModelError(f"expected {name} of {what} as finite numbers or lists of them, got {fault}.")
         found[name] = value
     return Values(present, found)
 

@@ -39,7 +39,7 @@ def drawn(cumulative: Tensor) -> Tensor:
     """
     if cumulative[..., -1].isnan().any():
         raise ModelError(
-            "Expected finite logits of the rules from a policy, actual NaN or infinite ones; look at what its step "
+            "expected finite logits of the rules from a policy, got NaN or infinite ones; look at what its step "
             "returns, and begin again with a lower learning rate where it was learnt."
         )
     least = cumulative[..., -1:] * (1 - torch.rand(*cumulative.shape[:-1], 1))

@@ -99,7 +99,7 @@ def run_program(
     name = getattr(model, "name", getattr(model, "__name__", "?"))
     if not derivation.complete.all():
         raise ModelError(
-            f"Expected complete derivations for model {name!r}, actual {int((~derivation.complete).sum())} of {N} with "
+            f"expected complete derivations for model {name!r}, got {int((~derivation.complete).sum())} of {N} with "
             "nonterminals left; draw them with derive_complete."
         )
     known = Given(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
@@ -109,8 +109,8 @@ def run_program(
     drawing = trace.nodes["_RETURN"].get("value")
     if not isinstance(drawing, Renderable) or len(drawing) != N:
         raise ModelError(
-            f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
-            f"or scene.build(...)), actual {type(drawing).__name__}."
+            f"expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
+            f"or scene.build(...)), got {type(drawing).__name__}."
         )
     check_nodes(name, drawing, derivation.trimmed())
     values, site_mask = {}, {}
@@ -121,8 +121,8 @@ def run_program(
         value, mask = site["value"], site["mask"]
         if value.ndim < 2 or value.shape[0] != N:
             raise ModelError(
-                f"Expected site {key!r} of model {name!r} inside the scenes plate, shape ({N}, nodes), "
-                f"actual {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
+                f"expected site {key!r} of model {name!r} inside the scenes plate, shape ({N}, nodes), "
+                f"got {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
             )
         shape = site["fn"].batch_shape
         mask = torch.ones(shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(shape)
@@ -144,7 +144,7 @@ def _site_log_prob(name: str, key: str, site: dict[str, Any]) -> Tensor:
         return site["fn"].log_prob(site["value"])
     except (ValueError, RuntimeError, NotImplementedError) as error:
         raise ModelError(
-            f"Expected a log-probability of the values of site {key!r} of model {name!r}, actual "
+            f"expected a log-probability of the values of site {key!r} of model {name!r}, got "
             f"{type(error).__name__}: {useful_text(error)}; {remedy(error)}."
         ) from error
 
@@ -166,7 +166,7 @@ def check_nodes(name: str, drawing: Renderable, derivation: Derivation) -> None:
         return ", ".join(names.get(k, f"kind {k}") for k in kind[kind >= 0].tolist()) or "none"
 
     raise ModelError(
-        f"Expected the program of model {name!r} to draw the nodes that were derived, actual other ones in scene {i}: "
+        f"expected the program of model {name!r} to draw the nodes that were derived, got other ones in scene {i}: "
         f"derived {words(derived[i])}; drawn {words(drawn[i])}. Derive with the model's own grammar and max_steps, a "
         "smaller one cuts scenes short, and draw with the SceneGraph of that derivation; scene_model does both."
     )

@@ -180,12 +180,12 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         ModelError: no models, or models that differ in canvas, channels, renderer or generator.
     """
     if not models:
-        raise ModelError("Expected at least one scenario, actual none.")
+        raise ModelError("expected at least one scenario, got none.")
     each = list(models.values())
     for what in ("canvas", "channels", "renderer", "generator"):
         found = {key: getattr(model, what) for key, model in models.items()}
         if len(set(found.values())) > 1:
-            raise ModelError(f"Expected scenarios of one {what}, actual {found}.")
+            raise ModelError(f"expected scenarios of one {what}, got {found}.")
     grammar = JointGrammar({key: model.grammar for key, model in models.items()})
     groups = {model.groups for model in each}
     variables = {model.assets_variable for model in each}

@@ -186,7 +186,7 @@ def _as_wide(grammar: Grammar, derivation: Derivation, max_nodes: int) -> Deriva
     most = derivation.kind.shape[1]
     if most > max_nodes:
         raise ModelError(
-            f"Expected scenes of at most max_nodes = {max_nodes} nodes, actual {most}; give SceneGraph a larger "
+            f"expected scenes of at most max_nodes = {max_nodes} nodes, got {most}; give SceneGraph a larger "
             "one, or none."
         )
     return derivation.padded(grammar, 0, max_nodes)
@@ -204,7 +204,7 @@ def _decorated(layer: Sprites | Meshes, num_scenes: int) -> Tensor:
     if present is None or present.ndim != 2 or present.shape[0] != num_scenes or present.dtype != torch.bool:
         actual = "none" if present is None else f"{present.dtype} {tuple(present.shape)}"
         raise ModelError(
-            f"Expected {type(layer).__name__} of no kind with present, bool ({num_scenes} scenes, how many), "
-            f"actual {actual}; say which of the decoration is drawn."
+            f"expected {type(layer).__name__} of no kind with present, bool ({num_scenes} scenes, how many), "
+            f"got {actual}; say which of the decoration is drawn."
         )
     return present

@@ -87,7 +87,7 @@ class StructurePrior(Policy):
         self.grammar = grammar
         given = {name: d.each if isinstance(d, Ranked) else (d,) for name, d in distributions.items()}
         if any(not each for each in given.values()):
-            raise GrammarError("Expected at least one distribution in ranked(...), actual none.")
+            raise GrammarError("expected at least one distribution in ranked(...), got none.")
         P = max([1, *(len(each) for each in given.values())])
         C = max([1, *(len(d.probs) for each in given.values() for d in each if isinstance(d, Counts))])
         V, K = len(grammar.nonterminals), len(grammar.rules)
@@ -99,7 +99,7 @@ class StructurePrior(Policy):
                 table[v, p][:, rules] = _rule_probs(grammar, name, each[min(p, len(each) - 1)], C)
         if given:
             raise GrammarError(
-                f"Expected distributions of nonterminals among {list(grammar.nonterminals)}, actual {sorted(given)}."
+                f"expected distributions of nonterminals among {list(grammar.nonterminals)}, got {sorted(given)}."
             )
         table[V, :, :, 0] = 1.0
         self.table = table.log().float()
@@ -130,7 +130,7 @@ class StructurePrior(Policy):
         keep = grown(keep.unsqueeze(0), P, C)[0].expand(len(table) - 1, P, C, K)
         if keep.all():
             raise GrammarError(
-                f"Expected a production that is not legal somewhere, actual all legal up to repeat {repeats - 1} and "
+                f"expected a production that is not legal somewhere, got all legal up to repeat {repeats - 1} and "
                 f"rank {ranks - 1}; write productions as '{rules[0]}'; repeats and ranks say how far is asked."
             )
         before, left = table[:-1].double().exp(), torch.zeros(table[:-1].shape, dtype=torch.float64)
@@ -144,8 +144,8 @@ class StructurePrior(Policy):
         for symbol, repeat, rank in Branching(self.grammar, table).types:
             if empty[symbol, min(rank, P - 1), min(repeat, C - 1)]:
                 raise GrammarError(
-                    f"Expected a production of {self.grammar.nonterminals[symbol]} that is legal after {repeat} "
-                    f"repeats at rank {rank}, actual none that has a probability there."
+                    f"expected a production of {self.grammar.nonterminals[symbol]} that is legal after {repeat} "
+                    f"repeats at rank {rank}, got none that has a probability there."
                 )
         table[:-1] = torch.where(empty, grown(self.table, P, C)[:-1], table[:-1])  # which nothing reaches
         return made
@@ -222,7 +222,7 @@ def _rule_probs(grammar: Grammar, name: str, distribution: Counts | Weights, C: 
     again = [(grammar.children[k] == v).sum().item() for k in rules]
     if sorted(set(again)) != [0, 1]:
         raise GrammarError(
-            f"Expected a list such as '{name} -> item {name} | ε' for counts of {name}, actual "
+            f"expected a list such as '{name} -> item {name} | ε' for counts of {name}, got "
             f"'{'; '.join(str(grammar.rules[k]) for k in rules)}'; use weights(...) here."
         )
     recursive = torch.tensor(again, dtype=torch.float64)
@@ -245,7 +245,7 @@ def _numbers(call: str, values: Any) -> tuple[float, ...]:
         pass
     alone = "weights=" in call
     right = "(1, 2)), a tuple of them" if alone else "1, 2), one argument each; unpack a list with a star"
-    raise GrammarError(f"Expected numbers in {call}...), actual {call}{actual}); write {call}{right}.")
+    raise GrammarError(f"expected numbers in {call}...), got {call}{actual}); write {call}{right}.")
 
 
 def _check_types(grammar: Any, distributions: dict[str, Any]) -> None:
@@ -256,14 +256,14 @@ def _check_types(grammar: Any, distributions: dict[str, Any]) -> None:
     """
     if not isinstance(grammar, Grammar):
         raise GrammarError(
-            f"Expected a Grammar in StructurePrior(grammar, ...), actual {type(grammar).__name__}; "
+            f"expected a Grammar in StructurePrior(grammar, ...), got {type(grammar).__name__}; "
             "make one of the text first: StructurePrior(Grammar(text), ...)."
         )
     for name, given in distributions.items():
         for each in given.each if isinstance(given, Ranked) else (given,):
             if not isinstance(each, Counts | Weights):
                 raise GrammarError(
-                    f"Expected counts(...), weights(...) or ranked(...) of them for {name}, actual {each!r}; write "
+                    f"expected counts(...), weights(...) or ranked(...) of them for {name}, got {each!r}; write "
                     f"{name}=counts(1, 2) for how long a list is, or weights(1, 2) for how likely each production is."
                 )
 
@@ -271,7 +271,7 @@ def _check_types(grammar: Any, distributions: dict[str, Any]) -> None:
 def _normalised(values: tuple[float, ...], number: int | None, what: str) -> Tensor:
     probs = torch.tensor(values, dtype=torch.float64)
     if number is not None and len(values) != number:
-        raise GrammarError(f"Expected {number} {what}, one a production, actual {len(values)}.")
+        raise GrammarError(f"expected {number} {what}, one a production, got {len(values)}.")
     if not len(values) or not torch.isfinite(probs).all() or (probs < 0).any() or probs.sum() <= 0:
-        raise GrammarError(f"Expected non-negative {what} with a positive sum, actual {values}.")
+        raise GrammarError(f"expected non-negative {what} with a positive sum, got {values}.")
     return probs / probs.sum()

@@ -246,7 +246,7 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
         # Sums of at most 64 bytes fit in 16 bits; two passes over small integers beat pooling in floating point. Rows
         # go first: they lie whole in memory, planar or interleaved.
         if reduce > 8:
-            raise ProbsceneError(f"Expected reduce at most 8, actual {reduce}.")
+            raise ProbsceneError(f"expected reduce at most 8, got {reduce}.")
         rows = x[..., ::reduce, :].to(torch.int16)
         for i in range(1, reduce):
             rows += x[..., i::reduce, :]
@@ -280,7 +280,7 @@ def embed_all(
             each(len(images))
     features = torch.cat(out)
     if not torch.isfinite(features).all():
-        raise ProbsceneError("Expected finite features, actual NaN or infinity; train the feature network again.")
+        raise ProbsceneError("expected finite features, got NaN or infinity; train the feature network again.")
     return features
 
 

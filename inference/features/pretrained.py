@@ -244,7 +244,7 @@ def weights_file(choice: str) -> Path | None:
         except Exception as error:  # no network, no disk, an answer that is not the file: whatever it led to
             about = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
             raise DataError(
-                f"Expected weights for {name}, actual none: there is no {path}, and {offered.url} cannot be had "
+                f"expected weights for {name}, got none: there is no {path}, and {offered.url} cannot be had "
                 f"({about}); give torchvision's file as {name}=FILE, or take efficientnet, whose weights came with the "
                 "install."
             ) from error
@@ -266,7 +266,7 @@ def _loaded(network: Callable[..., nn.Module], file: Path, **options) -> nn.Modu
     except RuntimeError as error:
         about = " ".join(str(error).split())[:160]
         raise DataError(
-            f"Expected a state dict of torchvision's {network.__name__} (1,000 classes) in {file}, actual another "
+            f"expected a state dict of torchvision's {network.__name__} (1,000 classes) in {file}, got another "
             f"network's ({about}...); name the file that torchvision offers as IMAGENET1K_V1."
         ) from error
     return net
@@ -279,16 +279,16 @@ def _named(net: str, number: int) -> tuple[str, ...]:
 def read_tensors(file: Path) -> dict[str, Tensor]:
     """The tensors of a ``torch.save`` or safetensors file."""
     if not file.is_file():
-        raise DataError(f"Expected a file of weights at {file}, actual none; name one.")
+        raise DataError(f"expected a file of weights at {file}, got none; name one.")
     try:
         if file.suffix == ".safetensors":
             return safetensors.torch.load_file(file)
         tensors = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file raises whatever its bytes lead to
         about = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
-        raise DataError(f"Expected weights in {file}, actual a file that cannot be read as such ({about}).") from error
+        raise DataError(f"expected weights in {file}, got a file that cannot be read as such ({about}).") from error
     if not isinstance(tensors, dict) or not all(isinstance(value, Tensor) for value in tensors.values()):
         raise DataError(
-            f"Expected a state dict (tensors by name) in {file}, actual {type(tensors).__name__} of something else."
+            f"expected a state dict (tensors by name) in {file}, got {type(tensors).__name__} of something else."
         )
     return tensors

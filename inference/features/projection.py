@@ -61,14 +61,14 @@ def discriminant(one: Tensor, other: Tensor, directions: int, scenes: int) -> Pr
     both = torch.cat([one, other]).double()
     if not torch.isfinite(both).all():
         raise ProbsceneError(
-            "Expected finite features of the prior's renders, actual NaN or infinity; name another network."
+            "expected finite features of the prior's renders, got NaN or infinity; name another network."
         )
     mean = both.mean(0)
     _, size, axes = torch.linalg.svd(both - mean, full_matrices=False)
     varying = int((size > 1e-6 * size[0]).sum())
     if varying < directions or len(one) <= directions:
         raise ProbsceneError(
-            f"Expected features of the prior's renders that vary in at least {directions} directions, actual "
+            f"expected features of the prior's renders that vary in at least {directions} directions, got "
             f"{min(varying, len(one) - 1)}; take fewer directions, more pairs, or a prior that varies."
         )
     axes = axes[: min(LEADING, varying, max(directions, len(one) // 4))].T
@@ -126,7 +126,7 @@ class Projected(nn.Module):
         """
         if not torch.equal(state.get("origin", self.origin), self.origin):
             raise RunError(
-                "Expected the weights of the feature network as they were when the run was begun, actual others; put "
+                "expected the weights of the feature network as they were when the run was begun, got others; put "
                 "that file back, or fit again."
             )
         return super().load_state_dict(state, strict, assign)

@@ -84,7 +84,7 @@ class GrammarVAE(LatentGuide):
     def _steps(self, steps: int) -> int:
         if steps > self.max_steps:
             raise ProbsceneError(
-                f"Expected derivations of at most max_steps = {self.max_steps} rules, actual {steps}; there are no "
+                f"expected derivations of at most max_steps = {self.max_steps} rules, got {steps}; there are no "
                 "logits beyond."
             )
         return steps

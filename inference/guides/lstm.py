@@ -108,6 +108,6 @@ def make_guide(kind: str, grammar: Grammar, max_steps: int, **settings) -> Guide
         ProbsceneError: another kind.
     """
     if kind not in GUIDES:
-        raise ProbsceneError(f"Expected a guide among {', '.join(GUIDES)}, actual {kind!r}.")
+        raise ProbsceneError(f"expected a guide among {', '.join(GUIDES)}, got {kind!r}.")
     made = {"lstm": LSTMGuide, "pcfg": PCFG, "grammar-vae": GrammarVAE}[kind]
     return made(grammar, max_steps, **settings)

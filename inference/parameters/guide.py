@@ -155,7 +155,7 @@ class _OfSites(TorchDistribution):
     def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
         """Values; their gradient by the net's parameters goes through u."""
         if sample_shape:
-            raise NotImplementedError("Expected samples one batch at a time; put the number of scenes in the plate.")
+            raise NotImplementedError("expected samples one batch at a time; put the number of scenes in the plate.")
         drawn = self.base.sample()
         v = self.base.cdf(drawn).clamp(NEAR, 1 - NEAR)
         return torch.where(self.has, self.base.icdf(self.quantile(v)), drawn)

@@ -82,7 +82,7 @@ class ValuedRenders:
         for site in (*self.node_sites, *self.scene_sites):
             if site.name not in found:
                 raise ModelError(
-                    f"Expected site {site.name!r} in every call of the program of model {self.model.name!r}, actual a "
+                    f"expected site {site.name!r} in every call of the program of model {self.model.name!r}, got a "
                     "call without it; sample it always, inside scene.nodes(...) where only some scenes have it, or "
                     "leave it out of learning with infer={'learn': False}."
                 )

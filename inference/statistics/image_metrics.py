@@ -163,9 +163,9 @@ def _checked(real: Tensor, generated: Tensor) -> tuple[Tensor, Tensor]:
     ok = real.ndim == generated.ndim == 2 and real.shape[1] == generated.shape[1] >= 1
     if not ok or min(len(real), len(generated)) < 2:
         raise ProbsceneError(
-            f"Expected features of at least 2 real and 2 generated images, as many of each, actual "
+            f"expected features of at least 2 real and 2 generated images, as many of each, got "
             f"{tuple(real.shape)} and {tuple(generated.shape)}."
         )
     if not (torch.isfinite(real).all() and torch.isfinite(generated).all()):
-        raise ProbsceneError("Expected finite features, actual NaN or infinity; check the feature network.")
+        raise ProbsceneError("expected finite features, got NaN or infinity; check the feature network.")
     return real.double(), generated.double()

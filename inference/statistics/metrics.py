@@ -39,7 +39,7 @@ def histogram(values: ArrayLike, bins: int | None = None) -> Shares:
     counts = _counts(values, 1)
     found = np.bincount(counts, minlength=bins or 0)
     if bins is not None and len(found) > bins:
-        raise ProbsceneError(f"Expected counts below {bins}, actual {len(found) - 1}; give more bins.")
+        raise ProbsceneError(f"expected counts below {bins}, got {len(found) - 1}; give more bins.")
     return found / len(counts)
 
 
@@ -127,7 +127,7 @@ def pooled_shares_interval(counts: ArrayLike, level: float = 0.95, resamples: in
 
 def _percentiles(drawn: Shares, level: float) -> tuple[Shares, Shares]:
     if not 0 < level < 1:
-        raise ProbsceneError(f"Expected a level between 0 and 1, actual {level}.")
+        raise ProbsceneError(f"expected a level between 0 and 1, got {level}.")
     low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2], axis=0)
     return low, high
 
@@ -137,7 +137,7 @@ def _counts(values: ArrayLike, axes: int) -> NDArray[np.int64]:
     whole = np.issubdtype(counts.dtype, np.integer) and counts.min(initial=0) >= 0
     if counts.ndim != axes or not len(counts) or not whole:
         raise ProbsceneError(
-            f"Expected counts of 0 or more in {axes} axes with at least one image, actual {counts.dtype} "
+            f"expected counts of 0 or more in {axes} axes with at least one image, got {counts.dtype} "
             f"{counts.shape}{f' from {counts.min()}' if counts.size else ''}."
         )
     return counts.astype(np.int64)
@@ -149,7 +149,7 @@ def _aligned(p: ArrayLike, q: ArrayLike) -> tuple[Shares, Shares]:
     for shares in (np.asarray(p, np.float64), np.asarray(q, np.float64)):
         if shares.ndim != 1 or (shares < 0).any() or not np.isclose(shares.sum(), 1.0, atol=1e-6):
             raise ProbsceneError(
-                f"Expected shares of 0 or more that sum to 1, actual {shares.shape} with the sum {shares.sum():.6g}."
+                f"expected shares of 0 or more that sum to 1, got {shares.shape} with the sum {shares.sum():.6g}."
             )
         whole.append(np.pad(shares, (0, size - len(shares))))
     return whole[0], whole[1]

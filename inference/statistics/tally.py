@@ -102,7 +102,7 @@ def tally(count: ArrayLike, image: ArrayLike, weight: NDArray[np.float32]) -> Ta
     N = weight.shape[1]
     if count.min(initial=0) < 0 or image.min(initial=0) < 0 or image.max(initial=0) >= N or count.shape != image.shape:
         raise ProbsceneError(
-            f"Expected counts of 0 or more in images 0..{N - 1}, actual {count.shape} counts from "
+            f"expected counts of 0 or more in images 0..{N - 1}, got {count.shape} counts from "
             f"{count.min(initial=0)} in {image.shape} images {image.min(initial=0)}..{image.max(initial=0)}."
         )
     units = np.zeros((N, 1 + int(count.max(initial=0))), np.float32)  # whole numbers, exact in either width

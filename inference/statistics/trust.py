@@ -193,11 +193,11 @@ def _scenes(features: ArrayLike, width: int, what: str) -> Features:
     features = np.asarray(features, np.float64)
     if features.ndim != 2 or features.shape[1] != width or len(features) < NEEDED:
         raise ProbsceneError(
-            f"Expected {what} features ({NEEDED} or more, {width}), actual {features.shape}; sample more scenes with "
+            f"expected {what} features ({NEEDED} or more, {width}), got {features.shape}; sample more scenes with "
             "the network that embedded the real images."
         )
     if not np.isfinite(features).all():
-        raise ProbsceneError(f"Expected finite {what} features, actual NaN or infinity; train the network again.")
+        raise ProbsceneError(f"expected finite {what} features, got NaN or infinity; train the network again.")
     return features
 
 

@@ -62,14 +62,14 @@ def check_features(real: ArrayLike, needed: int = NEEDED) -> Features:
     """
     real = np.asarray(real, np.float64)
     if real.ndim != 2:
-        raise DataError(f"Expected real features (L, D), actual {real.shape}.")
+        raise DataError(f"expected real features (L, D), got {real.shape}.")
     if len(real) < needed:
-        raise DataError(f"Expected at least {needed} real images, actual {len(real)}; add images to the target folder.")
+        raise DataError(f"expected at least {needed} real images, got {len(real)}; add images to the target folder.")
     if not np.isfinite(real).all():
-        raise DataError("Expected finite features of the real images, actual NaN or infinity; train the network again.")
+        raise DataError("expected finite features of the real images, got NaN or infinity; train the network again.")
     if (np.ptp(real, 0) <= 1e-5 * (1 + np.abs(real).max(0))).all():
         raise DataError(
-            f"Expected real images that differ, actual {len(real)} images with the same features (zero variance in all "
+            f"expected real images that differ, got {len(real)} images with the same features (zero variance in all "
             f"{real.shape[1]} features): the images are identical, or the feature network sees no difference in them; "
             "look at the target folder, or train the feature network longer."
         )

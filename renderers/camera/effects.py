@@ -99,7 +99,7 @@ def photographed(photo: Photo, image: Tensor, threads: int = 1) -> Tensor:
         ModelError: images of another shape; see ``photo_table``.
     """
     if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3:
-        raise ModelError(f"Expected images as uint8 (N, 3, H, W), actual {image.dtype} {tuple(image.shape)}.")
+        raise ModelError(f"expected images as uint8 (N, 3, H, W), got {image.dtype} {tuple(image.shape)}.")
     number, _, height, width = image.shape
     flat = np.append(image.permute(0, 2, 3, 1).flatten().numpy(), np.zeros(8, np.uint8))
     engine.start()
@@ -123,7 +123,7 @@ def photo_table(photo: Photo, number: int, canvas: tuple[int, int], exposed: boo
     shapes = {name: tuple(value.shape) for name, value in values.items() if value.shape != (number,)}
     if shapes:
         raise ModelError(
-            f"Expected a photo with one value for each of {number} scenes, actual {shapes}; make it with "
+            f"expected a photo with one value for each of {number} scenes, got {shapes}; make it with "
             "probscene.world.resolve_scene."
         )
     check_photo(values)

@@ -63,7 +63,7 @@ class Kept:
             with suppress(OSError):
                 aside.unlink()
             raise MachineError(
-                f"Expected to write pictures to {self.folder}, which keep= of the Command names, actual "
+                f"expected to write pictures to {self.folder}, which keep= of the Command names, got "
                 f"{error.strerror}; make room, or take keep= away."
             ) from error
 

@@ -157,8 +157,8 @@ class Pool:
         if self.closed:
             raise GeneratorError(f"The generator {self.command.name} was ended while it drew.")
         raise GeneratorError(
-            f"Expected the generator {self.command.name} to draw the scene of seed {record['seed']} "
-            f"({_contents(record)}), actual, in {len(faults)} attempts: {faults[-1]}"
+            f"expected the generator {self.command.name} to draw the scene of seed {record['seed']} "
+            f"({_contents(record)}), got, in {len(faults)} attempts: {faults[-1]}"
         )
 
     def _process(self, number: int) -> Process:

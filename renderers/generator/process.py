@@ -62,8 +62,8 @@ class Process:
         except OSError as error:
             self._listening.close()
             raise GeneratorError(
-                f"Expected to start the generator {command.name}, actual {error.strerror} for {command.argv[0]!r}; "
-                "mend the argv of its Command."
+                f"expected to start the generator {command.name}, got {error.strerror} for {command.argv[0]!r}; "
+                "fix the argv of its Command."
             ) from error
 
     def meet(self) -> None:
@@ -90,12 +90,12 @@ class Process:
         except TimeoutError:
             raise Fault(
                 f"it had drawn nothing after {self.command.timeout:g} seconds; raise timeout= of its Command where a "
-                "scene may take longer, or mend the program"
+                "scene may take longer, or fix the program"
             ) from None
         except (OSError, ValueError) as error:
-            raise Fault(f"{self._ended()}{type(error).__name__}: {error}; mend the program") from error
+            raise Fault(f"{self._ended()}{type(error).__name__}: {error}; fix the program") from error
         if answer is None:
-            raise Fault(f"{self._ended()}it hung up; mend the program")
+            raise Fault(f"{self._ended()}it hung up; fix the program")
         self.drawn += 1
         memory = answer[0].get("memory")
         self.memory = memory if isinstance(memory, float) else 0.0
@@ -153,13 +153,13 @@ class Process:
             raise GeneratorError(self._stranger(f"protocol {said.get('protocol')!r}"))
         if self.command.version and said.get("version") != self.command.version:
             raise GeneratorError(
-                f"Expected version {self.command.version!r} of the generator {self.command.name}, actual "
+                f"expected version {self.command.version!r} of the generator {self.command.name}, got "
                 f"{said.get('version')!r}; start that one, or change version= of the Command and fit again."
             )
 
     def _stranger(self, actual: str) -> str:
         return (
-            f"Expected the generator {self.command.name} to speak protocol {worker.PROTOCOL} of probscene, actual "
+            f"expected the generator {self.command.name} to speak protocol {worker.PROTOCOL} of probscene, got "
             f"{actual}; let it import the file probscene_worker in the folder that PROBSCENE_WORKER names, not a copy."
         )
 
@@ -177,7 +177,7 @@ class Process:
 def no_room(command: Command, error: OSError) -> MachineError:
     """What to do where temporary files cannot be written."""
     return MachineError(
-        f"Expected to write temporary files for the generator {command.name}, actual {error.strerror}; make room, or "
+        f"expected to write temporary files for the generator {command.name}, got {error.strerror}; make room, or "
         "set TMPDIR."
     )
 

@@ -49,7 +49,7 @@ class GeneratedRenderer:
         """
         if not isinstance(drawing, Request):
             raise ModelError(
-                f"Expected the program of a model with a generator to return scene.request(...), actual "
+                f"expected the program of a model with a generator to return scene.request(...), got "
                 f"{type(drawing).__name__}; or take generator= away."
             )
         records = drawing.records(self.canvas)
@@ -70,7 +70,7 @@ def _drawn_here(generator: Callable[[Any], Any], record: dict[str, Any]) -> Pict
         reply, arrays = packed(drawn)
         return read(record, reply, b"".join(arrays))
     except (Fault, ValueError) as error:
-        raise ModelError(f"Expected a picture of the generator, actual another answer: {error}.") from error
+        raise ModelError(f"expected a picture of the generator, got another answer: {error}.") from error
 
 
 def _batch(request: Request, pictures: list[Picture], canvas: tuple[int, int]) -> RenderBatch:
@@ -106,7 +106,7 @@ def _all_or_none(name: str, given: list[np.ndarray | None]) -> bool:
     known = sum(value is not None for value in given)
     if 0 < known < len(given):
         raise ModelError(
-            f"Expected {name} from the generator for all scenes or for none, actual for {known} of {len(given)}; give "
+            f"expected {name} from the generator for all scenes or for none, got for {known} of {len(given)}; give "
             "it for all."
         )
     return known > 0

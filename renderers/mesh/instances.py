@@ -71,10 +71,10 @@ def instances(world: World, atlas: MeshAtlas, canvas: tuple[int, int], map_size:
     """
     N, M = world.kind.shape
     if M > MAX_NODES:
-        raise ModelError(f"Expected at most {MAX_NODES} nodes a scene, actual {M}; draw fewer things.")
+        raise ModelError(f"expected at most {MAX_NODES} nodes a scene, got {M}; draw fewer things.")
     classes = names(world)
     if len(classes) > 256:
-        raise ModelError(f"Expected at most 256 classes in a world, actual {len(classes)}; join some of them.")
+        raise ModelError(f"expected at most 256 classes in a world, got {len(classes)}; join some of them.")
     atlas.add(
         [mesh for layer in world.layers for mesh in layer.meshes],
         [] if world.ground is None else list(world.ground.surfaces),
@@ -84,7 +84,7 @@ def instances(world: World, atlas: MeshAtlas, canvas: tuple[int, int], map_size:
     placed = Placed(*(values[order] for values in placed))
     count = np.bincount(placed.scene, minlength=N)
     if len(count) and count.max() > MAX_INSTANCES:
-        raise ModelError(f"Expected at most {MAX_INSTANCES} meshes in a scene, actual {count.max()}; draw fewer.")
+        raise ModelError(f"expected at most {MAX_INSTANCES} meshes in a scene, got {count.max()}; draw fewer.")
 
     sight = view(world)
     rows = max(1, len(order))
@@ -120,7 +120,7 @@ def _placed(world: World, atlas: MeshAtlas) -> Placed:
         for name, value in vars(layer).items():
             if hasattr(value, "shape") and (tuple(value.shape[:2]) != shape or len(shape) != 2):
                 raise ModelError(
-                    f"Expected {name} of layer {i} as (scenes, nodes) = {shape}, actual {tuple(value.shape)}; "
+                    f"expected {name} of layer {i} as (scenes, nodes) = {shape}, got {tuple(value.shape)}; "
                     "make layers with SceneGraph.build."
                 )
         present = layer.present.cpu().numpy()
@@ -130,7 +130,7 @@ def _placed(world: World, atlas: MeshAtlas) -> Placed:
         mesh = layer.mesh.cpu().numpy()[present]
         if mesh.min() < 0 or mesh.max() >= len(layer.meshes):
             raise ModelError(
-                f"Expected meshes of layer {i} in 0..{len(layer.meshes) - 1}, actual {mesh.min()}..{mesh.max()}; "
+                f"expected meshes of layer {i} in 0..{len(layer.meshes) - 1}, got {mesh.min()}..{mesh.max()}; "
                 "choose meshes that it has."
             )
         values = {
@@ -156,17 +156,17 @@ def _placed(world: World, atlas: MeshAtlas) -> Placed:
 def _check(values: dict[str, np.ndarray]) -> None:
     for name, value in values.items():
         if not np.isfinite(value).all():
-            raise ModelError(f"Expected finite {name} in a world, actual NaN or infinity; check the program.")
+            raise ModelError(f"expected finite {name} in a world, got NaN or infinity; check the program.")
     for name in ("x", "y", "z"):
         if (np.abs(values[name]) > MAX_POSITION).any():
             raise ModelError(
-                f"Expected {name} within {MAX_POSITION:g} m, actual {np.abs(values[name]).max():g} away; "
+                f"expected {name} within {MAX_POSITION:g} m, got {np.abs(values[name]).max():g} away; "
                 "check the program's units."
             )
     if not ((values["scale"] > 0) & (values["scale"] <= MAX_SCALE)).all():
         worst = values["scale"].min() if (values["scale"] <= 0).any() else values["scale"].max()
         raise ModelError(
-            f"Expected scales above 0 and at most {MAX_SCALE:g} in a world, actual {worst:g}; bound the scale."
+            f"expected scales above 0 and at most {MAX_SCALE:g} in a world, got {worst:g}; bound the scale."
         )
 
 

@@ -60,7 +60,7 @@ class MeshRenderer:
 
     def __init__(self, canvas: tuple[int, int], threads: int | None = None, samples: int = 1):
         if samples not in (1, 4):
-            raise ModelError(f"Expected 1 or 4 samples a pixel, actual {samples}.")
+            raise ModelError(f"expected 1 or 4 samples a pixel, got {samples}.")
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
         self.samples, self.map_size = samples, min(2048, max(256, 5 * self.canvas[1] // 96 * 16))
         self._atlas, self._finish = MeshAtlas(), PhotoFinish(self.canvas, self.threads)
@@ -78,7 +78,7 @@ class MeshRenderer:
             ProbsceneError: in a process forked from one in which Taichi ran.
         """
         if not isinstance(drawing, World):
-            raise ModelError(f"Expected a World of meshes, actual a {type(drawing).__name__}; take SpriteRenderer.")
+            raise ModelError(f"expected a World of meshes, got a {type(drawing).__name__}; take SpriteRenderer.")
         world = drawing
         engine.start()
         self._atlas.trim()
@@ -120,7 +120,7 @@ class MeshRenderer:
         most_vertices, triangles = table.most
         if triangles > _MOST_TRIANGLES:
             raise ModelError(
-                f"Expected at most {_MOST_TRIANGLES} triangles in sight of a scene, actual {triangles}; "
+                f"expected at most {_MOST_TRIANGLES} triangles in sight of a scene, got {triangles}; "
                 "use coarser meshes or fewer."
             )
         strips = 0 if world.ground is None else world.ground.surface.shape[1]

@@ -59,9 +59,9 @@ def view(world: World) -> Sight:
     yaw, pitch, roll = numbers(world.camera, "yaw", "pitch", "roll")
     eye = np.stack([x, y, z], 1)
     if not (np.isfinite([*eye.T, yaw, pitch, roll, u, v, focal]).all() and (np.abs(eye) <= MAX_POSITION).all()):
-        raise ModelError(f"Expected finite cameras within {MAX_POSITION:g} m, actual others; check its units.")
+        raise ModelError(f"expected finite cameras within {MAX_POSITION:g} m, got others; check its units.")
     if not (focal > 0).all():
-        raise ModelError(f"Expected a positive focal length in pixels, actual {focal.min():g}.")
+        raise ModelError(f"expected a positive focal length in pixels, got {focal.min():g}.")
     zero = np.zeros_like(yaw)
     level = np.stack([np.cos(yaw), np.sin(yaw), zero], 1)
     right = np.stack([np.sin(yaw), -np.cos(yaw), zero], 1)

@@ -67,7 +67,7 @@ class SpriteRenderer:
 
     def _rendered(self, drawing: Renderable, coloured: bool) -> RenderBatch:
         if not isinstance(drawing, Drawing):
-            raise ModelError(f"Expected a Drawing of sprites, actual a {type(drawing).__name__}; take MeshRenderer.")
+            raise ModelError(f"expected a Drawing of sprites, got a {type(drawing).__name__}; take MeshRenderer.")
         engine.start()
         height, width = self.canvas
         scenes, nodes = drawing.kind.shape

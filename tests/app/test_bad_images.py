@@ -95,7 +95,7 @@ def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp
     for i in range(50):
         shutil.copy(target.images / "000000.png", same / f"{i}.png")
     out = tmp_path / "run"
-    check_fault(call("fit", discs.file, "--target", few, "--out", out), 2, "at least 40 images", "actual 39")
+    check_fault(call("fit", discs.file, "--target", few, "--out", out), 2, "at least 40 images", "got 39")
     check_fault(call("fit", discs.file, "--target", same, "--out", out), 2, "images that differ", "50 that are all the")
     assert not out.exists()
 

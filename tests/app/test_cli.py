@@ -96,7 +96,7 @@ MODELS = {
     "syntax": ("def f(:\n", "does not import: SyntaxError"),
     "import": ("import nothing_of_this_name\n", "ModuleNotFoundError"),
     "raises": ("1 / 0\n", "ZeroDivisionError"),
-    "none": ("x = 1\n", "actual none"),
+    "none": ("x = 1\n", "got none"),
     "two": (GOOD + "\nOTHER = target(1)\nMODEL2 = MODEL\ndel MODEL\n", "to export one SceneModel"),
     "undefined": (GOOD.replace("red | blue\n", "red | Blue\n"), "Undefined nonterminal: Blue"),
     "unreachable": (GOOD.replace("| blue\n", "| blue\n    Lost -> lost\n", 1), "Unreachable nonterminal: Lost"),
@@ -138,7 +138,7 @@ def test_runs_that_cannot_be_read(call, fitted, target, tmp_path):
     record = json.loads((fitted / "run.json").read_text())
     runs = {
         "other": (json.dumps(record | {"format": 0, "version": "0.0.1"}), "another version of probscene (0.0.1)"),
-        "damaged": ("{", "actual something else"),
+        "damaged": ("{", "got something else"),
     }
     for name, (text, part) in runs.items():
         (tmp_path / name).mkdir()
@@ -170,14 +170,14 @@ def test_resume_takes_the_settings_of_the_run_or_none(call, discs, fitted, targe
     same = [discs.file, "--target", target.images, *discs.settings, "--seed", 0]
     assert call(*words, *same).code == 0
     for other, *parts in (
-        (["multi_mnist"], "Expected the model"),
-        (["--target", tmp_path], "Expected PNG, JPEG or TIFF images in", "an empty folder"),
-        (["--seed", 1], "(0), actual 1"),
+        (["multi_mnist"], "expected the model"),
+        (["--target", tmp_path], "expected PNG, JPEG or TIFF images in", "an empty folder"),
+        (["--seed", 1], "(0), got 1"),
         (["--threads", 7], "threads"),
         (["--skip-bad"], "skip_bad"),
-        ([*discs.settings, "--set", "batches=5"], "batches", "(4), actual 5"),
-        ([*discs.settings, "--objective", "mmd"], "(kde), actual mmd"),
-        ([*discs.settings, "--guide", "pcfg"], "the guide", "(lstm), actual pcfg"),
+        ([*discs.settings, "--set", "batches=5"], "batches", "(4), got 5"),
+        ([*discs.settings, "--objective", "mmd"], "(kde), got mmd"),
+        ([*discs.settings, "--guide", "pcfg"], "the guide", "(lstm), got pcfg"),
     ):
         check_fault(call(*words, *other), 2, *parts)
 
@@ -195,7 +195,7 @@ def test_numbers_out_of_range(call, discs, fitted, target, tmp_path):
         check_fault(call(*fitting, "--threads", number), 2, "threads")
     check_fault(call(*fitting, "--seed", -1), 2, "seed of 0 or more")
     check_fault(call("generate", fitted, "--num", 1, "--out", out, "--format", "voc"), 2, "'voc'")
-    check_fault(call("fit", "--out", out), 2, "Expected MODEL and --target")
+    check_fault(call("fit", "--out", out), 2, "expected MODEL and --target")
     assert not out.exists()
 
 

@@ -178,7 +178,7 @@ def test_all_refuse_the_same_files(tmp_path, name):
         with pytest.raises(DataError, match=rf"{name}.*{fault}"):
             reader(tmp_path / name)
     if not name.startswith(("web", "moving")):
-        said = f"Expected image 0 .*actual one that {fault}"
+        said = f"expected image 0 .*got one that {fault}"
         with Image.open(tmp_path / name) as opened, pytest.raises(DataError, match=said):
             ImageArray([opened], CANVAS, 3)
 
@@ -189,7 +189,7 @@ def test_pillow_images_that_no_file_has():
     assert images.value_range == (0, 4095) and not images.load(1).any() and (images.load(0) == images.load(2)).all()
     assert "2 of 3 images have 16 bits" in images.notes[0]
     for wrong, fault in ((Image.new("F", (4, 4)), "floating-point"), (Image.new("I", (4, 4), 70_000), "70000")):
-        with pytest.raises(DataError, match=f"Expected image 0 to have pixels of 8 or 16 bits, actual one.*{fault}"):
+        with pytest.raises(DataError, match=f"expected image 0 to have pixels of 8 or 16 bits, got one.*{fault}"):
             ImageArray([wrong], CANVAS, 3)
 
 
@@ -227,7 +227,7 @@ def test_a_run_keeps_its_range(discs, tmp_path):
         Image.fromarray(np.full((64, 64), 100, np.uint16)).save(file)
     assert int(open_target(again, lambda *_: None).load(0).max()) == 100 >> 4
     session.resume(tmp_path / "run", show, value_range=(0, 4095))
-    with pytest.raises(RunError, match=r"value_range that the run.*\[0.0, 4095.0\].*actual \[0.0, 255.0\]"):
+    with pytest.raises(RunError, match=r"value_range that the run.*\[0.0, 4095.0\].*got \[0.0, 255.0\]"):
         session.resume(tmp_path / "run", show, value_range=(0, 255))
 
 
@@ -259,5 +259,5 @@ def test_a_run_on_images_of_8_bits_has_no_range(target, discs, tmp_path):
 def test_the_words_of_a_range():
     assert range_given(None) is None and range_given("0,4095") == (0, 4095) and range_given(" 1.5, 2e3") == (1.5, 2000)
     for wrong in ("4095", "a,b", "1,2,3", ""):
-        with pytest.raises(ProbsceneError, match="Expected --range LOW,HIGH"):
+        with pytest.raises(ProbsceneError, match="expected --range LOW,HIGH"):
             range_given(wrong)

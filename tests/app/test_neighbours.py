@@ -186,7 +186,7 @@ def test_a_model_without_leaves_no_more_than_its_file(tmp_path):
 
 def test_check_finds_nothing_to_mend(tmp_path, call):
     done = call("check", folder(tmp_path))
-    assert done.code == 0 and "Nothing to mend" in done.out, done.err
+    assert done.code == 0 and "Nothing to fix" in done.out, done.err
 
 
 def test_another_process_finds_them(tmp_path):

@@ -124,7 +124,7 @@ def test_quantiles_of_multi_mnist():
         "50 % within 12, 90 % within 20",
         "bg 1, 0 0.5",
         "max_steps = 64: covers every",
-        "Nothing to mend",
+        "Nothing to fix",
     ):
         assert words in str(report)  # fmt: skip
 

@@ -221,7 +221,7 @@ def test_batches_are_the_images_in_order(tmp_path_factory, number, size):
     whole = torch.cat(batches)
     assert whole.dtype == torch.uint8 and whole.shape == (number, 1, 2, 3)
     assert (whole[:, 0, 0, 0] == torch.arange(number)).all() and not images.notes
-    with pytest.raises(DataError, match="positive batch size, actual 0"):
+    with pytest.raises(DataError, match="positive batch size, got 0"):
         next(images.batches(0))
 
 
@@ -307,7 +307,7 @@ def test_folders_that_cannot_be_used(tmp_path, noise):
     (tmp_path / "a.png").write_bytes(encoded(noise))
     assert "which is a file" in message(tmp_path / "a.png")
     (tmp_path / "empty").mkdir()
-    assert "actual an empty folder" in message(tmp_path / "empty")
+    assert "got an empty folder" in message(tmp_path / "empty")
     (tmp_path / "notes" / "images").mkdir(parents=True)
     (tmp_path / "notes" / "annotations.json").write_text("{}")
     assert "only images/, annotations.json; images in subfolders are not read" in message(tmp_path / "notes")
@@ -317,7 +317,7 @@ def test_a_file_that_goes_bad_later_is_named(tmp_path, noise):
     (tmp_path / "a.png").write_bytes(encoded(noise))
     images = ImageFolder(tmp_path, (40, 30), 3)
     (tmp_path / "a.png").write_bytes(b"")
-    with pytest.raises(DataError, match="a.png as it was, actual a file that is empty"):
+    with pytest.raises(DataError, match="a.png as it was, got a file that is empty"):
         next(images.batches(8))
 
 

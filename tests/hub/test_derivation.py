@@ -124,7 +124,7 @@ def test_a_rule_that_is_looked_up_in_a_table_is_the_one_that_its_row_draws(prior
 
 
 def test_more_steps_than_a_stack_can_count_are_refused():
-    with pytest.raises(GrammarError, match="max_steps of some thousands at most, actual 4194304"):
+    with pytest.raises(GrammarError, match="max_steps of some thousands at most, got 4194304"):
         program(StructurePrior(LIST), 1, 1 << 22)
 
 
@@ -164,7 +164,7 @@ LIST = Grammar("Scene -> Items\nItems -> x Items | ε")
 def test_derivation_of_refuses_rules_that_do_not_fit():
     fine = Derivation.of(LIST, torch.tensor([[0, 1, 2], [0, 2, -1]]))
     assert fine.complete.all() and fine.kind.tolist() == [[0], [-1]]
-    with pytest.raises(GrammarError, match="rule of Items at step 1 of scene 1, actual 0"):
+    with pytest.raises(GrammarError, match="rule of Items at step 1 of scene 1, got 0"):
         Derivation.of(LIST, torch.tensor([[0, 2], [0, 0]]))
     with pytest.raises(GrammarError, match="end of the derivation at step 2"):
         Derivation.of(LIST, torch.tensor([[0, 2, 2], [0, 1, 2]]))
@@ -228,5 +228,5 @@ def test_derive_complete_counts_no_failures_where_all_fits():
 
 def test_derive_complete_gives_up_with_advice():
     policy = StructurePrior(LIST, Items=weights(1, 0))
-    with pytest.raises(SamplingError, match="max_steps = 20, actual 7 of 7 scenes"):
+    with pytest.raises(SamplingError, match="max_steps = 20, got 7 of 7 scenes"):
         derive_complete(LIST, policy, 7, max_steps=20, attempts=5)

@@ -128,18 +128,18 @@ def test_faults_of_text_name_the_line(text, line, message):
 
 @pytest.mark.parametrize("name", ["x y", "x(y)", "ε", "eps", "", "y|z"])
 def test_python_names_that_text_could_not_say(name):
-    with pytest.raises(GrammarError, match="Expected names of letters"):
+    with pytest.raises(GrammarError, match="expected names of letters"):
         Rule("Scene", name)
-    with pytest.raises(GrammarError, match="Expected names of letters"):
+    with pytest.raises(GrammarError, match="expected names of letters"):
         Rule("Scene", Node("x", ("z", name)))
-    with pytest.raises(GrammarError, match="Expected names of letters"):
+    with pytest.raises(GrammarError, match="expected names of letters"):
         Rule(name, "x")
 
 
 def test_python_nodes_that_are_no_objects():
     with pytest.raises(GrammarError, match="below an object"):
         Rule("Scene", Node("Plate", ("x",)))
-    with pytest.raises(GrammarError, match="a tuple of children, actual Node"):
+    with pytest.raises(GrammarError, match="a tuple of children, got Node"):
         Rule("Scene", Node("plate", "Mugs"))
 
 
@@ -151,7 +151,7 @@ def test_a_childless_node_is_its_name_at_any_depth():
 
 def test_unknown_names():
     grammar = Grammar(TABLETOP)
-    with pytest.raises(GrammarError, match="nonterminal among .*actual 'Cup'"):
+    with pytest.raises(GrammarError, match="nonterminal among .*got 'Cup'"):
         grammar.rules_of("Cup")
-    with pytest.raises(GrammarError, match="object among .*actual 'cup'"):
+    with pytest.raises(GrammarError, match="object among .*got 'cup'"):
         grammar.kind("cup")

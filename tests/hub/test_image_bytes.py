@@ -211,7 +211,7 @@ def test_transparency_that_fits_nothing_is_ignored(png, photograph):
 def test_another_format_is_named(tmp_path, start, name):
     file = tmp_path / "photo.jpg"
     file.write_bytes(start + bytes(100))
-    with pytest.raises(DataError, match=f"photo.jpg, actual a file that is a {name}.* save it as"):
+    with pytest.raises(DataError, match=f"photo.jpg, got a file that is a {name}.* save it as"):
         read_rgb(file)
 
 

@@ -89,19 +89,19 @@ def test_the_default_photo_has_every_value_once_a_scene():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"blur": -1.0}, r"Photo.blur within 0..64, actual -1;"),
-        ({"blur": 65.0}, "Photo.blur within 0..64, actual 65;"),
+        ({"blur": -1.0}, r"Photo.blur within 0..64, got -1;"),
+        ({"blur": 65.0}, "Photo.blur within 0..64, got 65;"),
         ({"blur": float("nan")}, "finite values in Photo.blur"),
-        ({"jpeg_quality": 0.0}, "Photo.jpeg_quality within 1..100, or infinity for no JPEG, actual 0;"),
-        ({"jpeg_quality": 101.0}, "jpeg_quality within 1..100.*actual 101;"),
-        ({"jpeg_quality": float("nan")}, "jpeg_quality within 1..100.*actual nan;"),
-        ({"jpeg_quality": -torch.inf}, "jpeg_quality within 1..100.*actual -inf;"),
-        ({"exposure": -0.5}, "Photo.exposure of at least 0, actual -0.5;"),
+        ({"jpeg_quality": 0.0}, "Photo.jpeg_quality within 1..100, or infinity for no JPEG, got 0;"),
+        ({"jpeg_quality": 101.0}, "jpeg_quality within 1..100.*got 101;"),
+        ({"jpeg_quality": float("nan")}, "jpeg_quality within 1..100.*got nan;"),
+        ({"jpeg_quality": -torch.inf}, "jpeg_quality within 1..100.*got -inf;"),
+        ({"exposure": -0.5}, "Photo.exposure of at least 0, got -0.5;"),
         ({"noise": float("inf")}, "finite values in Photo.noise"),
-        ({"vignette": 1.5}, "Photo.vignette within 0..1, actual 1.5;"),
-        ({"contrast": torch.ones(2, 4)}, r"Photo.contrast to broadcast to \(2, 1\), actual shape \(2, 4\)"),
+        ({"vignette": 1.5}, "Photo.vignette within 0..1, got 1.5;"),
+        ({"contrast": torch.ones(2, 4)}, r"Photo.contrast to broadcast to \(2, 1\), got shape \(2, 4\)"),
         ({"seed": torch.zeros(3, 1)}, r"Photo.seed to broadcast to \(2, 1\)"),
-        ({"red_gain": torch.tensor([[1.0], [-1.0]])}, "Photo.red_gain of at least 0, actual -1;"),
+        ({"red_gain": torch.tensor([[1.0], [-1.0]])}, "Photo.red_gain of at least 0, got -1;"),
     ],
 )
 def test_photos_that_cannot_be(values, message):
@@ -115,9 +115,9 @@ def test_photos_that_cannot_be(values, message):
 @pytest.mark.parametrize(
     ("looks", "message"),
     [
-        ({"blur": (-1.0, 2.0)}, r"blur of scene.photo\(...\) as a range \(lowest, highest\) within 0..64, actual \(-1"),
-        ({"exposure": (-0.5, 0.5)}, "exposure .* of at least 0, actual"),
-        ({"contrast": (1.2, 0.8)}, r"contrast .* actual \(1.2, 0.8\)"),
+        ({"blur": (-1.0, 2.0)}, r"blur of scene.photo\(...\) as a range \(lowest, highest\) within 0..64, got \(-1"),
+        ({"exposure": (-0.5, 0.5)}, "exposure .* of at least 0, got"),
+        ({"contrast": (1.2, 0.8)}, r"contrast .* got \(1.2, 0.8\)"),
         ({"contrast": (1.0, 1.0)}, "write one number"),
         ({"contrast": (1.0, 1.1, 1.2)}, "as a range"),
         ({"contrast": ("low", "high")}, "as a range"),
@@ -131,13 +131,13 @@ def test_ranges_that_are_none(looks, message):
 
 
 def test_photos_belong_to_scenes_and_not_to_nodes():
-    with pytest.raises(ModelError, match=r"'photo.blur' with one value a scene, shape \(3, 1\), actual \(\)"):
+    with pytest.raises(ModelError, match=r"'photo.blur' with one value a scene, shape \(3, 1\), got \(\)"):
         scene_of().photo(blur=(0.0, 1.0))
     scene = scene_of()
     with (
         pyro.plate("scenes", 3, dim=-2),
         scene.nodes("disc"),
-        pytest.raises(ModelError, match=r"actual \(3, 2\); call scene.photo\(...\) .* outside"),
+        pytest.raises(ModelError, match=r"got \(3, 2\); call scene.photo\(...\) .* outside"),
     ):
         scene.photo(blur=(0.0, 1.0))
 

@@ -74,8 +74,8 @@ FAULTS = {
     repeated: ("Multiple sample sites named '(one/)?x'", "a name of its own"),
     own_plate: ('plates "mine" and "scenes", collide at dim=-2', "no plate of your own"),
     wrong_shape: ("Shape mismatch inside plate.'nodes'. at site (one/)?x dim -1", "broadcast to that"),
-    mistyped: ("AttributeError", "no attribute 'gap'", "mend that line"),
-    unfitting: ("RuntimeError", "size of tensor a .3. must match the size of tensor b .4.", "mend that line"),
+    mistyped: ("AttributeError", "no attribute 'gap'", "fix that line"),
+    unfitting: ("RuntimeError", "size of tensor a .3. must match the size of tensor b .4.", "fix that line"),
 }
 
 
@@ -146,72 +146,72 @@ WRONG = {
     "a bare array": (
         lambda: Atlas(SPRITE),
         ModelError,
-        r"actual ndarray uint8 \(8, 8, 4\); write Atlas\(\(sprite,\)\)",
+        r"got ndarray uint8 \(8, 8, 4\); write Atlas\(\(sprite,\)\)",
     ),
     "an array for an atlas": (
         lambda: Sprites("disc", SPRITE, 0, 1.0, 1.0),
         ModelError,
-        r"an Atlas in Sprites\('disc'\), actual ndarray .* write Atlas\(\(sprite,\)\)",
+        r"an Atlas in Sprites\('disc'\), got ndarray .* write Atlas\(\(sprite,\)\)",
     ),
-    "no array": (lambda: Atlas((SPRITE, "disc.png")), ModelError, "sprite 1 as a numpy array, .* actual str"),
-    "a list for numbers": (lambda: counts([1, 2]), GrammarError, r"actual counts\(\[1, 2\]\); write counts\(1, 2\)"),
-    "a word for numbers": (lambda: weights("ab"), GrammarError, r"numbers in weights\(...\), actual weights\('ab'\)"),
-    "a number for weights": (lambda: counts(1, 2, weights=3), GrammarError, r"actual counts\(..., weights=3\)"),
-    "a text for a grammar": (lambda: StructurePrior("Scene -> a"), GrammarError, r"actual str; .*\(Grammar\(text\)"),
+    "no array": (lambda: Atlas((SPRITE, "disc.png")), ModelError, "sprite 1 as a numpy array, .* got str"),
+    "a list for numbers": (lambda: counts([1, 2]), GrammarError, r"got counts\(\[1, 2\]\); write counts\(1, 2\)"),
+    "a word for numbers": (lambda: weights("ab"), GrammarError, r"numbers in weights\(...\), got weights\('ab'\)"),
+    "a number for weights": (lambda: counts(1, 2, weights=3), GrammarError, r"got counts\(..., weights=3\)"),
+    "a text for a grammar": (lambda: StructurePrior("Scene -> a"), GrammarError, r"got str; .*\(Grammar\(text\)"),
     "a list for counts": (
         lambda: StructurePrior(GRAMMAR, Discs=[1, 2]),
         GrammarError,
-        r"actual \[1, 2\]; .* Discs=counts",
+        r"got \[1, 2\]; .* Discs=counts",
     ),
     "a list in ranked": (lambda: StructurePrior(GRAMMAR, Discs=ranked([1, 2])), GrammarError, "write Discs=counts"),
     "three for a canvas": (
         lambda: replace(model_of(mistyped), canvas=(64, 64, 3)),
         ModelError,
-        r"actual canvas \(64, 64, 3\) .*=\(height, width\), .* without the channels",
+        r"got canvas \(64, 64, 3\) .*=\(height, width\), .* without the channels",
     ),
     "words for a canvas": (lambda: replace(model_of(mistyped), canvas=("64", 64)), ModelError, "positive canvas"),
     "half a step": (lambda: replace(model_of(mistyped), max_steps=9.5), ModelError, "max_steps 9.5; .* whole number"),
     "a string for classes": (
         lambda: SceneModel("m", GRAMMAR, PRIOR, mistyped, (64, 64), 9, "disc"),
         ModelError,
-        r"a tuple of names, actual 'disc'; write classes=\('disc',\)",
+        r"a tuple of names, got 'disc'; write classes=\('disc',\)",
     ),
     "a number for classes": (
         lambda: scene_model(GRAMMAR, PRIOR, canvas=(64, 64), max_steps=9, classes=3)(mistyped),
         ModelError,
-        "a tuple of names, actual 3",
+        "a tuple of names, got 3",
     ),
     "a text for the model's grammar": (
         lambda: SceneModel("m", "Scene -> a", PRIOR, mistyped, (64, 64), 9, ("a",)),
         ModelError,
-        "Expected a Grammar in model 'm', actual str",
+        "expected a Grammar in model 'm', got str",
     ),
     "a word for a place": (
         lambda: sample(model_of(lambda scene: scene.draw(Sprites.disc("disc", "left", 3.0, 6.0))), PRIOR, 3),
         ModelError,
-        r"Sprites\('disc'\).x as a number or a tensor, actual 'left'",
+        r"Sprites\('disc'\).x as a number or a tensor, got 'left'",
     ),
     "a word for the background": (
         lambda: sample(model_of(lambda scene: scene.draw(background="red")), PRIOR, 3),
         ModelError,
-        "three numbers in 0..1, .* actual 'red'",
+        "three numbers in 0..1, .* got 'red'",
     ),
     "a background of 0 to 255": (
         lambda: sample(model_of(lambda scene: scene.draw(background=(0.0, 90, 40))), PRIOR, 3),
         ModelError,
-        r"^Expected background in 0..1, actual 90; divide by 255.$",
+        r"^expected background in 0..1, got 90; divide by 255.$",
     ),
     "a background below black": (
         lambda: sample(model_of(lambda scene: scene.draw(background=(0.0, -5, 0.4))), PRIOR, 3),
         ModelError,
-        "Expected background in 0..1, actual -5; .* clamp it",
+        "expected background in 0..1, got -5; .* clamp it",
     ),
     "a tint of 0 to 255": (
         lambda: sample(
             model_of(lambda scene: scene.draw(Sprites.disc("disc", 3.0, 3.0, 6.0, tint=(255, 0, 0)))), PRIOR, 3
         ),
         ModelError,
-        r"^Expected Sprites\('disc'\).tint in 0..1, actual 255; divide by 255.$",
+        r"^expected Sprites\('disc'\).tint in 0..1, got 255; divide by 255.$",
     ),
     "a tint beyond every scale": (
         lambda: sample(
@@ -220,7 +220,7 @@ WRONG = {
             3,
         ),
         ModelError,
-        r"tint in 0..1, actual 1300; .* clamp it",
+        r"tint in 0..1, got 1300; .* clamp it",
     ),
 }
 

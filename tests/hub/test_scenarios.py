@@ -256,7 +256,7 @@ def test_a_scenario_that_draws_other_nodes_is_refused():
 def test_scenarios_that_do_not_go_together():
     with pytest.raises(ModelError, match="at least one scenario"):
         join("none", {})
-    with pytest.raises(ModelError, match="one canvas, actual"):
+    with pytest.raises(ModelError, match="one canvas, got"):
         join("two", {**MODELS, "discs": replace(MODELS["discs"], canvas=(32, 64))})
 
 

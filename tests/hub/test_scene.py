@@ -104,9 +104,9 @@ def test_a_scene_by_hand():
 
 def test_unknown_kinds():
     scene = two_roads()
-    with pytest.raises(GrammarError, match="actual 'lorry'"):
+    with pytest.raises(GrammarError, match="got 'lorry'"):
         scene.mask("lorry")
-    with pytest.raises(GrammarError, match="actual 'lorry'"), scene.nodes("lorry"):
+    with pytest.raises(GrammarError, match="got 'lorry'"), scene.nodes("lorry"):
         pass
 
 

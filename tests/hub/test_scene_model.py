@@ -152,12 +152,12 @@ class Table:
 @pytest.mark.parametrize(
     ("what", "named"),
     [
-        (two, r"actual two\(scene, structure\)"),
-        (lambda: None, r"actual <lambda>\(\)"),
-        (Table, "actual Table"),
-        (5, "actual int"),
-        (None, "actual NoneType"),
-        (tabletop, "actual SceneModel"),
+        (two, r"got two\(scene, structure\)"),
+        (lambda: None, r"got <lambda>\(\)"),
+        (Table, "got Table"),
+        (5, "got int"),
+        (None, "got NoneType"),
+        (tabletop, "got SceneModel"),
     ],
 )
 def test_what_is_no_function_of_a_scene_graph(what, named):
@@ -171,15 +171,15 @@ OTHER = Grammar("Scene -> plate | mug")
 @pytest.mark.parametrize(
     ("given_", "message"),
     [
-        ({"grammar": "Scene -> plate"}, "actual str for a grammar"),
-        ({"prior": None}, "policy of the same grammar, .* actual NoneType"),
-        ({"prior": StructurePrior(OTHER)}, "actual StructurePrior of another grammar"),
-        ({"clases": ("plate",)}, "fields of a SceneModel in scene_model.*, actual clases"),
-        ({"program": long_form}, "actual program"),
-        ({"classes": ("cup",)}, r"'tabletop' among the grammar's objects .*actual \['cup'\]"),
+        ({"grammar": "Scene -> plate"}, "got str for a grammar"),
+        ({"prior": None}, "policy of the same grammar, .* got NoneType"),
+        ({"prior": StructurePrior(OTHER)}, "got StructurePrior of another grammar"),
+        ({"clases": ("plate",)}, "fields of a SceneModel in scene_model.*, got clases"),
+        ({"program": long_form}, "got program"),
+        ({"classes": ("cup",)}, r"'tabletop' among the grammar's objects .*got \['cup'\]"),
         ({"canvas": 64}, "positive canvas"),
         ({"max_steps": 0}, "max_steps 0"),
-        ({"renderer": 3}, "renderer of model 'tabletop' as a class or function .* actual int"),
+        ({"renderer": 3}, "renderer of model 'tabletop' as a class or function .* got int"),
         ({"assets_variable": "TABLES"}, "with_assets in model 'tabletop', whose assets TABLES names"),
     ],
 )

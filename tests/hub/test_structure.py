@@ -136,21 +136,21 @@ def test_beyond_the_last_length_a_list_stops():
 @pytest.mark.parametrize(
     ("given_", "message"),
     [
-        ({"Thing": weights(1)}, r"among \['Scene', 'Items'\], actual \['Thing'\]"),
-        ({"Items": weights(1, 2)}, "Expected 3 weights of Items, one a production, actual 2"),
+        ({"Thing": weights(1)}, r"among \['Scene', 'Items'\], got \['Thing'\]"),
+        ({"Items": weights(1, 2)}, "expected 3 weights of Items, one a production, got 2"),
         ({"Items": weights(1, -1, 2)}, "non-negative weights of Items"),
         ({"Items": weights(0, 0, 0)}, "positive sum"),
         ({"Items": weights(1, float("nan"), 1)}, "non-negative"),
         ({"Items": weights(1, float("inf"), 1)}, "non-negative"),
-        ({"Items": weights()}, "Expected 3 weights"),
+        ({"Items": weights()}, "expected 3 weights"),
         ({"Items": counts()}, "counts of Items"),
         ({"Items": counts(0, 0)}, "positive sum"),
         ({"Items": counts(0.5, -0.5)}, "non-negative counts of Items"),
-        ({"Items": counts(1, 1, weights=(1,))}, "Expected 2 weights of Items's recursive productions"),
-        ({"Items": counts(1, 1, weights=())}, "Expected 2 weights of Items's recursive productions"),
+        ({"Items": counts(1, 1, weights=(1,))}, "expected 2 weights of Items's recursive productions"),
+        ({"Items": counts(1, 1, weights=())}, "expected 2 weights of Items's recursive productions"),
         ({"Items": ranked()}, r"at least one distribution in ranked"),
-        ({"Items": ranked(weights(1, 1, 1), weights(1))}, "Expected 3 weights"),
-        ({"Scene": counts(1, 1)}, "Expected a list such as 'Scene -> item Scene | ε'"),
+        ({"Items": ranked(weights(1, 1, 1), weights(1))}, "expected 3 weights"),
+        ({"Scene": counts(1, 1)}, "expected a list such as 'Scene -> item Scene | ε'"),
     ],
 )
 def test_distributions_that_are_none(given_, message):
@@ -160,7 +160,7 @@ def test_distributions_that_are_none(given_, message):
 
 @pytest.mark.parametrize("productions", ["Scene -> Scene Scene | x", "Scene -> A\nA -> x Scene | ε"])
 def test_only_lists_are_counted(productions):
-    with pytest.raises(GrammarError, match="Expected a list"):
+    with pytest.raises(GrammarError, match="expected a list"):
         StructurePrior(Grammar(productions), Scene=counts(1, 1))
 
 
@@ -223,7 +223,7 @@ def test_what_leaves_nothing_or_says_nothing_is_named():
     prior = StructurePrior(LIST, Items=counts(1, 1))
     with pytest.raises(GrammarError, match="of Items that is legal after 1 repeats at rank 0"):
         prior.where(lambda production, repeat, _: repeat < 1 or "ε" not in production, repeats=2)
-    with pytest.raises(GrammarError, match="not legal somewhere, actual all legal up to repeat 0"):
+    with pytest.raises(GrammarError, match="not legal somewhere, got all legal up to repeat 0"):
         prior.where(lambda *_: True)
 
 

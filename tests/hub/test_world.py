@@ -68,18 +68,18 @@ def test_kittis_camera_sees_the_same_on_half_of_the_pixels():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"triangles": np.zeros((0, 3), int)}, "actual an empty one"),
-        ({"triangles": np.array([[0, 1, 2, 2]])}, r"triangles of a mesh of shape \(1, 3\), actual \(1, 4\)"),
-        ({"triangles": np.array([[0, 1, 3]])}, r"vertices 0..2 .* actual 0..3"),
+        ({"triangles": np.zeros((0, 3), int)}, "got an empty one"),
+        ({"triangles": np.array([[0, 1, 2, 2]])}, r"triangles of a mesh of shape \(1, 3\), got \(1, 4\)"),
+        ({"triangles": np.array([[0, 1, 3]])}, r"vertices 0..2 .* got 0..3"),
         ({"positions": np.eye(3) * np.nan}, "finite positions"),
-        ({"positions": np.eye(3) * 400}, "at most 200 m, actual 400 m"),
+        ({"positions": np.eye(3) * 400}, "at most 200 m, got 400 m"),
         ({"texture": np.zeros((2, 2, 3), np.uint8)}, "texture coordinates"),
         ({"uv": np.zeros((1, 3, 3))}, r"uv of a mesh of shape \(1, 3, 2\)"),
-        ({"colour": (0.8, 0.1, 0.0)}, r"colour of a mesh in 0..255, actual 0.8; multiply by 255"),
-        ({"colour": np.array([[0, 300, -2]])}, r"colour of a mesh in 0..255, actual -2; clip it"),
+        ({"colour": (0.8, 0.1, 0.0)}, r"colour of a mesh in 0..255, got 0.8; multiply by 255"),
+        ({"colour": np.array([[0, 300, -2]])}, r"colour of a mesh in 0..255, got -2; clip it"),
         (
             {"texture": np.full((2, 2, 3), 0.5), "uv": np.zeros((1, 3, 2))},
-            r"texture of a mesh in 0..255, actual 0.5; multiply by 255",
+            r"texture of a mesh in 0..255, got 0.5; multiply by 255",
         ),
     ],
 )
@@ -100,16 +100,16 @@ def test_a_mesh_does_not_change_with_its_source():
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"mesh": 1}, r"mesh in 0..0, actual 1..1"),
+        ({"mesh": 1}, r"mesh in 0..0, got 1..1"),
         ({"x": torch.zeros(3)}, r"x to broadcast to \(5, "),
         ({"yaw": float("nan")}, "finite values in Meshes\\('car'\\).yaw"),
-        ({"scale": 0.0}, "positive Meshes\\('car'\\).scale, actual 0"),
-        ({"tint": (255, 0, 0)}, r"Expected Meshes\('car'\).tint in 0..1, actual 255; divide by 255"),
-        ({"tint": torch.tensor([0.5, 1.0, 300.0])}, r"tint in 0..1, actual 300; .* clamp it"),
-        ({"light": Light(zenith=(90, 140, 220))}, r"Expected Light.zenith in 0..1, actual 220; divide by 255"),
-        ({"light": Light(horizon=torch.full((5, 3), 200.0))}, r"Light.horizon in 0..1, actual 200; divide by 255"),
-        ({"camera": Camera(focal=-700.0)}, "positive focal length in pixels, actual -700"),
-        ({"camera": Camera(pitch=torch.zeros(4, 1))}, r"Camera.pitch to broadcast to \(5, 1\), actual shape \(4, 1\)"),
+        ({"scale": 0.0}, "positive Meshes\\('car'\\).scale, got 0"),
+        ({"tint": (255, 0, 0)}, r"expected Meshes\('car'\).tint in 0..1, got 255; divide by 255"),
+        ({"tint": torch.tensor([0.5, 1.0, 300.0])}, r"tint in 0..1, got 300; .* clamp it"),
+        ({"light": Light(zenith=(90, 140, 220))}, r"expected Light.zenith in 0..1, got 220; divide by 255"),
+        ({"light": Light(horizon=torch.full((5, 3), 200.0))}, r"Light.horizon in 0..1, got 200; divide by 255"),
+        ({"camera": Camera(focal=-700.0)}, "positive focal length in pixels, got -700"),
+        ({"camera": Camera(pitch=torch.zeros(4, 1))}, r"Camera.pitch to broadcast to \(5, 1\), got shape \(4, 1\)"),
     ],
 )
 def test_worlds_that_cannot_be(more, message):
@@ -132,7 +132,7 @@ def test_grounds_that_cannot_be():
         build([[1.0, -1.0]], [[0, 0, 0]])
     with pytest.raises(ModelError, match=r"Ground.edges to broadcast to \(2, 2\)"):
         build([[-1.0, 0.0, 1.0]], [[0, 0, 0]])
-    with pytest.raises(ModelError, match=r"surface in 0..0, actual 0..1"):
+    with pytest.raises(ModelError, match=r"surface in 0..0, got 0..1"):
         build([[-1.0, 1.0]], [[0, 1, 0]])
     assert Light().sun > 0 and Photo().noise == 0
 

@@ -181,11 +181,11 @@ def test_the_score_function_learns_what_needs_context(small, kind):
 def test_make_guide():
     assert [type(make_guide(kind, COIN, 5)) for kind in GUIDES] == [LSTMGuide, PCFG, GrammarVAE]
     assert len(make_guide("grammar-vae", COIN, 5, num_latents=7).latents) == 7
-    with pytest.raises(ProbsceneError, match="lstm, pcfg, grammar-vae, actual 'hmm'"):
+    with pytest.raises(ProbsceneError, match="lstm, pcfg, grammar-vae, got 'hmm'"):
         make_guide("hmm", COIN, 5)
 
 
 def test_a_grammar_vae_has_no_logits_beyond_its_last_step():
     guide = GrammarVAE(LISTS, max_steps=6)
-    with pytest.raises(ProbsceneError, match="at most max_steps = 6 rules, actual 8"):
+    with pytest.raises(ProbsceneError, match="at most max_steps = 6 rules, got 8"):
         guide.log_prob(enumerate_derivations(LISTS, 8))

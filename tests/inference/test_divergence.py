@@ -210,7 +210,7 @@ def test_the_bounded_cost_is_the_gradient_of_jensen_shannon(small):
 @pytest.mark.parametrize(
     ("generated", "real", "says"),
     [
-        (torch.zeros(5, 2), torch.zeros(5, 3), "Expected generated"),
+        (torch.zeros(5, 2), torch.zeros(5, 3), "expected generated"),
         (torch.zeros(1, 2), torch.zeros(5, 2), "at least 2 generated"),
         (torch.zeros(5, 2), torch.zeros(0, 2), "at least 2 generated"),
         (torch.full((5, 2), torch.nan), torch.zeros(5, 2), "finite"),
@@ -233,5 +233,5 @@ def test_blocks_have_densities_of_their_own():
     assert torch.allclose(Blockwise((2, 3), (each[0], None))(*both), each[0](one, real))
     joint = each[1](*both)
     assert joint.std() < 1e-5 < found.std()
-    with pytest.raises(ProbsceneError, match="Expected generated"):
+    with pytest.raises(ProbsceneError, match="expected generated"):
         Blockwise((2, 3), each)(one, torch.cat([real, far], 1))

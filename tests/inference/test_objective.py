@@ -133,13 +133,13 @@ def test_other_arguments_start_another_batch(small):
 
 def test_a_guide_that_is_none_is_told_what_is_missing(small):
     loss = ScoreFunction(small.observe, small.cost)
-    with pytest.raises(ModelError, match="log_prob and max_steps, actual StructurePrior without max_steps"):
+    with pytest.raises(ModelError, match="log_prob and max_steps, got StructurePrior without max_steps"):
         loss(small.program, StructurePrior(small.grammar), 20, real=None)
-    with pytest.raises(ModelError, match="actual function without grammar, log_prob, max_steps"):
+    with pytest.raises(ModelError, match="got function without grammar, log_prob, max_steps"):
         loss(small.program, lambda num_scenes: None, 20, real=None)
 
 
 def test_bad_arguments_are_named(small):
     for arguments in ({"baseline": "median"}, {"updates": 0}, {"decay": 0.0}, {"clip": -1.0}, {"reject_threshold": -1}):
-        with pytest.raises(ProbsceneError, match="Expected"):
+        with pytest.raises(ProbsceneError, match="expected"):
             ScoreFunction(small.observe, small.cost, **arguments)

@@ -81,7 +81,7 @@ def test_guides_and_their_settings():
         assert chosen.guide_settings()["kind"] == kind
         assert chosen.learning_rate == PRESETS["paper"].learning_rate
     assert chosen.guide_settings() == {"kind": "grammar-vae", "hidden": 100, "num_latents": 32}
-    with pytest.raises(ProbsceneError, match="lstm, pcfg, grammar-vae, or FILE.py:NAME, actual 'hmm'"):
+    with pytest.raises(ProbsceneError, match="lstm, pcfg, grammar-vae, or FILE.py:NAME, got 'hmm'"):
         QUICK.with_guide("hmm")
 
 

@@ -165,7 +165,7 @@ def test_what_is_not_finite_ends_it(name, dots, small):
         spoilt = module.pretrained if name == "projection" else getattr(module, "heads", module)
         with torch.no_grad():
             next(p for p in spoilt.parameters()).fill_(math.nan)
-    with pytest.raises(ProbsceneError, match=r"(^|: )Expected .*finite .* actual .*(nan|NaN).*; "):
+    with pytest.raises(ProbsceneError, match=r"(^|: )expected .*finite .* got .*(nan|NaN).*; "):
         training.run()
 
 

@@ -170,7 +170,7 @@ def test_hidden_files_are_no_pictures(tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ("missing", "Expected PNG files in .*tree"),
+        ("missing", "expected PNG files in .*tree"),
         ("no alpha", r"tree/one\.png, which has no alpha channel;"),
         ("no picture", r"tree/one\.png, which is not a PNG"),
         ("web", r"tree/one\.png, which is a WebP file"),

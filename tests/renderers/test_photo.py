@@ -247,14 +247,14 @@ def test_renderers_of_ones_own_get_the_same(seed, number, height, width):
 
 def test_a_photo_of_other_scenes_is_named():
     drawing = drawing_of(noise_of(0, 2, 5, 6))
-    with pytest.raises(ModelError, match=r"uint8 \(N, 3, H, W\), actual torch.uint8 \(2, 5, 6, 3\)"):
+    with pytest.raises(ModelError, match=r"uint8 \(N, 3, H, W\), got torch.uint8 \(2, 5, 6, 3\)"):
         photo_module.photographed(resolve_scene(Photo(), 2), torch.zeros(2, 5, 6, 3, dtype=torch.uint8))
     renderer = SpriteRenderer((5, 6), threads=1)
     for photo in (Photo(), resolve_scene(Photo(), 1), resolve_scene(Photo(), 3)):
         with pytest.raises(ModelError, match="one value for each of 2 scenes.*resolve_scene"):
             renderer(replace(drawing, photo=photo))
     wrong = replace(resolve_scene(Photo(), 2), blur=torch.tensor([0.0, torch.nan]))
-    with pytest.raises(ModelError, match="Photo.blur within 0..64, actual nan"):
+    with pytest.raises(ModelError, match="Photo.blur within 0..64, got nan"):
         renderer(replace(drawing, photo=wrong))
 
 

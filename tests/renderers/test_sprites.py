@@ -355,5 +355,5 @@ def test_malformed_drawings_are_named():
 
 @pytest.mark.parametrize(("canvas", "threads"), [((0, 5), 1), ((5, -1), 1), ((1 << 14, 1 << 14), 1), ((5, 5), 0)])
 def test_malformed_renderers_are_named(canvas, threads):
-    with pytest.raises(ModelError, match="Expected"):
+    with pytest.raises(ModelError, match="expected"):
         SpriteRenderer(canvas, threads)

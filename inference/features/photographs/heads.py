@@ -136,7 +136,7 @@ class PretrainedCountNet(nn.Module):
     @torch.no_grad()
     def begin(self, maps: Maps, targets: list[Tensor]) -> None:
         """Take over channels' means and scales, and start from what places hold in the mean: from anywhere else the
-        first steps, which only mend the counts, leave a head that tells no class from another for long.
+        first steps, which only fix the counts, leave a head that tells no class from another for long.
 
         Args:
             maps: of some renders.

@@ -89,7 +89,7 @@ def generate(
             source = load_model(str(source))
         if isinstance(source, SceneModel):
             if workers != 1 or cluster is not None:
-                raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
+                raise ProbsceneError("expected one worker for a model in memory, got several; fit or name its file.")
             policy = policy or source.prior
             more = min_visible, shard, flat, box_margin, amodal, values
             return generate_scenes(source, policy, num, out, seed, format, said, *more)

@@ -67,7 +67,7 @@ def demo(
     """
     loaded = load_model(model)
     if loaded.target is None:
-        raise ModelError(f"Expected a model with a target to learn from, actual {model!r}, which has none.")
+        raise ModelError(f"expected a model with a target to learn from, got {model!r}, which has none.")
     out = make_folder(out)
     with Display() as show:
         target = _draw(loaded.target(seed), images, out, seed, show)

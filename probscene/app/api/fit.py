@@ -92,7 +92,7 @@ def fit(
             None, what is found in the images, see ``ImageFolder``. The run keeps it.
 
     Raises:
-        ProbsceneError: an input is at fault; the message says which and how to mend it. What was finished of the run
+        ProbsceneError: an input is at fault; the message says which and how to fix it. What was finished of the run
             stays, and ``resume=True`` goes on with it.
     """
     settings = with_learn(settings, learn, parameters)
@@ -194,7 +194,7 @@ def with_learn(
     """
     if parameters is not None and learn == STRUCTURE:
         raise ProbsceneError(
-            f"Expected learn={BOTH} where parameters={parameters} says how, actual learn={STRUCTURE}; leave one out."
+            f"expected learn={BOTH} where parameters={parameters} says how, got learn={STRUCTURE}; leave one out."
         )
     learn = BOTH if learn is None and parameters is not None else learn
     words = [f"{key}={_word(value)}" for key, value in settings.items()] if isinstance(settings, Mapping) else settings

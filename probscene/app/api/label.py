@@ -68,7 +68,7 @@ def label(
         few = None if labels is None else read_few(Path(labels), model, images, least=1)
         rows = _proposed(run, model, images, number, few, seed, show)
     if not rows:
-        raise DataError(f"Expected images without labels in {images.path}, actual all {len(images)} labelled.")
+        raise DataError(f"expected images without labels in {images.path}, got all {len(images)} labelled.")
     classes = model.classes if few is None else few.classes
     return write_sheet(out, images, rows, classes, model.name, _cells(images, few))
 

@@ -45,12 +45,12 @@ class GeneratorReport(NamedTuple):
 
     @property
     def fault(self) -> str:
-        """What to mend; empty for nothing."""
+        """What to fix; empty for nothing."""
         if not self.differs or not self.reproducible:
             return ""
         return (
-            f"Expected the generator {self.command} to draw a scene with the same bytes by fresh processes and in "
-            f"another order, actual another {' and another '.join(self.differs)}; let all that is random in it come "
+            f"expected the generator {self.command} to draw a scene with the same bytes by fresh processes and in "
+            f"another order, got another {' and another '.join(self.differs)}; let all that is random in it come "
             "from scene.seed and keep nothing from scene to scene, or say so: Command(..., reproducible=False)."
         )
 
@@ -80,8 +80,7 @@ def check_generator(model: SceneModel, images: Mapping[str, int]) -> GeneratorRe
     """
     if model.generator is None:
         raise ModelError(
-            f"Expected a model with a generator, actual {model.name!r}, which probscene draws itself; leave --render "
-            "out."
+            f"expected a model with a generator, got {model.name!r}, which probscene draws itself; leave --render out."
         )
     generator = _unkept(model.generator)
     if isinstance(generator, Command):

@@ -44,7 +44,7 @@ def beside_sites(
     if not differs:
         return []
     return [
-        f"Expected the program to draw the same scenes again, actual other ones {', and '.join(differs)}: something "
+        f"expected the program to draw the same scenes again, got other ones {', and '.join(differs)}: something "
         "random is no site (torch.rand, random, numpy's generators), or is kept from call to call. Draw it with "
         "pyro.sample, such as shift = pyro.sample('shift', dist.Uniform(0.0, 1.0))."
     ]

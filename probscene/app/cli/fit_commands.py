@@ -92,9 +92,9 @@ def fit(
     other = preset_for_photographs(name, features, objective, guide, settings)
     if scenarios is not None:
         if model is None:
-            raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")
+            raise ProbsceneError("expected MODEL with --scenarios, got none; a run knows its own.")
         if split_reference(model)[1]:
-            raise ProbsceneError(f"Expected scenarios once, actual {model} and {scenarios}; leave out --scenarios.")
+            raise ProbsceneError(f"expected scenarios once, got {model} and {scenarios}; leave out --scenarios.")
         model = f"{model}:{scenarios}"
     judged = None
     with Display() as show:
@@ -106,7 +106,7 @@ def fit(
                 run, images = session.resume(out, show, model, target, given, assets, parts, photographs=other, **begun)
             elif model is None or target is None:
                 raise ProbsceneError(
-                    "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
+                    "expected MODEL and --target DIR, got one missing; only --resume goes without them."
                 )
             else:
                 run, images = session.begin(

@@ -80,9 +80,9 @@ def trial(
     for words in sets or []:
         name, equals, said = words.partition("=")
         if not equals or not said:
-            raise ProbsceneError(f"Expected --set NAME=SET, actual {words!r}.")
+            raise ProbsceneError(f"expected --set NAME=SET, got {words!r}.")
         if name.strip() in named:
-            raise ProbsceneError(f"Expected a name for each set of a trial, actual {name.strip()!r} twice; rename one.")
+            raise ProbsceneError(f"expected a name for each set of a trial, got {name.strip()!r} twice; rename one.")
         named[name.strip()] = said.strip()
     found = calls.trial(
         test,
@@ -118,7 +118,7 @@ def _words(text: str) -> list[str]:
 def _numbers(text: str) -> list[int | None]:
     words = [] if text == "none" else _words(text)
     if not all(word == "all" or (word.isdecimal() and int(word) > 0) for word in words):
-        raise ProbsceneError(f"Expected numbers of photographs such as 10,20,50,all, or none, actual {text!r}.")
+        raise ProbsceneError(f"expected numbers of photographs such as 10,20,50,all, or none, got {text!r}.")
     return [None if word == "all" else int(word) for word in words]
 
 
@@ -126,5 +126,5 @@ def _size(text: str) -> tuple[int, int]:
     """Height and width."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise ProbsceneError(f"Expected a size WIDTHxHEIGHT such as 256x192, actual {text!r}.")
+        raise ProbsceneError(f"expected a size WIDTHxHEIGHT such as 256x192, got {text!r}.")
     return int(height), int(width)

@@ -28,7 +28,7 @@ def drawable(model: SceneModel, drawing: Renderable) -> Drawing | World:
     """
     if isinstance(drawing, Request):
         raise ProbsceneError(
-            f"Expected a model of sprites or meshes for amodal masks, actual {model.name!r}, whose generator draws "
+            f"expected a model of sprites or meshes for amodal masks, got {model.name!r}, whose generator draws "
             "whole scenes; leave amodal out."
         )
     return drawing

@@ -37,7 +37,7 @@ def files(model: SceneModel, batch: RenderBatch) -> list[bytes]:
     depth = of(batch)
     if depth is None:
         raise ProbsceneError(
-            f"Expected renders of model {model.name!r} to have depth, for format depth, actual none; choose other "
+            f"expected renders of model {model.name!r} to have depth, for format depth, got none; choose other "
             "formats, or let its generator return depth."
         )
     steps = np.rint(depth.double().numpy() * _METRE)

@@ -46,7 +46,7 @@ class Shard(NamedTuple):
         """
         number, _, shards = text.partition("/")
         if not (number.isdecimal() and shards.isdecimal() and int(number) < int(shards)):
-            raise ProbsceneError(f"Expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8, actual {text!r}.")
+            raise ProbsceneError(f"expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8, got {text!r}.")
         return Shard(int(number), int(shards))
 
 
@@ -88,7 +88,7 @@ class DatasetFolder:
         begun = self.place.exists(SETTINGS)  # in this order: what else is there may be what another process has begun
         if others and not begun:
             raise DataError(
-                f"Expected a new or empty folder for the dataset, actual {self.place} with {', '.join(others[:5])} in "
+                f"expected a new or empty folder for the dataset, got {self.place} with {', '.join(others[:5])} in "
                 "it; name another folder."
             )
         self.place.make()
@@ -181,7 +181,7 @@ class DatasetFolder:
             settings |= {key: line.get(key, usual) for key, usual in UNSAID.items()}
         except (OSError, StopIteration, ValueError, KeyError, TypeError) as error:
             raise DataError(
-                f"Expected lines of provenance in {self.place}/{LINES}, actual something else; name another folder."
+                f"expected lines of provenance in {self.place}/{LINES}, got something else; name another folder."
             ) from error
         settings |= {"num": num, "format": ",".join(found(self.place.exists))}
         return settings | {"flat": line["image"] == image_name(line["index"], True)}
@@ -192,7 +192,7 @@ class DatasetFolder:
         if differing:
             was, now = (", ".join(f"{key} {s.get(key)}" for key in differing) for s in (before, settings))
             raise DataError(
-                f"Expected the settings that the dataset in {self.place} was begun with ({was}), actual {now}; "
+                f"expected the settings that the dataset in {self.place} was begun with ({was}), got {now}; "
                 "give the same, or name another folder; this one is left as it is."
             )
 
@@ -209,6 +209,6 @@ def check_begun(out: Path | str) -> None:
             return
         time.sleep(1)
     raise DataError(
-        f"Expected the folder {out} of the machine that runs the command, actual another or none; write to a folder "
+        f"expected the folder {out} of the machine that runs the command, got another or none; write to a folder "
         "that all nodes share, or to an address such as s3://."
     )

@@ -104,9 +104,9 @@ def generate(
             ``Crew.run``.
     """
     if workers < 1:
-        raise ProbsceneError(f"Expected a positive number of workers, actual {workers}.")
+        raise ProbsceneError(f"expected a positive number of workers, got {workers}.")
     if cluster is not None and workers > 1:
-        raise ProbsceneError(f"Expected workers or a cluster, actual {workers} workers and a cluster; leave one out.")
+        raise ProbsceneError(f"expected workers or a cluster, got {workers} workers and a cluster; leave one out.")
     part = WHOLE if shard is None else Shard.of(shard)
     more = min_visible, flat, box_margin, amodal, attributes.chosen(values)
     job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), *more)
@@ -114,7 +114,7 @@ def generate(
         return job.run(job.each, progress, part)
     if run.objects:
         raise ProbsceneError(
-            f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual "
+            f"expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), got "
             f"{workers if cluster is None else 'a cluster'}; fit a model and parts in files for more."
         )
     task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, *more)
@@ -178,16 +178,16 @@ class Job:
         values: str | Iterable[str] = (),
     ):
         if num < 1:
-            raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
+            raise ProbsceneError(f"expected a positive number of images, got {num}.")
         if seed < 0:
-            raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
+            raise ProbsceneError(f"expected a seed of 0 or more, got {seed}.")
         coco.check_min_visible(min_visible)
         coco.check_box_margin(box_margin)
         self.formats, self.box_margin = chosen(format), int(box_margin)
         self.amodal, self.values = bool(amodal), attributes.chosen(values)
         if (self.amodal or self.values) and not {"coco", "webdataset"} & {*self.formats}:
             raise ProbsceneError(
-                f"Expected coco or webdataset among the formats for {'amodal masks' if amodal else 'values'}, actual "
+                f"expected coco or webdataset among the formats for {'amodal masks' if amodal else 'values'}, got "
                 f"{', '.join(self.formats)}; add one of them."
             )
         if "kitti" in self.formats:
@@ -238,7 +238,7 @@ class Job:
             amodal.drawable(self.model, scenes.drawing)
         if posed and not self._named(keypoints(scenes.drawing[:1], self.model.canvas)):
             raise ProbsceneError(
-                f"Expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, actual none; "
+                f"expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, got none; "
                 "name some: Sprites(..., keypoints={'nose': (0.5, 0.2)}), or choose other formats."
             )
         if "depth" in self.formats or boxes:
@@ -375,7 +375,7 @@ class Job:
             names = record["keypoints"] if names is None else names
             if record["keypoints"] != names:
                 raise ModelError(
-                    f"Expected model {self.model.name!r} to name the same keypoints whatever it draws, actual {names} "
+                    f"expected model {self.model.name!r} to name the same keypoints whatever it draws, got {names} "
                     f"in some scenes and {record['keypoints']} in others; give scene.draw every layer always."
                 )
             yield record

@@ -62,7 +62,7 @@ def check(model: SceneModel) -> None:
     """
     if len(model.classes) > MOST:
         raise ProbsceneError(
-            f"Expected at most {MOST} classes, for 8 bits of KITTI's masks, actual {len(model.classes)} in model "
+            f"expected at most {MOST} classes, for 8 bits of KITTI's masks, got {len(model.classes)} in model "
             f"{model.name!r}; choose other formats."
         )
 
@@ -75,8 +75,8 @@ def check_box_margin(model: SceneModel, batch: RenderBatch, box_margin: int) -> 
     """
     if box_margin and batch.space is not None:
         raise ProbsceneError(
-            f"Expected no box_margin in KITTI's labels of the 3D model {model.name!r}, whose boxes there are of whole "
-            f"silhouettes, actual {box_margin}; leave it out, or choose other formats."
+            f"expected no box_margin in KITTI's labels of the 3D model {model.name!r}, whose boxes there are of whole "
+            f"silhouettes, got {box_margin}; leave it out, or choose other formats."
         )
 
 
@@ -122,7 +122,7 @@ def instances(model: SceneModel, batch: RenderBatch, first: int, min_visible: fl
             nodes = np.flatnonzero(category == number)
             if len(nodes) > MOST:
                 raise ProbsceneError(
-                    f"Expected at most {MOST} objects of a class in an image, for 8 bits of KITTI's masks, actual "
+                    f"expected at most {MOST} objects of a class in an image, for 8 bits of KITTI's masks, got "
                     f"{len(nodes)} of class {model.classes[number - 1]!r} in image {first + i}; write other formats to "
                     "another folder."
                 )

@@ -137,8 +137,8 @@ def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
         path, name = run.path, run.path.resolve().name
         if name in runs or name in (PRIOR, START, TRUTH, ESTIMATE):
             raise RunError(
-                f"Expected runs in folders of different names, none of them {PRIOR}, {START}, {TRUTH} or {ESTIMATE}, "
-                f"actual another {name!r} at {path}; rename the folder, or save the run under another name."
+                f"expected runs in folders of different names, none of them {PRIOR}, {START}, {TRUTH} or {ESTIMATE}, "
+                f"got another {name!r} at {path}; rename the folder, or save the run under another name."
             )
         first = next(iter(runs.values()), run)
         same = {
@@ -150,7 +150,7 @@ def open_runs(given: Sequence[RunFolder | Path | str]) -> dict[str, RunFolder]:
         if not all(same.values()):
             differs = next(words for words, alike in same.items() if not alike)
             raise RunError(
-                f"Expected runs of one model, actual {first.path} of {first.record['model']} and {path} of "
+                f"expected runs of one model, got {first.path} of {first.record['model']} and {path} of "
                 f"{run.record['model']}{differs}; compare runs of the same model."
             )
         run.check_finished()
@@ -182,12 +182,12 @@ def compare(
         RunError: there are no target images, and the runs were fitted to different ones.
     """
     if num < 1:
-        raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
+        raise ProbsceneError(f"expected a positive number of scenes, got {num}.")
     first = next(iter(runs.values()))
     path = first.target if target is None else target.path
     if target is None and (other := next((r for r in runs.values() if r.target != path), None)):
         raise RunError(
-            f"Expected runs that were fitted to the same images, actual {first.path} to {path} and {other.path} to "
+            f"expected runs that were fitted to the same images, got {first.path} to {path} and {other.path} to "
             f"{other.target}; say with --target which to compare with."
         )
     model, done = first.model, 0

@@ -218,7 +218,7 @@ def _would_tell(looked: dict[str, Looked]) -> str:
 def _aspect(run: RunFolder, name: str, figures: Nearness | None, worse: str, would_tell: str) -> Aspect:
     if figures is None:
         why = "Not judged: too few learnt scenes have as many objects as the target's images."
-        return Aspect(None, why, "Mend the structure first.")
+        return Aspect(None, why, "Fix the structure first.")
     word, because = figures.word, _because(figures)
     if word is None:
         why = f"Of {figures.rows} images neither what was learnt nor the prior can be told from the target."

@@ -109,14 +109,14 @@ def judge(
     """
     num = SCENES if num is None else num
     if num < NEEDED:
-        raise ProbsceneError(f"Expected at least {NEEDED} scenes to judge by, actual {num}; or 0 for no verdict.")
+        raise ProbsceneError(f"expected at least {NEEDED} scenes to judge by, got {num}; or 0 for no verdict.")
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
     if run.readings and set(run.unread) == set(run.model.classes) - set(run.model.stuff):
         return Judged(None, usable(run))
     if len(target) < NEEDED:
         return Judged(
-            None, f"Expected at least {NEEDED} real images for a verdict, actual {len(target)} in {target.path}."
+            None, f"expected at least {NEEDED} real images for a verdict, got {len(target)} in {target.path}."
         )
     preset, model, net = run.preset, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)

@@ -228,9 +228,9 @@ def evaluate(
         RunError: the fit is not finished.
     """
     if num < 1:
-        raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
+        raise ProbsceneError(f"expected a positive number of scenes, got {num}.")
     if features and target is None:
-        raise ProbsceneError("Expected the target's images to compare features with, actual none.")
+        raise ProbsceneError("expected the target's images to compare features with, got none.")
     policies = {**before(run.model), LEARNT: run.guide}
     seen, notes = seen_by(run.model, run, truth, visible)
     done = 0

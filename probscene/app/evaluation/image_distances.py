@@ -55,9 +55,9 @@ def image_distances(
     if not choices:
         return {}
     if num is not None and num < 2:
-        raise ProbsceneError(f"Expected at least 2 images to compare, actual {num}.")
+        raise ProbsceneError(f"expected at least 2 images to compare, got {num}.")
     if len(target) < 4:
-        raise DataError(f"Expected at least 4 images in {target.path} for KID and FID, actual {len(target)}.")
+        raise DataError(f"expected at least 4 images in {target.path} for KID and FID, got {len(target)}.")
     from probscene.inference.statistics.image_metrics import fid, kid  # torchmetrics takes seconds to import
 
     nets = [network(choice, run) for choice in choices]

@@ -82,7 +82,7 @@ def read_labels(path: Path, model: SceneModel, target: Images, some: bool = Fals
         return Labels(counts, None, boxes.classes, notes, low, boxes.rows, whole)
     if min_height:
         raise DataError(
-            "Expected labels with boxes (COCO's, KITTI's or YOLO's) for a least height of objects, actual the file "
+            "expected labels with boxes (COCO's, KITTI's or YOLO's) for a least height of objects, got the file "
             f"{path}."
         )
     if path.suffix != ".jsonl":
@@ -113,9 +113,7 @@ def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool)
             of_line.append((list(line["rules"]), line["derivation"]))
         except (ValueError, KeyError, TypeError) as error:
             about = f"{type(error).__name__}: {error}"
-            raise DataError(
-                f"Expected image, rules and derivation {where}, actual something else ({about})."
-            ) from error
+            raise DataError(f"expected image, rules and derivation {where}, got something else ({about}).") from error
     found = match_target(path, entries, target, some)
     rules = [_rules(model, *of_line[k], entries[k].where) for k in found.entries.values()]
     try:
@@ -125,7 +123,7 @@ def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool)
         whole = False
     if not whole:
         names = (target.paths[i].name for i, row in zip(found.entries, rules, strict=True) if not _is_whole(model, row))
-        raise DataError(f"Expected structures of model {model.name!r} in {path}, actual another of {next(names)}.")
+        raise DataError(f"expected structures of model {model.name!r} in {path}, got another of {next(names)}.")
     return Labels(count(model, derivation), derivation, notes=found.notes, rows=list(found.entries))
 
 
@@ -134,7 +132,7 @@ def _rules(model: SceneModel, rules: list[Any], spelt: str, where: str) -> list[
     known = model.grammar.rules
     own = rules and all(type(rule) is int and 0 <= rule < len(known) for rule in rules)
     if not own or "; ".join(str(known[rule]) for rule in rules) != spelt:
-        raise DataError(f"Expected rules of model {model.name!r} {where}, actual those of another grammar.")
+        raise DataError(f"expected rules of model {model.name!r} {where}, got those of another grammar.")
     return rules
 
 

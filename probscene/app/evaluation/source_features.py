@@ -138,8 +138,8 @@ def _cells(run: RunFolder, net: FeatureNet, images: Tensor) -> Tensor | None:
     shape = tuple(found.shape)
     if len(shape) != 4 or shape[:2] != (len(images), len(classes)) or not (found >= 0).all():
         raise ModelError(
-            f"Expected of {type(own).__name__}.cells numbers that are not negative ({len(images)}, {len(classes)}, h, "
-            f"w), actual {shape}; see docs/extending.md."
+            f"expected of {type(own).__name__}.cells numbers that are not negative ({len(images)}, {len(classes)}, h, "
+            f"w), got {shape}; see docs/extending.md."
         )
     return found[:, [classes.index(name) for name in names]]
 

@@ -64,7 +64,7 @@ def seen_by(
     if truth is not None and truth.derivation is not None:
         if given is not None:
             raise ProbsceneError(
-                "Expected labels of what can be seen with a visible share, actual whole structures; leave out the "
+                "expected labels of what can be seen with a visible share, got whole structures; leave out the "
                 "share, or give labels that people made."
             )
         return None, ()
@@ -91,15 +91,13 @@ def visible_shares(given: Visible, classes: tuple[str, ...]) -> dict[str, float]
     found: dict[str, float] = {}
     for name, share in pairs:
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
-            raise ProbsceneError(f"Expected a visible share from 0 to 1, or CLASS=SHARE, actual {share!r}.")
+            raise ProbsceneError(f"expected a visible share from 0 to 1, or CLASS=SHARE, got {share!r}.")
         if name in found:
-            raise ProbsceneError(
-                f"Expected one visible share {f'of {name}' if name else 'of all classes'}, actual two."
-            )
+            raise ProbsceneError(f"expected one visible share {f'of {name}' if name else 'of all classes'}, got two.")
         found[name] = float(share)
     if unknown := next((name for name in found if name and name not in classes), None):
         raise ProbsceneError(
-            f"Expected a visible share of a class among {', '.join(classes)}, actual {unknown!r}; mend the name."
+            f"expected a visible share of a class among {', '.join(classes)}, got {unknown!r}; fix the name."
         )
     every = {name: found[""] for name in classes} if "" in found else {}
     return every | {name: share for name, share in found.items() if name}
@@ -186,7 +184,7 @@ def _of_run(model: SceneModel, run: Storage) -> dict[str, float]:
     try:
         return visible_shares(shares, model.classes)
     except ProbsceneError as error:
-        raise RunError(f"Expected visible shares of the model's classes in {run.path}, actual {shares}.") from error
+        raise RunError(f"expected visible shares of the model's classes in {run.path}, got {shares}.") from error
 
 
 def _number(text: str) -> float | str:

@@ -48,7 +48,7 @@ def override(preset: Preset, settings: list[str], other: Preset | None = None) -
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
-            raise ProbsceneError(f"Expected --set key=value, actual {setting!r}.")
+            raise ProbsceneError(f"expected --set key=value, got {setting!r}.")
         pairs.append((key.strip(), text.strip()))
     preset = _applied(preset, pairs)
     unread = preset.unread()
@@ -56,15 +56,15 @@ def override(preset: Preset, settings: list[str], other: Preset | None = None) -
         unread = {name: because for name, because in unread.items() if name in _applied(other, pairs).unread()}
     for key, _ in pairs:
         if because := unread.get(key.partition(".")[0]):
-            raise ProbsceneError(f"Expected settings that are read, actual --set {key}=...: {because}; leave it out.")
+            raise ProbsceneError(f"expected settings that are read, got --set {key}=...: {because}; leave it out.")
     if preset.objective == "mmd" and preset.baseline == "leave_one_out":
         raise ProbsceneError(
-            "Expected a baseline of moving_average or none with objective=mmd, actual leave_one_out: all scenes share "
+            "expected a baseline of moving_average or none with objective=mmd, got leave_one_out: all scenes share "
             "one cost, so that their advantages would all be 0."
         )
     if preset.batches == 0 and preset.learn == STRUCTURE:
         raise ProbsceneError(
-            f"Expected batches of at least 1 where structure alone is learnt, actual 0; add learn={BOTH} to learn "
+            f"expected batches of at least 1 where structure alone is learnt, got 0; add learn={BOTH} to learn "
             "parameters in the structures that guides are pretrained on."
         )
     return preset
@@ -84,13 +84,13 @@ def _replaced(value: Any, path: list[str], text: str, key: str) -> Any:
     known = [field.name for field in fields(value)]
     if name not in known:
         where = f" of {key.rpartition('.')[0]}" if "." in key else ""
-        raise ProbsceneError(f"Expected a setting{where} among {', '.join(known)}, actual {key!r} in --set.")
+        raise ProbsceneError(f"expected a setting{where} among {', '.join(known)}, got {key!r} in --set.")
     inner = getattr(value, name)
     if rest and not is_dataclass(inner):
-        raise ProbsceneError(f"Expected --set {key.removesuffix('.' + '.'.join(rest))}=..., actual {key!r}.")
+        raise ProbsceneError(f"expected --set {key.removesuffix('.' + '.'.join(rest))}=..., got {key!r}.")
     if is_dataclass(inner):
         if not rest:
-            raise ProbsceneError(f"Expected --set {key}.{fields(inner)[0].name}=..., actual {key!r} alone.")
+            raise ProbsceneError(f"expected --set {key}.{fields(inner)[0].name}=..., got {key!r} alone.")
         return replace(value, **{name: _replaced(inner, rest, text, key)})
     new = _read(text, get_type_hints(type(value))[name], key)
     if isinstance(new, str):
@@ -113,14 +113,14 @@ def _read(text: str, wanted: Any, key: str) -> Any:
         return wanted(text)
     except (KeyError, ValueError):
         kind = wanted.__name__ if isinstance(wanted, type) else str(wanted)
-        raise ProbsceneError(f"Expected --set {key}=<{kind}>, actual {text!r}.") from None
+        raise ProbsceneError(f"expected --set {key}=<{kind}>, got {text!r}.") from None
 
 
 def _check(name: str, value: Any, key: str) -> None:
     if isinstance(value, str) and value not in CHOICES[name]:
-        raise ProbsceneError(f"Expected --set {key}=... among {', '.join(CHOICES[name])}, actual {value!r}.")
+        raise ProbsceneError(f"expected --set {key}=... among {', '.join(CHOICES[name])}, got {value!r}.")
     if type(value) is int and value < LEAST.get(name, 1):
-        raise ProbsceneError(f"Expected --set {key}=... of at least {LEAST.get(name, 1)}, actual {value}.")
+        raise ProbsceneError(f"expected --set {key}=... of at least {LEAST.get(name, 1)}, got {value}.")
     if type(value) is float and not (math.isfinite(value) and (value > 0 or (value == 0 and name not in ABOVE_ZERO))):
         least = "above 0" if name in ABOVE_ZERO else "of at least 0"
-        raise ProbsceneError(f"Expected --set {key}=... {least}, actual {value}.")
+        raise ProbsceneError(f"expected --set {key}=... {least}, got {value}.")

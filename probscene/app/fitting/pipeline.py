@@ -70,7 +70,7 @@ def fit(
         return run.guide
     if cluster is not None and run.objects:
         raise ProbsceneError(
-            f"Expected no cluster for a fit with parts in memory alone ({', '.join(run.objects)}); put model and parts "
+            f"expected no cluster for a fit with parts in memory alone ({', '.join(run.objects)}); put model and parts "
             "in files, which nodes can open."
         )
     images = cache(lambda: open_target(run, progress) if target is None else target)
@@ -215,7 +215,7 @@ def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: 
 
 def _others(target: Images) -> RunError:
     return RunError(
-        f"Expected the target images in {target.path} as they were when the run began, actual others; put them back, "
+        f"expected the target images in {target.path} as they were when the run began, got others; put them back, "
         "or begin a new run."
     )
 
@@ -228,12 +228,12 @@ def check_target(target: Images) -> None:
     """
     if len(target) < NEEDED:
         raise DataError(
-            f"Expected at least {NEEDED} images in {target.path}, from which the distribution of their features is "
-            f"estimated, actual {len(target)}; add images."
+            f"expected at least {NEEDED} images in {target.path}, from which the distribution of their features is "
+            f"estimated, got {len(target)}; add images."
         )
     if target.distinct == 1:
         raise DataError(
-            f"Expected images that differ in {target.path}, actual {len(target)} that are all the same; a distribution "
+            f"expected images that differ in {target.path}, got {len(target)} that are all the same; a distribution "
             "cannot be learnt from one image."
         )
 
@@ -248,7 +248,7 @@ def open_target(run: RunFolder, progress: Progress) -> Images:
     model, target = run.model, run.record["target"]
     if target is None:
         raise RunError(
-            f"Expected the images that the run in {run.path} was begun with, actual none: they were in memory. Give "
+            f"expected the images that the run in {run.path} was begun with, got none: they were in memory. Give "
             "them again: as the target of the command, or from Python, probscene.fit(..., resume=True) for a fit."
         )
     return ImageFolder(

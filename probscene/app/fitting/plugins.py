@@ -75,7 +75,7 @@ def load_part(word: str, imported: dict[Path, ModuleType] | None = None) -> Any:
     if file not in modules:
         modules[file] = import_file(file)
     if not hasattr(modules[file], name):
-        raise ModelError(f"Expected {name!r} in {file}, actual none; write FILE.py:NAME with a name that it has.")
+        raise ModelError(f"expected {name!r} in {file}, got none; write FILE.py:NAME with a name that it has.")
     return getattr(modules[file], name)
 
 
@@ -93,14 +93,14 @@ def as_features(given: Any) -> Features:
         missing += [name for name in ("resolution", "pretrained", "takes_labels") if not hasattr(made, name)]
         if missing:
             raise ModelError(
-                f"Expected features with {', '.join(methods)}, actual {type(made).__name__} without "
+                f"expected features with {', '.join(methods)}, got {type(made).__name__} without "
                 f"{', '.join(missing)}; subclass probscene.Features, which has them."
             )
         return made
     if is_network(made):
         return Fixed(made)
     raise ModelError(
-        f"Expected features with a name and build(model), or a network with names and embed(images), actual "
+        f"expected features with a name and build(model), or a network with names and embed(images), got "
         f"{type(made).__name__}; see probscene.Features."
     )
 
@@ -121,7 +121,7 @@ def as_divergence(given: Any) -> Divergence:
     made = _made(given, "a divergence")
     if not _takes(made, 2):
         raise ModelError(
-            f"Expected a divergence, called with features (N, D) and (L, D), actual {_called(made)}; see "
+            f"expected a divergence, called with features (N, D) and (L, D), got {_called(made)}; see "
             "probscene.Divergence."
         )
     return cast(Divergence, made)
@@ -135,7 +135,7 @@ def as_guide_maker(given: Any) -> GuideMaker:
     """
     if isinstance(given, Policy) or not _takes(given, 2):
         raise ModelError(
-            f"Expected a class of guides or a function, called with the grammar and max_steps, actual {_called(given)};"
+            f"expected a class of guides or a function, called with the grammar and max_steps, got {_called(given)};"
             " every fit makes its own guide."
         )
     return cast(GuideMaker, given)
@@ -147,7 +147,7 @@ def _made(given: Any, what: str) -> Any:
         return given
     if not _takes(given, 0):
         raise ModelError(
-            f"Expected {what}, or a class of them that is made without arguments, actual {given.__name__}"
+            f"expected {what}, or a class of them that is made without arguments, got {given.__name__}"
             f"{inspect.signature(given)}; give defaults, or name an object."
         )
     return given()
@@ -178,8 +178,8 @@ class CheckedNet:
     def __init__(self, net: Any, features: Any):
         if not is_network(net):
             raise ModelError(
-                f"Expected of {type(features).__name__}.build a network with names, one a feature, and embed(images), "
-                f"actual {type(net).__name__}; see probscene.FeatureNet."
+                f"expected of {type(features).__name__}.build a network with names, one a feature, and embed(images), "
+                f"got {type(net).__name__}; see probscene.FeatureNet."
             )
         self.net: FeatureNet = net
         self.names = tuple(net.names)
@@ -205,7 +205,7 @@ class CheckedNet:
             alone = self.net.embed(images[:1])
             if alone.shape != found[:1].shape or not torch.allclose(alone, found[:1], rtol=1e-4, atol=1e-5):
                 raise ModelError(
-                    f"Expected {where} to give an image the same features alone and in a batch, actual others; use no "
+                    f"expected {where} to give an image the same features alone and in a batch, got others; use no "
                     "statistics of the batch and no random numbers, and call eval()."
                 )
             self._checked = True
@@ -236,7 +236,7 @@ class CheckedDivergence:
         if not self._checked:
             if not torch.equal(self.divergence(generated, real), cost):
                 raise ModelError(
-                    f"Expected {what} to give the same costs whenever it is given the same features, actual others; "
+                    f"expected {what} to give the same costs whenever it is given the same features, got others; "
                     "draw no random numbers in it, and keep nothing from call to call."
                 )
             self._checked = True
@@ -252,9 +252,9 @@ def check_guide(guide: Any, max_steps: int) -> Guide:
     """
     name = type(guide).__name__
     if not isinstance(guide, Guide):
-        raise ModelError(f"Expected a guide, actual {name}; subclass probscene.Guide.")
+        raise ModelError(f"expected a guide, got {name}; subclass probscene.Guide.")
     if not any(p.requires_grad for p in guide.parameters()):
-        raise ModelError(f"Expected a guide with parameters to learn, actual {name} with none.")
+        raise ModelError(f"expected a guide with parameters to learn, got {name} with none.")
     with torch.no_grad(), pyro.poutine.block():
         # Complete or not: an untrained guide's scenes may well be endless.
         derivation = derive(guide.grammar, _Logits(guide, name), 4, max_steps)
@@ -262,7 +262,7 @@ def check_guide(guide: Any, max_steps: int) -> Guide:
     _check_tensor(found[0], (4,), f"{name}.log_prob", "one log-probability a derivation (N,)")
     if not torch.equal(*found):
         raise ModelError(
-            f"Expected {name}.log_prob to say the same of the same derivations, actual two different answers; use no "
+            f"expected {name}.log_prob to say the same of the same derivations, got two different answers; use no "
             "random numbers in it, such as dropout."
         )
     return guide
@@ -280,7 +280,7 @@ class _Logits(Policy):
     def step(self, memory: Any, frontier: Any, previous_rule: Tensor) -> tuple[Tensor, Any]:
         found = self.guide.step(memory, frontier, previous_rule)
         if not isinstance(found, tuple) or len(found) != 2:
-            raise ModelError(f"Expected (logits, memory) of {self.name}.step, actual {type(found).__name__}.")
+            raise ModelError(f"expected (logits, memory) of {self.name}.step, got {type(found).__name__}.")
         shape = (len(previous_rule), len(self.grammar.rules))
         _check_tensor(found[0], shape, f"{self.name}.step", "logits (N, K), one column a rule")
         return found
@@ -292,6 +292,6 @@ class _Logits(Policy):
 def _check_tensor(found: Any, shape: tuple[int, ...], where: str, what: str) -> None:
     if not isinstance(found, Tensor) or tuple(found.shape) != shape or not found.is_floating_point():
         actual = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
-        raise ModelError(f"Expected of {where} {what}: a float tensor {shape}, actual {actual}.")
+        raise ModelError(f"expected of {where} {what}: a float tensor {shape}, got {actual}.")
     if not torch.isfinite(found).all():
-        raise ProbsceneError(f"Expected finite values of {where}, actual NaN or infinity; mend it there.")
+        raise ProbsceneError(f"expected finite values of {where}, got NaN or infinity; fix it there.")

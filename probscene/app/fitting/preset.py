@@ -147,7 +147,7 @@ class Preset:
         """
         if objective not in OBJECTIVES and not is_file_part(objective):
             raise ProbsceneError(
-                f"Expected an objective among {', '.join(OBJECTIVES)}, or FILE.py:NAME, actual {objective!r}."
+                f"expected an objective among {', '.join(OBJECTIVES)}, or FILE.py:NAME, got {objective!r}."
             )
         if objective == self.objective or objective != "mmd":
             return replace(self, objective=objective)
@@ -182,8 +182,8 @@ class Preset:
                 ", ".join(sorted(set(settings) - set(known))) if isinstance(settings, dict) else type(settings).__name__
             )
             raise ModelError(
-                f"Expected of {type(features).__name__}.settings a dict with fields of Preset ({', '.join(known)}), "
-                f"actual {actual}."
+                f"expected of {type(features).__name__}.settings a dict with fields of Preset ({', '.join(known)}), "
+                f"got {actual}."
             )
         return replace(self, features=word or features.name, **settings)
 
@@ -220,7 +220,7 @@ class Preset:
         if is_file_part(kind):
             return replace(self, guide=kind)
         if kind not in GUIDES:
-            raise ProbsceneError(f"Expected a guide among {', '.join(GUIDES)}, or FILE.py:NAME, actual {kind!r}.")
+            raise ProbsceneError(f"expected a guide among {', '.join(GUIDES)}, or FILE.py:NAME, got {kind!r}.")
         if kind == "pcfg":
             return replace(self, guide=kind, pretrain_rate=3e-2)
         if kind == "grammar-vae":

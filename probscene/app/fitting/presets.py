@@ -88,7 +88,7 @@ def preset(name: str) -> Preset:
         ProbsceneError: there is none.
     """
     if name not in PRESETS:
-        raise ProbsceneError(f"Expected a preset among {', '.join(PRESETS)}, actual {name!r}.")
+        raise ProbsceneError(f"expected a preset among {', '.join(PRESETS)}, got {name!r}.")
     return PRESETS[name]
 
 

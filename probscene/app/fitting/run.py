@@ -154,7 +154,7 @@ class RunFolder(Storage):
             named = ", ".join(f"{name} ({objects[name]})" for name in missing)
             again = ", ".join(f"{name}=..." for name in missing)
             raise RunError(
-                f"Expected all that the run in {self.path} was begun with, actual its folder, which cannot give back "
+                f"expected all that the run in {self.path} was begun with, got its folder, which cannot give back "
                 f"what was in memory: {named}. Open it from Python: probscene.Run.open({str(self.path)!r}, {again})."
             )
 
@@ -257,14 +257,14 @@ class RunFolder(Storage):
         """
         tensors = self.read_tensors("guide")
         if tensors is None:
-            raise RunError(f"Expected a finished fit in {self.path}, actual an unfinished one; go on with --resume.")
+            raise RunError(f"expected a finished fit in {self.path}, got an unfinished one; go on with --resume.")
         if PRIOR_KEPT in tensors:
             return self.model.prior
         guide = self.new_guide()
         try:
             guide.load_state_dict(apart(tensors)[0])
         except RuntimeError as error:
-            raise RunError(f"Expected a guide for model {self.model.name} in {self.path}, actual another.") from error
+            raise RunError(f"expected a guide for model {self.model.name} in {self.path}, got another.") from error
         return with_parameters(self, guide.eval(), apart(tensors)[1])
 
     def check_finished(self) -> None:
@@ -291,7 +291,7 @@ class RunFolder(Storage):
                 else ""
             )
             raise RunError(
-                f"Expected the {what} file {file} as it was when {self.path} was fitted, actual a missing or changed "
+                f"expected the {what} file {file} as it was when {self.path} was fitted, got a missing or changed "
                 f"file. {kept or 'Put it back, or fit again.'}"
             )
 

@@ -51,7 +51,7 @@ def checked_model(model: str | SceneModel, assets: Path | None = None) -> SceneM
     loaded = model if isinstance(model, SceneModel) else load_model(model, assets)
     if faults := check_model(loaded, *QUICK).faults:
         name = loaded.name if isinstance(model, SceneModel) else model
-        raise ModelError(f"Expected a model without faults, actual {name}: {' '.join(faults)}")
+        raise ModelError(f"expected a model without faults, got {name}: {' '.join(faults)}")
     return loaded
 
 
@@ -87,7 +87,7 @@ def begin(
             ``checked_model``, ``open_images``, ``check_target``, ``read_few`` and ``RunFolder.create``.
     """
     if threads is not None and threads < 1:
-        raise ProbsceneError(f"Expected a positive number of threads, actual {threads}.")
+        raise ProbsceneError(f"expected a positive number of threads, got {threads}.")
     check_free(out)
     loaded = checked_model(model, assets)
     images = open_images(target, loaded, skip_bad, show, value_range)
@@ -184,7 +184,7 @@ def resume(
     for key, value in given.items():
         if value != known[key]:
             raise RunError(
-                f"Expected the {key} that the run in {out} was begun with ({known[key]}), actual {value}; leave it "
+                f"expected the {key} that the run in {out} was begun with ({known[key]}), got {value}; leave it "
                 "out with --resume, or begin another run."
             )
     if run.record != before:
@@ -196,7 +196,7 @@ def resume(
     elif images is None:
         if isinstance(place := run.record["target"], str) and not Path(place).exists():
             raise RunError(
-                f"Expected the images of the run in {out} in {place}, actual nothing there; where they lie elsewhere "
+                f"expected the images of the run in {out} in {place}, got nothing there; where they lie elsewhere "
                 "by now, name that folder with --target."
             )
         images = open_target(run, show)
@@ -257,7 +257,7 @@ def check_takes_labels(features: Features) -> None:
     if not features.takes_labels:
         able = " or ".join(f"--features {name}" for name in takers_of_labels())
         raise ProbsceneError(
-            f"Expected features that labels can calibrate, actual {features.name!r}, which take none; "
+            f"expected features that labels can calibrate, got {features.name!r}, which take none; "
             f"{f'add {able}, or ' if able else ''}leave out the labels."
         )
 
@@ -308,7 +308,7 @@ def _same_labels(run: RunFolder, images: Images) -> FewLabels | None:
     path = Path(kept["path"])
     if labels_record(path) != kept:
         raise RunError(
-            f"Expected the labels in {path} as they were when the run in {run.path} was begun, actual others; put them "
+            f"expected the labels in {path} as they were when the run in {run.path} was begun, got others; put them "
             "back, or begin a new run."
         )
     return read_few(path, run.model, images)

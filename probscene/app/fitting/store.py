@@ -67,7 +67,7 @@ class Storage:
             return {name: float(read["visible"]) for name, read in found.items() if "visible" in read}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunError(
-                f"Expected what was read of each class in {self.path / READINGS}, actual something else; fit again."
+                f"expected what was read of each class in {self.path / READINGS}, got something else; fit again."
             ) from error
 
     @property
@@ -129,7 +129,7 @@ class Storage:
                 raise ValueError(type(found).__name__)
             return found
         except ValueError as error:
-            raise RunError(f"Expected JSON in {file}, actual a damaged file ({error}); fit again.") from error
+            raise RunError(f"expected JSON in {file}, got a damaged file ({error}); fit again.") from error
 
     def read_tensors(self, name: str) -> dict[str, Tensor] | None:
         """The tensors of ``name.safetensors``, or None where there is no such file.
@@ -191,11 +191,11 @@ def check_free(path: Path) -> None:
     """
     path = Path(path)
     if (path / "run.json").exists():
-        raise RunError(f"Expected a new folder for the run, actual {path} holds one; add --resume or name another.")
+        raise RunError(f"expected a new folder for the run, got {path} holds one; add --resume or name another.")
     if path.exists() and not path.is_dir():
-        raise DataError(f"Expected a folder for the run, actual {path} is a file; name another.")
+        raise DataError(f"expected a folder for the run, got {path} is a file; name another.")
     if path.is_dir() and any(not entry.name.startswith(".") for entry in path.iterdir()):
-        raise RunError(f"Expected a new or empty folder for the run, actual {path} holds other files.")
+        raise RunError(f"expected a new or empty folder for the run, got {path} holds other files.")
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -206,17 +206,17 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     file = path / "run.json"
     if not file.is_file():
-        raise RunError(f"Expected a run folder with a run.json, actual {path}; make one with 'probscene fit'.")
+        raise RunError(f"expected a run folder with a run.json, got {path}; make one with 'probscene fit'.")
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         written = record["format"]
         if written == FORMAT and not KEYS <= record.keys():
             raise KeyError(*(KEYS - record.keys()))
     except (ValueError, KeyError, TypeError) as error:
-        raise RunError(f"Expected JSON of a run in {file}, actual something else; fit again.") from error
+        raise RunError(f"expected JSON of a run in {file}, got something else; fit again.") from error
     if written != FORMAT:
         raise RunError(
-            f"Expected a run of format {FORMAT}, actual format {written} in {path}: another version of probscene "
+            f"expected a run of format {FORMAT}, got format {written} in {path}: another version of probscene "
             f"({record.get('version', 'unknown')}) wrote it. Use that version, or fit again."
         )
     return record
@@ -231,7 +231,7 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
     try:
         return safetensors.torch.load_file(file)
     except (safetensors.SafetensorError, OSError) as error:
-        raise RunError(f"Expected tensors in {file}, actual a damaged file ({error}); delete it.") from error
+        raise RunError(f"expected tensors in {file}, got a damaged file ({error}); delete it.") from error
 
 
 def save_tensors(file: Path, tensors: dict[str, Tensor]) -> None:
@@ -260,7 +260,7 @@ def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
         module.load_state_dict(tensors)
     except RuntimeError as error:
         raise RunError(
-            f"Expected the state of a {type(module).__name__}, actual another network's; put the features back as they "
+            f"expected the state of a {type(module).__name__}, got another network's; put the features back as they "
             "were when the run was begun, or fit again."
         ) from error
     module.eval()

@@ -87,7 +87,7 @@ def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False
         if i not in crowded
     }
     if not boxes:
-        raise DataError(f"Expected labelled images of {target.path} in {path}, actual crowds alone; label each object.")
+        raise DataError(f"expected labelled images of {target.path} in {path}, got crowds alone; label each object.")
     labelled = tuple(name for name in model.classes if name in classes.values())
     return on_canvas(target, boxes, labelled, (*found.notes, *notes), min_height, 1.0 if labels.kitti else 0.0)
 
@@ -122,7 +122,7 @@ def on_canvas(
             right, bottom = box.right + end, box.bottom + end
             if not (box.left < size[1] and right > 0 and box.top < size[0] and bottom > 0):
                 raise DataError(
-                    f"Expected boxes on the image of {size[1]}x{size[0]} {box.where}, actual {box.name} from "
+                    f"expected boxes on the image of {size[1]}x{size[0]} {box.where}, got {box.name} from "
                     f"{box.left:g}, {box.top:g} to {right:g}, {bottom:g}; give the labels of these images, not of "
                     "images of another size."
                 )
@@ -154,8 +154,8 @@ def _classes_of_types(
     classes = {name: own for name, own in of_type.items() if own is not None}
     if not classes:
         raise DataError(
-            f"Expected types in {folder} that model {model.name!r} has classes for ({', '.join(model.classes)}), "
-            f"actual {', '.join(occurring) or 'no object'}."
+            f"expected types in {folder} that model {model.name!r} has classes for ({', '.join(model.classes)}), "
+            f"got {', '.join(occurring) or 'no object'}."
         )
     renamed = [f"{name} as {own}" for name in occurring if (own := of_type[name]) and own.casefold() != name.casefold()]
     out = [f"{number} {name}" for name, number in occurring.most_common() if of_type[name] is None]

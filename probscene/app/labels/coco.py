@@ -34,7 +34,7 @@ def read_coco(path: Path) -> Annotated:
     categories = _by_id(path, "categories", whole["categories"], "name")
     twice = [name for name in categories.values() if list(categories.values()).count(name) > 1]
     if twice:
-        raise DataError(f"Expected categories with a name each in {path}, actual {twice[0]!r} more than once.")
+        raise DataError(f"expected categories with a name each in {path}, got {twice[0]!r} more than once.")
     names = _by_id(path, "images", whole["images"], "file_name")
     of_image: dict[str, list[tuple[str, str, dict[str, Any]]]] = defaultdict(list)
     for i, entry in enumerate(whole["annotations"]):
@@ -47,7 +47,7 @@ def read_coco(path: Path) -> Annotated:
         said = tuple(number_of(whole["images"][i].get(side)) for side in ("height", "width"))
         if all(side > 0 for side in said) and said != size:
             raise DataError(
-                f"Expected {images[i].name} to be {said[1]:.9g}x{said[0]:.9g} as {images[i].where}, actual "
+                f"expected {images[i].name} to be {said[1]:.9g}x{said[0]:.9g} as {images[i].where}, got "
                 f"{size[1]}x{size[0]}; give labels of these images, not of images of another size."
             )
         return [_annotation(*each, size) for each in of_image[keys[i]]]
@@ -59,11 +59,11 @@ def _whole(path: Path) -> dict[str, list[Any]]:
     try:
         whole = json.loads(text_of(path))
     except (ValueError, RecursionError) as error:
-        raise DataError(f"Expected COCO's JSON in {path}, actual something else ({error}).") from error
+        raise DataError(f"expected COCO's JSON in {path}, got something else ({error}).") from error
     missing = [key for key in LISTS if not isinstance(whole, dict) or not isinstance(whole.get(key), list)]
     if missing:
         raise DataError(
-            f"Expected COCO's JSON with lists of {', '.join(LISTS)} in {path}, actual none of {', '.join(missing)}."
+            f"expected COCO's JSON with lists of {', '.join(LISTS)} in {path}, got none of {', '.join(missing)}."
         )
     return whole
 
@@ -76,11 +76,9 @@ def _by_id(path: Path, key: str, entries: list[Any], named: str) -> dict[str, st
         said = entry.get("id") if isinstance(entry, dict) else None
         number, name = _id(said), entry.get(named) if isinstance(entry, dict) else None
         if number is None or number in names:
-            raise DataError(
-                f"Expected an id that no other entry has {where}, actual {json.dumps(said)}; mend the entry."
-            )
+            raise DataError(f"expected an id that no other entry has {where}, got {json.dumps(said)}; fix the entry.")
         if isinstance(name, bool) or not isinstance(name, str | int) or name == "":
-            raise DataError(f"Expected a {named} {where}, actual {json.dumps(name)}; mend the entry.")
+            raise DataError(f"expected a {named} {where}, got {json.dumps(name)}; fix the entry.")
         names[number] = str(name)
     return names
 
@@ -102,7 +100,7 @@ def _known(entry: Any, key: str, known: dict[str, str], where: str) -> str:
     said = entry.get(key) if isinstance(entry, dict) else None
     found = _id(said)
     if found is None or found not in known:
-        raise DataError(f"Expected {key} to be an id that is listed {where}, actual {json.dumps(said)}; mend it.")
+        raise DataError(f"expected {key} to be an id that is listed {where}, got {json.dumps(said)}; fix it.")
     return found
 
 
@@ -114,13 +112,12 @@ def _annotation(name: str, where: str, entry: dict[str, Any], size: Size) -> Ann
         height, width = map(number_of, shape["size"]) if isinstance(shape, dict) else size
         if (height, width) != size:
             raise DataError(
-                f"Expected a mask of {size[1]}x{size[0]} {where}, as its image is, actual {width:.9g}x{height:.9g}; "
-                "mend or delete it."
+                f"expected a mask of {size[1]}x{size[0]} {where}, as its image is, got {width:.9g}x{height:.9g}; "
+                "fix or delete it."
             )
     if box is None or min(box[2:]) <= 0:
         raise DataError(
-            f"Expected bbox: x, y, and a width and height above 0 {where}, actual {json.dumps(said)}; mend or delete "
-            "it."
+            f"expected bbox: x, y, and a width and height above 0 {where}, got {json.dumps(said)}; fix or delete it."
         )
     x, y, width, height = box
     crowd = number_of(entry.get("iscrowd")) > 0 or entry.get("iscrowd") is True
@@ -139,7 +136,7 @@ def around(segmentation: Any, where: str) -> list[float]:
     corners = [_numbers(part) for part in parts]
     if any(part is None or len(part) < 6 or len(part) % 2 for part in corners):
         raise DataError(
-            f"Expected polygons of at least three corners x, y {where}, actual {json.dumps(segmentation)[:80]}; mend "
+            f"expected polygons of at least three corners x, y {where}, got {json.dumps(segmentation)[:80]}; fix "
             "or delete it."
         )
     x, y = ([value for part in corners if part for value in part[axis::2]] for axis in (0, 1))
@@ -152,7 +149,7 @@ def _around_runs(coded: dict[str, Any], where: str) -> list[float]:
     runs = _decoded(counts) if isinstance(counts, str) else _numbers(counts)
     if not runs or size is None or min(runs) < 0 or sum(runs) != size[0] * size[1]:
         raise DataError(
-            f"Expected a mask with size and counts that add up to it {where}, actual {json.dumps(coded)[:80]}; mend or "
+            f"expected a mask with size and counts that add up to it {where}, got {json.dumps(coded)[:80]}; fix or "
             "delete it."
         )
     ends = np.cumsum(runs).astype(np.int64)

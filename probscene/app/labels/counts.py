@@ -57,11 +57,11 @@ def read_table(path: Path, classes: tuple[str, ...], target: Images, some: bool 
     header, lines = _lines(path)
     expected = f"the columns {','.join(['image', *classes])}"
     if header.count("image") != 1 or len(set(header)) != len(header):
-        raise DataError(f"Expected {expected} in {path}, actual {','.join(header) or 'none'}.")
+        raise DataError(f"expected {expected} in {path}, got {','.join(header) or 'none'}.")
     found, notes = labelled_classes([name for name in header if name != "image"], classes, expected, path)
     for number, fields in lines:
         if len(fields) != len(header):
-            raise DataError(f"Expected {len(header)} fields in line {number} of {path}, actual {len(fields)}.")
+            raise DataError(f"expected {len(header)} fields in line {number} of {path}, got {len(fields)}.")
     cells = [(number, dict(zip(header, fields, strict=True))) for number, fields in lines]
     empty = tuple(name for name in found if cells and not any(row[name].strip() for _, row in cells))
     if empty and len(empty) < len(found):
@@ -96,7 +96,7 @@ def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
         lines = io.StringIO(text, newline="")
         rows = list(csv.reader(lines, delimiter=max(",;\t", key=first.count), strict=True))
     except csv.Error as error:
-        raise DataError(f"Expected a CSV file in UTF-8, actual {path}: {error}.") from error
+        raise DataError(f"expected a CSV file in UTF-8, got {path}: {error}.") from error
     named = [(number, fields) for number, fields in enumerate(rows[1:], 2) if any(field.strip() for field in fields)]
     return [composed(name.strip()) for name in rows[0]] if rows else [], named
 
@@ -105,6 +105,6 @@ def _count(text: str, column: str, name: str, where: str) -> int:
     if not re.fullmatch(r"\+?[0-9]{1,9}", text, re.ASCII):
         remedy = "write a whole number" if text else "write 0 where there is none, or leave the whole row empty"
         raise DataError(
-            f"Expected a count of 0 or more for class {column!r} of {name} {where}, actual {text!r}; {remedy}."
+            f"expected a count of 0 or more for class {column!r} of {name} {where}, got {text!r}; {remedy}."
         )
     return int(text)

@@ -63,22 +63,19 @@ def class_of(type: str, classes: Iterable[str]) -> str | None:
 
 def _object(fields: list[str], where: str) -> Annotation:
     if len(fields) != len(COLUMNS):
-        remedy = "mend the line"
+        remedy = "fix the line"
         if len(fields) == len(COLUMNS) + 1:
             remedy = "a type is one word, and labels have no score"
         elif fields[0].isdecimal():
             remedy = "for YOLO's labels put their data.yaml or classes.txt beside them"
-        raise DataError(
-            f"Expected {len(COLUMNS)} columns ({' '.join(COLUMNS)}) {where}, actual {len(fields)}; {remedy}."
-        )
+        raise DataError(f"expected {len(COLUMNS)} columns ({' '.join(COLUMNS)}) {where}, got {len(fields)}; {remedy}.")
     values = [number_of(text) for text in fields[1:]]
     for name, text, value in zip(COLUMNS[1:], fields[1:], values, strict=True):
         if not math.isfinite(value):
-            raise DataError(f"Expected a number for {name} {where}, actual {text!r}; mend the line.")
+            raise DataError(f"expected a number for {name} {where}, got {text!r}; fix the line.")
     truncated, occluded, _, left, top, right, bottom, *_ = values
     if right < left or bottom < top:
         raise DataError(
-            f"Expected a box from left to right and top to bottom {where}, actual {' '.join(fields[4:8])}; mend the "
-            "line."
+            f"expected a box from left to right and top to bottom {where}, got {' '.join(fields[4:8])}; fix the line."
         )
     return Annotation(fields[0], left, top, right, bottom, truncated, occluded, where=where)

@@ -62,7 +62,7 @@ def matched(
         found = names.of(entry.name)
         if len(found) > 1:
             raise DataError(
-                f"Expected the name of one image {entry.where}, actual {entry.name!r}, which {len(found)} files in "
+                f"expected the name of one image {entry.where}, got {entry.name!r}, which {len(found)} files in "
                 f"{folder} have; give them different names."
             )
         if found:
@@ -75,7 +75,7 @@ def matched(
         best = [number for number, depth in zip(numbers, alike, strict=True) if depth == max(alike)]
         if len(best) > 1:
             raise DataError(
-                f"Expected one row an image, actual a second one of {files[i].name} {entries[best[1]].where}; keep one "
+                f"expected one row an image, got a second one of {files[i].name} {entries[best[1]].where}; keep one "
                 "of them."
             )
         chosen[i] = best[0]
@@ -107,13 +107,13 @@ def match_target(path: Path, entries: Sequence[Entry], target: Images, some: boo
         but = f", but of {_last(entry.name)!r} {entry.where}{f' and {more} more' if more else ''}, which it has not"
     if not found.entries and (some or not missing):
         raise DataError(
-            f"Expected labels of images of {target.path} in {path}, actual none{but}; label at least one, by the name "
+            f"expected labels of images of {target.path} in {path}, got none{but}; label at least one, by the name "
             "of its file."
         )
     if missing and not some:
         names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
         raise DataError(
-            f"Expected labels of every image of {target.path} in {path}, actual none of {names}{but}; if only some are "
+            f"expected labels of every image of {target.path} in {path}, got none of {names}{but}; if only some are "
             "labelled, add --some-labels."
         )
     return found
@@ -139,12 +139,12 @@ def labelled_classes(
     for name in others:
         if near := next((other for other in free if _plain(other) == _plain(name)), None):
             raise DataError(
-                f"Expected {what} in {path}, actual {name!r}; did you mean {near!r}? Write it as the model does."
+                f"expected {what} in {path}, got {name!r}; did you mean {near!r}? Write it as the model does."
             )
     found = {name: own[composed(name)] for name in names if composed(name) in own}
     if not found:
         raise DataError(
-            f"Expected {what} in {path}, actual {', '.join(others) or 'none'}; give at least one by the model's name."
+            f"expected {what} in {path}, got {', '.join(others) or 'none'}; give at least one by the model's name."
         )
     note = f"Not counted, since the model has no such class: {', '.join(others)}."
     return dict(sorted(found.items(), key=lambda pair: classes.index(pair[1]))), (note,) if others else ()
@@ -201,7 +201,7 @@ def _check_case(unknown: Sequence[Entry], free: Sequence[Path], folder: Path, st
     for entry in unknown:
         if file := near.get(_last(entry.name).casefold()):
             raise DataError(
-                f"Expected the name of an image in {folder} {entry.where}, actual {entry.name!r}; did you mean "
+                f"expected the name of an image in {folder} {entry.where}, got {entry.name!r}; did you mean "
                 f"{file.name!r}?"
             )
 

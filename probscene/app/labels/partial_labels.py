@@ -54,7 +54,7 @@ def read_few(path: Path, model: SceneModel, target: Images, least: int = LEAST) 
     path, boxes, notes = Path(path), None, ()
     if path.suffix == ".jsonl":
         raise DataError(
-            f"Expected labels that people give (a CSV of counts, COCO's JSON, a folder of KITTI's or YOLO's), actual "
+            f"expected labels that people give (a CSV of counts, COCO's JSON, a folder of KITTI's or YOLO's), got "
             f"{path} of whole structures; give those to 'probscene evaluate'."
         )
     if has_boxes(path):
@@ -71,7 +71,7 @@ def read_few(path: Path, model: SceneModel, target: Images, least: int = LEAST) 
     if len(read.rows) < least:
         short = len(target) < least
         raise DataError(
-            f"Expected labels of at least {least} images of {target.path} in {path}, actual {len(read.rows)}; "
+            f"expected labels of at least {least} images of {target.path} in {path}, got {len(read.rows)}; "
             f"{'add images' if short else 'label more (probscene label says which)'}."
         )
     counts = torch.from_numpy(read.counts)
@@ -110,7 +110,7 @@ def labels_record(path: Path) -> dict[str, Any]:
     try:
         digest = _digest(path)
     except OSError as error:
-        raise DataError(f"Expected a file of labels at {path}, actual none: {error.strerror}.") from error
+        raise DataError(f"expected a file of labels at {path}, got none: {error.strerror}.") from error
     return {"path": str(path), "sha256": digest}
 
 

@@ -31,7 +31,7 @@ def read_annotations(path: Path) -> Annotated:
     """
     if not path.is_dir():
         if not path.exists():
-            raise DataError(f"Expected a file of labels at {path}, actual none.")
+            raise DataError(f"expected a file of labels at {path}, got none.")
         return read_yolo(path, path) if path.suffix.lower() in YAML else read_coco(path)
     if (path / ANNOTATIONS).is_file():
         return read_coco(path / ANNOTATIONS)

@@ -93,9 +93,9 @@ def check_empty(out: Path) -> None:
         DataError: it holds files already, or is none.
     """
     if out.exists() and not out.is_dir():
-        raise DataError(f"Expected a folder for the sheet, actual {out} is a file; name another.")
+        raise DataError(f"expected a folder for the sheet, got {out} is a file; name another.")
     if out.is_dir() and any(out.iterdir()):
-        raise DataError(f"Expected a new or empty folder for the sheet, actual {out} holds files; name another.")
+        raise DataError(f"expected a new or empty folder for the sheet, got {out} holds files; name another.")
 
 
 def page(

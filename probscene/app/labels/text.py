@@ -16,9 +16,9 @@ def text_of(path: Path) -> str:
     try:
         return path.read_bytes().decode("utf-8-sig")
     except OSError as error:
-        raise DataError(f"Expected a file of labels at {path}, actual none: {error.strerror}.") from error
+        raise DataError(f"expected a file of labels at {path}, got none: {error.strerror}.") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"Expected a text file in UTF-8, actual {path}: {error}.") from error
+        raise DataError(f"expected a text file in UTF-8, got {path}: {error}.") from error
 
 
 def lines_of(path: Path) -> list[tuple[str, list[str]]]:

@@ -82,15 +82,15 @@ def _classes(file: Path) -> tuple[dict[int, str], int]:
         whole: Any = yaml.safe_load(text_of(file))
     except yaml.YAMLError as error:
         about = " ".join(str(error).split())
-        raise DataError(f"Expected YAML with names of classes in {file}, actual something else ({about}).") from error
+        raise DataError(f"expected YAML with names of classes in {file}, got something else ({about}).") from error
     names = whole.get("names") if isinstance(whole, Mapping) else None
     numbered = dict(enumerate(names)) if isinstance(names, list) else names
     if not isinstance(numbered, Mapping) or not numbered or not all(str(key).isdecimal() for key in numbered):
-        raise DataError(f"Expected names: a list of the classes, in {file}, actual {names!r}; write it.")
+        raise DataError(f"expected names: a list of the classes, in {file}, got {names!r}; write it.")
     shape = whole.get("kpt_shape") or [0, 0]
     if not isinstance(shape, list) or [type(number) for number in shape] != [int, int]:
         raise DataError(
-            f"Expected kpt_shape: how many keypoints, and numbers each, in {file}, actual {shape!r}; mend or delete it."
+            f"expected kpt_shape: how many keypoints, and numbers each, in {file}, got {shape!r}; fix or delete it."
         )
     return {int(key): str(name) for key, name in numbered.items()}, shape[0] * shape[1]
 
@@ -99,19 +99,19 @@ def _object(fields: list[str], where: str, classes: dict[int, str], keypoints: i
     number, *shares = (number_of(text) for text in fields)
     if number not in classes:
         raise DataError(
-            f"Expected the number of a class, {min(classes)} to {max(classes)}, {where}, actual {fields[0]!r}; mend it."
+            f"expected the number of a class, {min(classes)} to {max(classes)}, {where}, got {fields[0]!r}; fix it."
         )
     boxed = len(shares) in (4, 4 + keypoints)
     if not boxed and (len(shares) < 6 or len(shares) % 2):
-        remedy = "labels have no score" if len(shares) == 5 else "mend the line"
+        remedy = "labels have no score" if len(shares) == 5 else "fix the line"
         raise DataError(
-            f"Expected a class and x y width height, or at least three corners x y, {where}, actual {len(fields)} "
+            f"expected a class and x y width height, or at least three corners x y, {where}, got {len(fields)} "
             f"numbers; {remedy}."
         )
     shares = shares[:4] if boxed else shares
     if not all(-1 <= share <= 2 for share in shares):
         raise DataError(
-            f"Expected shares of the image's sides, 0 to 1, {where}, actual {' '.join(fields[1:])[:80]}; divide pixels "
+            f"expected shares of the image's sides, 0 to 1, {where}, got {' '.join(fields[1:])[:80]}; divide pixels "
             "by the width and height."
         )
     if boxed:
@@ -121,7 +121,7 @@ def _object(fields: list[str], where: str, classes: dict[int, str], keypoints: i
         left, top, right, bottom = min(shares[::2]), min(shares[1::2]), max(shares[::2]), max(shares[1::2])
     if right <= left or bottom <= top:
         raise DataError(
-            f"Expected a width and height above 0 {where}, actual {' '.join(fields[1:])[:80]}; mend or delete the line."
+            f"expected a width and height above 0 {where}, got {' '.join(fields[1:])[:80]}; fix or delete the line."
         )
     name, (height, width) = classes[int(number)], size
     return Annotation(name, left * width, top * height, right * width, bottom * height, where=where)

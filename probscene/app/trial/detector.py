@@ -68,7 +68,7 @@ def checked(choice: str) -> str:
     """
     name, _, file = choice.partition("=")
     if name not in RECIPES or (name == "maskrcnn") != bool(file):
-        raise ProbsceneError(f"Expected a detector efficientnet or maskrcnn=FILE, actual {choice!r}.")
+        raise ProbsceneError(f"expected a detector efficientnet or maskrcnn=FILE, got {choice!r}.")
     if file:
         build(choice, 1, (64, 64))
     return name
@@ -181,7 +181,7 @@ def _mask_rcnn(file: Path, classes: int, size: tuple[int, int]) -> nn.Module:
             raise RuntimeError(f"no {lacking[0]}")
     except RuntimeError as error:
         raise DataError(
-            f"Expected a state dict of torchvision's maskrcnn_resnet50_fpn or resnet50 in {file}, actual another "
+            f"expected a state dict of torchvision's maskrcnn_resnet50_fpn or resnet50 in {file}, got another "
             f"network's ({' '.join(str(error).split())[:160]}...)."
         ) from error
     heads = detector.roi_heads

@@ -153,7 +153,7 @@ class Job(NamedTuple):
             return False
         if before != self.digests[name]:
             raise RunError(
-                f"Expected the set {name!r} as {file} was trained on, actual another; rename the set, or name another "
+                f"expected the set {name!r} as {file} was trained on, got another; rename the set, or name another "
                 "folder."
             )
         return True

@@ -191,7 +191,7 @@ def _run_stage(
             targets.append({"boxes": torch.from_numpy(boxes).reshape(-1, 4), "labels": labels})
         loss = torch.stack([*detector(images, targets).values()]).sum()
         if not torch.isfinite(loss):
-            raise ProbsceneError("Expected a finite loss of the detector, actual one that is not; give a lower --rate.")
+            raise ProbsceneError("expected a finite loss of the detector, got one that is not; give a lower --rate.")
         adam.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_([p for group in groups for p in group], CLIP)

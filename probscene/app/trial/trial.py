@@ -120,9 +120,9 @@ def trial(
     for number, what in ((seeds, "seeds"), (workers, "workers"), (resamples, "resamples")):
         positive(number, what)
     if size is not None and any(side < STEP or side % STEP for side in size):
-        raise ProbsceneError(f"Expected a size of multiples of {STEP}, actual {size[1]}x{size[0]}.")
+        raise ProbsceneError(f"expected a size of multiples of {STEP}, got {size[1]}x{size[0]}.")
     if hold_out is not None and real is not None:
-        raise ProbsceneError("Expected photographs to train on from --hold-out or from --real, actual both; give one.")
+        raise ProbsceneError("expected photographs to train on from --hold-out or from --real, got both; give one.")
     tested, photographs = _photographs(test, real, hold_out, seed, classes, show)
     names, same = tested.classes, classes is None
     known = [] if generated is None else list(_sources(generated))
@@ -133,7 +133,7 @@ def trial(
     else:
         wanted = list(numbers or ())
         if wanted:
-            raise ProbsceneError("Expected --hold-out N or --real PATH for --real-numbers, actual neither.")
+            raise ProbsceneError("expected --hold-out N or --real PATH for --real-numbers, got neither.")
     planned = plan(sets, known, wanted)
     bases = baselines_of(planned, baselines)
     loaded = {} if photographs is None else {REAL: photographs}
@@ -187,14 +187,14 @@ def trial(
 def _recipe(choice: str, budget: Budget):
     """What a detector is trained with."""
     if not 0 < budget.last < 1:
-        raise ProbsceneError(f"Expected a share of the last set between 0 and 1, actual {budget.last}.")
+        raise ProbsceneError(f"expected a share of the last set between 0 and 1, got {budget.last}.")
     recipe = RECIPES[checked(choice)]
     given = {"presentations": budget.presentations, "batch": budget.batch, "rate": budget.rate}
     recipe = recipe._replace(**{key: value for key, value in given.items() if value is not None})
     positive(recipe.presentations, "presentations")
     positive(recipe.batch, "images a step")
     if not (recipe.rate > 0 and math.isfinite(recipe.rate)):
-        raise ProbsceneError(f"Expected a positive learning rate, actual {recipe.rate}.")
+        raise ProbsceneError(f"expected a positive learning rate, got {recipe.rate}.")
     return recipe
 
 
@@ -217,7 +217,7 @@ def _photographs(
     lacking = [name for number, name in enumerate(tested.classes) if number not in labelled]
     if lacking:
         raise DataError(
-            f"Expected test images in {test} with objects of every class, actual none of {', '.join(lacking)}; name "
+            f"expected test images in {test} with objects of every class, got none of {', '.join(lacking)}; name "
             "the classes that there are by --classes, or test on more images."
         )
     return tested, photographs
@@ -228,7 +228,7 @@ def _sources(generated: Generated) -> tuple[str, ...]:
     unknown = set(generated.sources) - {"prior", "start", "learnt"}
     if unknown or not generated.sources:
         actual = ", ".join(sorted(unknown)) or "none"
-        raise ProbsceneError(f"Expected sources of a run among prior, start and learnt, actual {actual}.")
+        raise ProbsceneError(f"expected sources of a run among prior, start and learnt, got {actual}.")
     generated.run.check_finished()
     same = generated.run.model.pretraining is None
     return tuple(name for name in dict.fromkeys(generated.sources) if not (name == "start" and same))
@@ -238,8 +238,8 @@ def _check_classes(generated: Generated, classes: tuple[str, ...], same: bool) -
     there = set(generated.run.model.classes)
     if set(classes) - there or (same and there - set(classes)):
         raise DataError(
-            f"Expected model {generated.run.model.name!r} to have the classes of the test images "
-            f"({', '.join(classes)}), actual {', '.join(generated.run.model.classes)}; rename its classes or those of "
+            f"expected model {generated.run.model.name!r} to have the classes of the test images "
+            f"({', '.join(classes)}), got {', '.join(generated.run.model.classes)}; rename its classes or those of "
             "the labels, or name the classes that both have by --classes."
         )
 
@@ -297,19 +297,17 @@ def _bind(out: Path, shared: dict[str, Any]) -> None:
             before = json.loads(record.read_text(encoding="utf-8"))
         except ValueError as error:
             raise RunError(
-                f"Expected a trial's settings in {record}, actual a damaged file; name another folder."
+                f"expected a trial's settings in {record}, got a damaged file; name another folder."
             ) from error
         differing = [key for key in shared if before.get(key) != shared[key]]
         if differing:
             was, now = (", ".join(f"{key} {str(s.get(key))[:60]}" for key in differing) for s in (before, shared))
             raise RunError(
-                f"Expected the settings that the trial in {out} was begun with ({was}), actual {now}; give the "
+                f"expected the settings that the trial in {out} was begun with ({was}), got {now}; give the "
                 "same, or name another folder. Sets and seeds can be added."
             )
         return
     others = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith("."))
     if others:
-        raise DataError(
-            f"Expected a new or empty folder for the trial, actual {out} with {', '.join(others[:5])} in it."
-        )
+        raise DataError(f"expected a new or empty folder for the trial, got {out} with {', '.join(others[:5])} in it.")
     write_json(record, {**shared, "rows": {}})

@@ -33,7 +33,7 @@ def make_place(out: Path) -> None:
         MachineError: its folder cannot be made.
     """
     if out.is_dir():
-        raise DataError(f"Expected a file to write the picture to, actual the folder {out}; name a file in it.")
+        raise DataError(f"expected a file to write the picture to, got the folder {out}; name a file in it.")
     make_folder(out.parent)
 
 

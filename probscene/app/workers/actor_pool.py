@@ -109,7 +109,7 @@ class Crew:
                     again(member)
             if not self._longest and time.monotonic() - begun > START and not self._there():
                 raise MachineError(
-                    f"Expected an actor on the cluster at {self.cluster.address} within {START:g} s, actual none; "
+                    f"expected an actor on the cluster at {self.cluster.address} within {START:g} s, got none; "
                     "most often other jobs hold its cores. Wait for them, or add nodes."
                 )
 
@@ -139,8 +139,8 @@ class Crew:
         if not any(room.values()):
             there = f"{len(nodes)} with fewer" if nodes else "none left"
             raise MachineError(
-                f"Expected a node with {self.threads} cores for an actor in the cluster at {self.cluster.address}, "
-                f"actual {there}. Start nodes, or ask for fewer --threads; the same command goes on where it stopped."
+                f"expected a node with {self.threads} cores for an actor in the cluster at {self.cluster.address}, "
+                f"got {there}. Start nodes, or ask for fewer --threads; the same command goes on where it stopped."
             )
         for rank in range(max(room.values())):
             for node, number in room.items():
@@ -176,7 +176,7 @@ class Crew:
             self._members.remove(member)
             if "No module named" in str(error):
                 raise MachineError(
-                    f"Expected probscene {versions()['probscene']} on node {self._names[member.node]}, actual "
+                    f"expected probscene {versions()['probscene']} on node {self._names[member.node]}, got "
                     f"{first_line(error, 'No module named')}; install it in the environment that Ray runs in there."
                 ) from error
             return None
@@ -195,15 +195,15 @@ class Crew:
         here = versions()
         if other := [name for name in here if here[name] != there.get(name)]:
             raise ProbsceneError(
-                f"Expected {', '.join(f'{name} {here[name]}' for name in other)} on node {self._names[member.node]}, "
-                f"as on this machine, actual {', '.join(str(there.get(name)) for name in other)}; other versions may "
+                f"expected {', '.join(f'{name} {here[name]}' for name in other)} on node {self._names[member.node]}, "
+                f"as on this machine, got {', '.join(str(there.get(name)) for name in other)}; other versions may "
                 "give other bytes. Install the same on all nodes."
             )
 
     def _check_deaths(self, number: int, task: str | int) -> None:
         if number >= ATTEMPTS and task != "versions":
             raise MachineError(
-                f"Expected an actor to do its task, actual {number} actors that died with the same one, most often for "
+                f"expected an actor to do its task, got {number} actors that died with the same one, most often for "
                 "lack of memory. Run the same command again: it goes on where it stopped; nodes with fewer CPUs "
                 "(ray start --num-cpus) run fewer actors."
             )

@@ -46,7 +46,7 @@ class Cluster:
             import ray
         except ImportError as error:
             raise ProbsceneError(
-                "Expected the package ray, which --cluster needs, actual none; install it with "
+                "expected the package ray, which --cluster needs, got none; install it with "
                 "pip install 'probscene[cluster]'."
             ) from error
         self.ray, self.address, self.say = ray, address, say
@@ -62,12 +62,12 @@ class Cluster:
             if str(error).startswith("Version mismatch"):
                 theirs = re.findall(r"(?:Ray|Python): \S+", str(error))[:2]
                 raise MachineError(
-                    f"Expected Ray {ray.__version__} and Python {platform.python_version()} at {address}, as here, "
-                    f"actual {' and '.join(theirs).replace(':', '')}; install the same versions of Ray and Python on "
+                    f"expected Ray {ray.__version__} and Python {platform.python_version()} at {address}, as here, "
+                    f"got {' and '.join(theirs).replace(':', '')}; install the same versions of Ray and Python on "
                     "both."
                 ) from error
             raise MachineError(
-                f"Expected a Ray cluster at {address}, actual none ({first_line(error)}). Start one with "
+                f"expected a Ray cluster at {address}, got none ({first_line(error)}). Start one with "
                 "ray start --head and name its address, HOST:6379; or let one be started here: --cluster auto."
             ) from error
 

@@ -65,7 +65,7 @@ class MeshAtlas:
         vertices = np.array([0, *(len(mesh.positions) for mesh in meshes)])
         triangles = np.array([0, *(len(mesh.triangles) for mesh in meshes)])
         if self.faces.size // FACE + triangles.sum() > _MOST:
-            raise ModelError(f"Expected at most {_MOST} triangles in the meshes of a world, actual more; use fewer.")
+            raise ModelError(f"expected at most {_MOST} triangles in the meshes of a world, got more; use fewer.")
         rows = np.stack(
             [
                 len(self.positions) // 3 + vertices.cumsum()[:-1],

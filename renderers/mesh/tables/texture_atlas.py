@@ -56,7 +56,7 @@ class TextureAtlas:
                     words.append((word | np.roll(word, -1, 1) << np.uint64(32)).ravel())
                     used += words[-1].size
             if used > _MOST:
-                raise ModelError(f"Expected textures of at most {_MOST} texels in all, actual more; make them smaller.")
+                raise ModelError(f"expected textures of at most {_MOST} texels in all, got more; make them smaller.")
             rows.append(row.astype(np.int32))
         if new:
             self.texels, self.table = np.concatenate(words), np.concatenate(rows)

@@ -171,11 +171,11 @@ def test_resuming_takes_what_the_run_was_begun_with(quick, discs, target, python
     for other in ({"seed": 1}, {"preset": "street"}, {"guide": "pcfg"}, {"threads": 2}, {"skip_bad": True}):
         with pytest.raises(ps.RunError, match="that the run in .* was begun with"):
             quick(discs.file, target.images, out=python_run.path, resume=True, **other)
-    with pytest.raises(ps.RunError, match="Expected the target that the run"):
+    with pytest.raises(ps.RunError, match="expected the target that the run"):
         quick(discs.file, np.zeros((40, 64, 64, 3), np.uint8), out=python_run.path, resume=True)
-    with pytest.raises(ps.RunError, match="Expected the model that the run"):
+    with pytest.raises(ps.RunError, match="expected the model that the run"):
         quick("multi_mnist", target.images, out=python_run.path, resume=True)
-    with pytest.raises(ps.RunError, match="Expected a new folder"):
+    with pytest.raises(ps.RunError, match="expected a new folder"):
         quick(discs.file, target.images, out=python_run.path)
 
 
@@ -186,7 +186,7 @@ def test_resuming_does_not_ask_for_settings_that_nothing_reads(quick, discs, tar
     again = quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
     assert learnt(again) == learnt(python_run)
     other = replace(begun, parameters=replace(begun.parameters, rounds=begun.parameters.rounds + 1))
-    with pytest.raises(ps.RunError, match="Expected the parameters that the run"):
+    with pytest.raises(ps.RunError, match="expected the parameters that the run"):
         quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
 
 

@@ -83,7 +83,7 @@ def test_images_and_structures_stay_and_provenance_names_the_margin(drawn):
 
 def test_another_margin_is_another_data_set(drawn):
     for begun, other in ((0, MARGIN), (MARGIN, 0), (MARGIN, 2)):
-        with pytest.raises(DataError, match=f"begun with .*box_margin {begun}.*, actual box_margin {other}"):
+        with pytest.raises(DataError, match=f"begun with .*box_margin {begun}.*, got box_margin {other}"):
             generate_scenes(drawn.model, drawn.model.prior, NUM, drawn.of(begun), 1, drawn.formats, box_margin=other)
 
 

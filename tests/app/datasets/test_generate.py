@@ -125,7 +125,7 @@ def test_a_line_that_is_not_the_models_is_refused(run, undisturbed):
         {**line, "parameters": {site: v for site, v in line["parameters"].items() if site != "plate.x"}},
     ]
     for bad in wrong:
-        with pytest.raises(DataError, match="Expected"):
+        with pytest.raises(DataError, match="expected"):
             remake(run.model, bad)
 
 
@@ -195,11 +195,11 @@ def test_folders_that_cannot_take_a_dataset(run, tmp_path):
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ({"num": 0}, "positive number of images, actual 0"),
-        ({"num": -3}, "positive number of images, actual -3"),
-        ({"workers": 0}, "positive number of workers, actual 0"),
-        ({"seed": -1}, "seed of 0 or more, actual -1"),
-        ({"format": "voc"}, "formats among coco, panoptic, yolo, .*, images, actual 'voc'"),
+        ({"num": 0}, "positive number of images, got 0"),
+        ({"num": -3}, "positive number of images, got -3"),
+        ({"workers": 0}, "positive number of workers, got 0"),
+        ({"seed": -1}, "seed of 0 or more, got -1"),
+        ({"format": "voc"}, "formats among coco, panoptic, yolo, .*, images, got 'voc'"),
     ],
 )
 def test_wrong_numbers(run, tmp_path, wrong, message):

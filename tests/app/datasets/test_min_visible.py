@@ -107,7 +107,7 @@ def test_the_torch_dataset_has_the_same_labels_with_whole_boxes_and_visible_frac
 def test_another_fraction_is_another_data_set(drawn, tmp_path):
     for begun, other in ((0.0, 0.25), (0.25, 0.0), (0.25, 0.6)):
         before = contents(drawn.of(begun))
-        message = f"begun with .*min_visible {begun}.*, actual min_visible {other}"
+        message = f"begun with .*min_visible {begun}.*, got min_visible {other}"
         with pytest.raises(DataError, match=message):
             generate_scenes(drawn.model, drawn.model.prior, NUM, drawn.of(begun), 1, ALL, min_visible=other)
         assert contents(drawn.of(begun)) == before

@@ -407,7 +407,7 @@ def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path,
     assert done.code == 0, done.err
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     assert generate(run, 70, tmp_path / "one", **ALL).made == 0  # it is seen to be finished
-    with pytest.raises(ProbsceneError, match=r"begun with \(amodal True\), actual amodal False"):
+    with pytest.raises(ProbsceneError, match=r"begun with \(amodal True\), got amodal False"):
         generate(run, 70, tmp_path / "one", **ALL | {"amodal": False})
     found = json.loads((tmp_path / "one" / "annotations.json").read_text())
     assert found["info"]["values"] == "car.x,light" and found["info"]["amodal"] is True
@@ -444,7 +444,7 @@ def test_names_of_keypoints_that_change_are_one_error(cars, tmp_path):
         return replace(drawing, layers=tuple(layers))
 
     changing = replace(cars.model, program=program)
-    with pytest.raises(ModelError, match="name the same keypoints whatever it draws, actual .*'a'.* and .*'b'"):
+    with pytest.raises(ModelError, match="name the same keypoints whatever it draws, got .*'a'.* and .*'b'"):
         generate_scenes(changing, changing.prior, 65, tmp_path)
     assert not (tmp_path / "annotations.json").exists()
 
@@ -457,14 +457,14 @@ def test_what_a_model_does_not_have_is_one_error(cars, tmp_path, call):
         assert not (tmp_path / "out").exists()
         return str(error.value)
 
-    assert "sites of model 'cars' (light, x, y, car.turn, car.far, car.scale, car.x), actual 'car.z'" in message(
+    assert "sites of model 'cars' (light, x, y, car.turn, car.far, car.scale, car.x), got 'car.z'" in message(
         values="car.x,car.z"
     )
     for asked in ({"amodal": True}, {"values": "x"}):
-        assert "Expected coco or webdataset among the formats" in message(format="yolo,panoptic", **asked)
+        assert "expected coco or webdataset among the formats" in message(format="yolo,panoptic", **asked)
     assert "to have depth" in message(format="coco,depth")
     plain = load_model(str(FILES["lots"]))
-    assert "sprites of model 'lots' with keypoints, for format yolo-pose, actual none" in message(
+    assert "sprites of model 'lots' with keypoints, for format yolo-pose, got none" in message(
         model=plain, format="yolo-pose"
     )
 
@@ -474,7 +474,7 @@ def test_what_a_model_does_not_have_is_one_error(cars, tmp_path, call):
             return scene.request(Objects("car", x=1.0))
 
     generated = replace(cars.model, program=request, generator=lambda scene: 1 / 0)
-    assert "sprites or meshes for amodal masks, actual 'cars'" in message(model=generated, amodal=True)
+    assert "sprites or meshes for amodal masks, got 'cars'" in message(model=generated, amodal=True)
     with pytest.raises(ProbsceneError, match="sprites or meshes for amodal masks"):
         next(iter(SceneDataset(generated, 1, amodal=True)))
 

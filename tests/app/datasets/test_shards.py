@@ -101,7 +101,7 @@ def test_files_that_another_shard_writes_are_not_foreign(run, undisturbed, tmp_p
 
 def test_shards_have_the_same_settings(run, tmp_path):
     generate(run, 130, tmp_path / "out", seed=3, shard="0/2")
-    with pytest.raises(DataError, match=r"begun with \(seed 3\), actual seed 4; give the same"):
+    with pytest.raises(DataError, match=r"begun with \(seed 3\), got seed 4; give the same"):
         generate(run, 130, tmp_path / "out", seed=4, shard="1/2")
 
 
@@ -116,7 +116,7 @@ def test_a_shard_that_no_chunk_is_left_for(run, undisturbed, tmp_path):
 @pytest.mark.parametrize("text", ["8/8", "-1/8", "1", "", "a/b", "1/0", "1/2/3", "1 / 2"])
 def test_what_is_no_shard_is_refused(run, tmp_path, text):
     with pytest.raises(
-        ProbsceneError, match="Expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8"
+        ProbsceneError, match="expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8"
     ) as error:
         generate(run, 130, tmp_path / "out", shard=text)
     assert error.value.exit_code == 2 and not (tmp_path / "out").exists()

@@ -217,7 +217,7 @@ def test_wrong_lines_of_provenance(fault, plates, tmp_path):
     change, *parts = LINES[fault]
     lines = change(plates.lines.read_text(encoding="utf-8").splitlines())
     (tmp_path / "p.jsonl").write_text("\n".join(lines), encoding="utf-8")
-    with pytest.raises(DataError, match="^Expected ") as refused:
+    with pytest.raises(DataError, match="^expected ") as refused:
         read_labels(tmp_path / "p.jsonl", plates.run.model, plates.opened)
     assert all(part in str(refused.value) for part in parts), refused.value
 

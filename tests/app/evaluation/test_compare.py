@@ -218,16 +218,16 @@ def test_what_cannot_be_compared(call, two, nested, target, tmp_path):
     record = json.loads((elsewhere / "run.json").read_text())
     (elsewhere / "run.json").write_text(json.dumps(record | {"target": "other"}))
     for paths, *parts in (
-        ([lstm, nested["a"].path], "Expected runs of one model", "discs.py", "plates.py"),
+        ([lstm, nested["a"].path], "expected runs of one model", "discs.py", "plates.py"),
         ([lstm, tmp_path / "more" / "lstm"], "different names", "another 'lstm'"),
         ([tmp_path / "prior"], "none of them prior"),
-        ([lstm, tmp_path / "unfinished"], "Expected a finished fit", "--resume"),
-        ([lstm, tmp_path / "none"], "Expected a run folder"),
+        ([lstm, tmp_path / "unfinished"], "expected a finished fit", "--resume"),
+        ([lstm, tmp_path / "none"], "expected a run folder"),
         ([lstm, elsewhere], "fitted to the same images", "--target"),
     ):
         done = call("compare", *paths, *out)
         last = done.err.splitlines()[-1]
-        assert done.code == 2 and last.startswith("probscene: Expected"), done.err
+        assert done.code == 2 and last.startswith("probscene: expected"), done.err
         assert all(part in last for part in parts), last
     done = call("compare", lstm, "--out", tmp_path)
     assert done.code == 2 and "name a file in it" in done.err

@@ -262,8 +262,8 @@ LABELS = {
     "another case": (changed(0, "image,red,Blue"), "'Blue'", "did you mean 'blue'"),
     "no image column": (changed(0, "name,red,blue"), "image,red,blue"),
     "no header": (changed(0, None), "image,red,blue"),
-    "nothing": (lambda lines: [], "actual none"),
-    "short row": (changed(3, "000002.png,1"), "3 fields in line 4", "actual 2"),
+    "nothing": (lambda lines: [], "got none"),
+    "short row": (changed(3, "000002.png,1"), "3 fields in line 4", "got 2"),
     "unknown image": (changed(3, "x.png,1,0"), "line 4", "'x.png'"),
     "twice": (changed(3, "000001.png,1,0"), "second one of 000001.png in line 4"),
     "missing": (lambda lines: lines[:-2], "000038.png and 1 more"),
@@ -285,7 +285,7 @@ def test_wrong_labels(fault, call, fitted, target, tmp_path):
     result = call("evaluate", fitted, *words)
     assert result.code == 2 and not (tmp_path / "e.json").exists()
     last = result.err.splitlines()[-1]
-    assert last.startswith("probscene: Expected ")
+    assert last.startswith("probscene: expected ")
     assert all(part in last for part in parts), last
 
 
@@ -295,7 +295,7 @@ def test_labels_that_are_no_text_or_not_there(target, tmp_path):
     with pytest.raises(DataError, match="UTF-8"):
         read_table(tmp_path / "c.csv", CLASSES, images)
     for path in (tmp_path, tmp_path / "none.csv"):
-        with pytest.raises(DataError, match="Expected a file of labels"):
+        with pytest.raises(DataError, match="expected a file of labels"):
             read_table(path, CLASSES, images)
 
 

@@ -86,14 +86,14 @@ def test_faults_come_before_any_work(run, images, target, tmp_path):
         raise AssertionError
 
     assert image_distances(run, images, [], never) == {}
-    with pytest.raises(ProbsceneError, match="run, efficientnet, .* or resnet50=FILE, actual 'vgg'"):
+    with pytest.raises(ProbsceneError, match="run, efficientnet, .* or resnet50=FILE, got 'vgg'"):
         image_distances(run, images, ["run", "vgg"], never)
-    with pytest.raises(ProbsceneError, match="at least 2 images to compare, actual 1"):
+    with pytest.raises(ProbsceneError, match="at least 2 images to compare, got 1"):
         image_distances(run, images, ["run"], never, 1)
     for name in ("000000.png", "000001.png", "000002.png"):
         (tmp_path / name).write_bytes((target.images / name).read_bytes())
     few = ImageFolder(tmp_path, run.model.canvas, run.model.channels)
-    with pytest.raises(DataError, match="at least 4 images .* actual 3"):
+    with pytest.raises(DataError, match="at least 4 images .* got 3"):
         image_distances(run, few, ["run"], never)
 
 
@@ -112,7 +112,7 @@ def test_the_command_prints_and_writes_them(call, fitted, target, tmp_path):
     said = "".join(shown.out.split())  # a title may be wider than its table
     assert "inthefeaturesofefficientnet-lite0" in said and shown.out.index("KID, 10") < shown.out.index("FID, 10")
     refused = call(*words[:-4], "--images", "many", "--features", "run")
-    assert refused.code == 2 and "number of images to compare, or all, actual 'many'" in refused.err
+    assert refused.code == 2 and "number of images to compare, or all, got 'many'" in refused.err
     assert "FID of 10 images in 1280 dimensions" in shown.out and "two halves of the target" in shown.out
     wrong = call(*words, "--features", "resnet", "--json", tmp_path / "f.json")
-    assert wrong.code == 2 and "actual 'resnet'" in wrong.err and not (tmp_path / "f.json").exists()
+    assert wrong.code == 2 and "got 'resnet'" in wrong.err and not (tmp_path / "f.json").exists()

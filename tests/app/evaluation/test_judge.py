@@ -227,7 +227,7 @@ def test_too_few_images_have_no_verdict_and_are_still_compared(call, seeing, dra
     for path in drawn.target.paths[:12]:
         (tmp_path / "few" / path.name).write_bytes(path.read_bytes())
     done = call("evaluate", seeing, "--target", tmp_path / "few", "--num", 100, "--json", tmp_path / "e.json")
-    assert done.code == 0 and "No verdict. Expected at least 40 real images for a verdict, actual 12" in done.out
+    assert done.code == 0 and "No verdict. expected at least 40 real images for a verdict, got 12" in done.out
     assert json.loads((tmp_path / "e.json").read_text())["trust"]["verdict"] is None
 
 
@@ -239,10 +239,10 @@ def test_images_that_are_all_the_same_have_no_verdict(seeing, drawn, tmp_path):
 
 
 def test_wrong_numbers_and_no_labels_at_all(call, seeing, drawn, tmp_path):
-    with pytest.raises(ProbsceneError, match="at least 40 scenes to judge by, actual 39"):
+    with pytest.raises(ProbsceneError, match="at least 40 scenes to judge by, got 39"):
         judge(RunFolder.at(seeing), drawn.target, quiet, 39)
     (tmp_path / "c.csv").write_text("image,red,blue\n")
-    with pytest.raises(DataError, match="Expected labels of images .* actual none"):
+    with pytest.raises(DataError, match="expected labels of images .* got none"):
         read_labels(tmp_path / "c.csv", load_model(RunFolder.at(seeing).record["model"]), drawn.target, some=True)
     short = "\n".join(drawn.labels.read_text().splitlines()[:20])
     (tmp_path / "c.csv").write_text(short)

@@ -71,12 +71,12 @@ def test_shares_in_numbers_and_in_words():
     ("given", "part"),
     [
         (1.5, "1.5"), (-0.1, "-0.1"), (float("nan"), "nan"), (["x"], "'x'"), (["red="], "''"), (["red=1.1"], "1.1"),
-        (["Red=0.5"], "'Red'"), (["red=0", "red=1"], "red, actual two"), (["0", "1"], "all classes, actual two"),
-        ({"green": 0.5}, "red, blue, actual 'green'"), ({"red": "a"}, "'a'"), ({"red": True}, "True"),
+        (["Red=0.5"], "'Red'"), (["red=0", "red=1"], "red, got two"), (["0", "1"], "all classes, got two"),
+        ({"green": 0.5}, "red, blue, got 'green'"), ({"red": "a"}, "'a'"), ({"red": True}, "True"),
     ],
 )  # fmt: skip
 def test_shares_that_are_none(given, part):
-    with pytest.raises(ProbsceneError, match="^Expected .*visible share") as error:
+    with pytest.raises(ProbsceneError, match="^expected .*visible share") as error:
         visible_shares(given, CLASSES)
     assert part in str(error.value)
 
@@ -107,7 +107,7 @@ def test_a_run_knows_what_labels_count(run, fitted, target):
     assert seen_by(model, run, truth._replace(min_height=9.0), 0.25)[0] == Seen(9.0, {"red": 0.25, "blue": 0.25})
     structures = truth._replace(derivation=SimpleNamespace())
     assert seen_by(model, run, structures, None) == (None, ())
-    with pytest.raises(ProbsceneError, match="actual whole structures"):
+    with pytest.raises(ProbsceneError, match="got whole structures"):
         seen_by(model, run, structures, 0.25)
     for text in ("{", "[]", '{"classes": {"red": {"visible": "much"}}}'):
         (run.path / "readings.json").write_text(text)
@@ -177,7 +177,7 @@ def test_every_command_counts_what_can_be_seen(call, fitted, target, tmp_path):
     done = call("compare", fitted, *words, "--out", tmp_path / "c.png", "--some-labels")
     assert done.code == 0 and f"({target.counts[:5, 0].mean():.2f})" in done.out, done.err
     done = call("evaluate", fitted, "--target", target.images, "--visible", "green=0.5")
-    assert done.code == 2 and "red, blue, actual 'green'" in done.err
+    assert done.code == 2 and "red, blue, got 'green'" in done.err
 
 
 def test_a_share_holds_without_labels(fitted, target):

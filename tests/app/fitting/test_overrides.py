@@ -61,9 +61,9 @@ def test_what_is_set_beside_a_choice_wins_whatever_comes_first():
         (["objective=witness", "leave_one_out=true"], "only the objectives kde and js estimate densities"),
         (
             ["objective=mmd", "baseline=leave_one_out"],
-            "moving_average or none with objective=mmd, actual leave_one_out",
+            "moving_average or none with objective=mmd, got leave_one_out",
         ),
-        (["learn=structure", "batches=0"], "batches of at least 1 where structure alone is learnt, actual 0"),
+        (["learn=structure", "batches=0"], "batches of at least 1 where structure alone is learnt, got 0"),
     ],
 )
 def test_settings_that_do_nothing_are_errors(settings, because):

@@ -76,5 +76,5 @@ def test_the_guide_is_rebuilt_from_the_record(tmp_path, kind):
     assert type(again) is type(made)
     assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), made.state_dict().values(), strict=True))
     other = RunFolder(run.path, run.record | {"guide": {"kind": "pcfg" if kind != "pcfg" else "lstm"}})
-    with pytest.raises(RunError, match="Expected a guide for model discs"):
+    with pytest.raises(RunError, match="expected a guide for model discs"):
         _ = other.guide

@@ -72,7 +72,7 @@ def test_networks_by_their_words(run, tmp_path):
     for word in ("vgg", "resnet", "inception=", "efficientnet=x", ""):
         with pytest.raises(ProbsceneError, match="inception=FILE"):
             seen.network(word, run)
-    with pytest.raises(DataError, match="Expected a file of weights"):
+    with pytest.raises(DataError, match="expected a file of weights"):
         seen.network(f"inception={tmp_path / 'none.pth'}", run)
     with pytest.raises(RunError, match="--resume"):
         seen.network("run", RunFolder(tmp_path, run.record))

@@ -63,5 +63,5 @@ def test_columns_that_are_no_classes_are_refused(labels, fitted, target):
         ("image", "red,blue"),
     ):
         file.write_text("\n".join([columns, *rows]))
-        with pytest.raises(DataError, match=rf"^Expected the columns image,.*{part}"):
+        with pytest.raises(DataError, match=rf"^expected the columns image,.*{part}"):
             read_labels(file, model, images)

@@ -92,5 +92,5 @@ def test_another_command_has_pictures_of_its_own(drawn, request_of, tmp_path, fa
 
 def test_a_folder_that_cannot_be_written_is_named(drawn, request_of, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(MachineError, match="file.*, which keep= of the Command names, actual Not a directory"):
+    with pytest.raises(MachineError, match="file.*, which keep= of the Command names, got Not a directory"):
         drawn(request_of(1), keep=tmp_path / "file")

@@ -122,7 +122,7 @@ def test_the_fingerprint_goes_by_bytes_words_and_version(tmp_path):
     assert len({of("a"), *others}) == 4
     (tmp_path / "a" / "cup.obj").write_text("v 1 0 0")
     assert of("a", files=mesh) != others[-1]
-    with pytest.raises(ProbsceneError, match="Expected to read .*gone.obj, of which the generator draw.py is made"):
+    with pytest.raises(ProbsceneError, match="expected to read .*gone.obj, of which the generator draw.py is made"):
         of("a", files=(tmp_path / "gone.obj",))
 
 
@@ -153,7 +153,7 @@ def test_the_check_draws_again_in_another_order(model, call):
         return {"image": np.full((32, 40, 3), len(drawn), np.uint8), "instance": np.zeros((32, 40), int)}
 
     assert "another image" in check_generator(replace(model, generator=counting), images_drawn()).fault
-    with pytest.raises(ModelError, match="Expected a model with a generator, actual 'multi_mnist'"):
+    with pytest.raises(ModelError, match="expected a model with a generator, got 'multi_mnist'"):
         check_generator(load_model("multi_mnist"), images_drawn())
     assert all(f"{name} " in str(report) for name in PRESETS)
     command = replace(model.generator, files=(HERE / "none.png",))
@@ -237,7 +237,7 @@ def test_what_a_program_printed_stands_below_the_message_line_by_line(copied, ca
     script.write_text("import sys\n\nprint('no licence:', 3, 'seats')\nsys.exit('ask Ann')\n")
     told = call("preview", copied, "--num", 1, "--out", tmp_path / "prior.png")
     message, *printed = told.err.strip().splitlines()
-    assert told.code == 2 and message.startswith("probscene: Expected the generator draw_boxes.py to draw the scene")
+    assert told.code == 2 and message.startswith("probscene: expected the generator draw_boxes.py to draw the scene")
     assert printed[0] == "The end of what it printed:" and set(printed[1:]) == {"no licence: 3 seats", "ask Ann"}
 
 
@@ -247,7 +247,7 @@ def test_the_page_on_generators_is_a_model_and_its_program(tmp_path, call):
     (tmp_path / "model.py").write_text(model)
     (tmp_path / "draw.py").write_text(draw)
     told = call("check", tmp_path / "model.py", "--render")
-    assert told.code == 0 and "Nothing to mend" in told.out and "the same bytes" in told.out
+    assert told.code == 0 and "Nothing to fix" in told.out and "the same bytes" in told.out
     for block in re.findall(r"(?:^    .*\n|^\n)+", page, re.MULTILINE):
         if "probscene_worker" in block:  # written for programs that are not here
             compile(textwrap.dedent(block), "page", "exec")

@@ -114,7 +114,7 @@ TWICE = [{"id": 1, "name": "rbc"}, {"id": 1, "name": "wbc"}]
 JSON = {
     "no json": ("{", "COCO's JSON"),
     "a list": ("[]", "images, annotations, categories"),
-    "too few": (dict(images=GOOD[:2]), "at least 3 images", "actual 2", "probscene label"),
+    "too few": (dict(images=GOOD[:2]), "at least 3 images", "got 2", "probscene label"),
     "unknown images": (dict(images=[("image 9", []), ("image 8", [])]), "'image 9' in images[0]", "and 1 more"),
     "another case of an image": (dict(images=[*GOOD, ("Image 3", [])]), "did you mean 'image 3'"),
     "an image twice": (dict(images=[*GOOD, GOOD[1]]), "second one of image 1", "images[3]"),
@@ -126,9 +126,9 @@ JSON = {
     "no width": (dict(images=[*GOOD[1:], ("image 0", [(1, 4, 5, 0, 5)])]), "annotations[4]", "above 0"),
     "three numbers": (dict(images=[*GOOD[1:], ("image 0", [(1, 4, 5, 5)])]), "annotations[4]", "[4, 5, 5]"),
     "no number": (dict(images=[*GOOD[1:], ("image 0", [(1, 4, float("nan"), 5, 5)])]), "annotations[4]"),
-    "an unknown category": (dict(images=[*GOOD[1:], ("image 0", [(7, 4, 5, 5, 5)])]), "category_id", "actual 7"),
-    "another size": (dict(images=GOOD, size=(480, 640)), "images[0]", "640x480", "actual 64x48"),
-    "an id twice": (dict(images=GOOD, other={"categories": TWICE}), "categories[1]", "actual 1;"),
+    "an unknown category": (dict(images=[*GOOD[1:], ("image 0", [(7, 4, 5, 5, 5)])]), "category_id", "got 7"),
+    "another size": (dict(images=GOOD, size=(480, 640)), "images[0]", "640x480", "got 64x48"),
+    "an id twice": (dict(images=GOOD, other={"categories": TWICE}), "categories[1]", "got 1;"),
 }  # fmt: skip
 
 
@@ -143,7 +143,7 @@ def test_faults_of_coco(fault, tmp_path):
     with pytest.raises(DataError) as error:
         read_few(path, CELLS, pictures(5))
     assert all(part in str(error.value) for part in [*parts, "few.json"]), error.value
-    assert str(error.value).startswith("Expected ") and "\n" not in str(error.value)
+    assert str(error.value).startswith("expected ") and "\n" not in str(error.value)
 
 
 CSV = {
@@ -197,7 +197,7 @@ def test_structures_are_no_few_labels_and_one_image_is_too_few(tmp_path):
     with pytest.raises(DataError, match="whole structures"):
         read_few(tmp_path / "few.jsonl", CELLS, pictures(4))
     (tmp_path / "few.csv").write_text("image,rbc\nimage 0,1\n")
-    with pytest.raises(DataError, match="at least 3 images .* actual 1; add images"):
+    with pytest.raises(DataError, match="at least 3 images .* got 1; add images"):
         read_few(tmp_path / "few.csv", CELLS, pictures(1))
 
 
@@ -232,7 +232,7 @@ def test_a_record_changes_with_what_labels_say(tmp_path):
         (folder / "a.txt").write_text(text)
         digests |= {labels_record(path)["sha256"] for path in (file, folder)}
     assert len(digests) == 4 and labels_record(file)["path"] == str(file)
-    with pytest.raises(DataError, match="none.csv, actual none"):
+    with pytest.raises(DataError, match="none.csv, got none"):
         labels_record(tmp_path / "none.csv")
 
 

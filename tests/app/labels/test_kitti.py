@@ -102,7 +102,7 @@ def test_boxes_of_images_of_another_size_are_refused(tmp_path):
     for left, height, error in ((1230, 400, False), (1242, 20, True), (-80, 20, True), (-39, 20, False)):
         (tmp_path / "a.txt").write_text(line("Car") + "\n" + line("Car", height, left))
         if error:
-            with pytest.raises(DataError, match=r"image of 1242x375 in .*a\.txt, actual .*of another size"):
+            with pytest.raises(DataError, match=r"image of 1242x375 in .*a\.txt, got .*of another size"):
                 read_boxes(tmp_path, STREET, target)
         else:
             assert read_boxes(tmp_path, STREET, target).counts[0, 0] == 2
@@ -117,19 +117,19 @@ def test_names_of_the_model_go_first(tmp_path):
 def test_images_without_a_file_are_left_out_only_where_some_are_labelled(tmp_path):
     (tmp_path / "b.txt").write_text(line("Car"))
     target = images("x", ["a.png", "b.png", "c.png"])
-    with pytest.raises(DataError, match="actual none of a.png and 1 more"):
+    with pytest.raises(DataError, match="got none of a.png and 1 more"):
         read_boxes(tmp_path, STREET, target)
     assert read_boxes(tmp_path, STREET, target, some=True).counts.tolist() == [[1, 0, 0, 0]]
     (tmp_path / "b.txt").unlink()
-    with pytest.raises(DataError, match="actual none; label at least one"):
+    with pytest.raises(DataError, match="got none; label at least one"):
         read_boxes(tmp_path, STREET, target, some=True)
 
 
 FAULTS = {
-    "fourteen columns": (line("Car").rsplit(" ", 1)[0], "15 columns", "actual 14; mend the line"),
-    "a score": (line("Car") + " 0.93", "15 columns", "actual 16; ", "no score"),
-    "two words": (line("Person sitting"), "15 columns", "actual 16"),
-    "seventeen columns": (line("Car") + " 0.93 1", "15 columns", "actual 17; mend the line"),
+    "fourteen columns": (line("Car").rsplit(" ", 1)[0], "15 columns", "got 14; fix the line"),
+    "a score": (line("Car") + " 0.93", "15 columns", "got 16; ", "no score"),
+    "two words": (line("Person sitting"), "15 columns", "got 16"),
+    "seventeen columns": (line("Car") + " 0.93 1", "15 columns", "got 17; fix the line"),
     "a number with a gap": (line("Car").replace("12.00", "1_2"), "a number for z", "'1_2'"),
     "a word": (line("Car").replace("12.00", "far"), "a number for z", "'far'"),
     "not a number": (line("Car").replace("130.00", "nan"), "a number for bottom", "'nan'"),
@@ -142,7 +142,7 @@ FAULTS = {
 def test_wrong_lines_are_named(fault, tmp_path):
     wrong, *parts = FAULTS[fault]
     (tmp_path / "000007.txt").write_text("\n".join([line("Car"), "", wrong, line("Van")]))
-    with pytest.raises(DataError, match=r"^Expected .* in line 3 of .*000007\.txt") as error:
+    with pytest.raises(DataError, match=r"^expected .* in line 3 of .*000007\.txt") as error:
         read_boxes(tmp_path, STREET, images("x", ["000007.png"]))
     assert all(part in str(error.value) for part in parts) and "\n" not in str(error.value)
 
@@ -153,7 +153,7 @@ def test_what_is_no_text_or_has_no_class(tmp_path):
         read_boxes(tmp_path, STREET, images("x", ["a.png"]))
     (tmp_path / "a.txt").write_text(line("Car"))
     model = SimpleNamespace(name="digits", classes=("0", "1"))
-    with pytest.raises(DataError, match=r"'digits' has classes for \(0, 1\), actual Car"):
+    with pytest.raises(DataError, match=r"'digits' has classes for \(0, 1\), got Car"):
         read_boxes(tmp_path, model, images("x", ["a.png"]))
 
 

@@ -173,7 +173,7 @@ def test_files_of_macos_beside_images_and_labels_are_not_read(tmp_path):
 def test_an_image_without_a_label_file_is_named(tmp_path):
     pictures(tmp_path / "kitti" / "image_2", ["0.png", "1.png", "2.png", "3.png"])
     write_kitti(tmp_path / "kitti" / "label_2", ONE, "{}")
-    with pytest.raises(DataError, match=r"label file for each image in .*label_2, actual none of .*3\.png"):
+    with pytest.raises(DataError, match=r"label file for each image in .*label_2, got none of .*3\.png"):
         read_set(tmp_path / "kitti")
     (tmp_path / "kitti" / "image_2" / "3.png").unlink()
     (tmp_path / "kitti" / "label_2" / "9.txt").write_text(f"rbc 0 0 0 1 1 5 5 {REST}")

@@ -212,7 +212,7 @@ def test_images_of_yolo_lie_beside_their_labels_in_any_folder(tmp_path):
 
 YOLO = {
     "a score": ("0 .5 .5 .1 .1 .9", "line 2", "no score"),
-    "three numbers": ("0 .5 .5 .1", "at least three corners", "actual 4 numbers"),
+    "three numbers": ("0 .5 .5 .1", "at least three corners", "got 4 numbers"),
     "odd corners": ("0 .1 .1 .2 .2 .3 .3 .4", "at least three corners"),
     "a word": ("0 .5 .5 .1 wide", "0 to 1", "wide"),
     "pixels": ("0 64 48 10 10", "0 to 1", "divide"),
@@ -228,7 +228,7 @@ def test_faults_of_yolo(fault, tmp_path):
     wrong, *parts = YOLO[fault]
     folder = write_yolo(tmp_path / "yolo", [[], []])
     (folder / "labels" / "image 0.txt").write_text(f"1 .5 .5 .1 .1\n{wrong}\n")
-    with pytest.raises(DataError, match=r"^Expected .*image 0\.txt") as error:
+    with pytest.raises(DataError, match=r"^expected .*image 0\.txt") as error:
         read_boxes(folder, CELLS, target(2))
     assert all(part in str(error.value) for part in parts), error.value
 
@@ -236,11 +236,11 @@ def test_faults_of_yolo(fault, tmp_path):
 def test_names_of_yolos_classes_are_needed(tmp_path):
     folder = write_yolo(tmp_path / "a" / "b" / "yolo", THREE)
     for text, said in (
-        ("names: 3", "actual 3"),
-        ("nc: 1", "actual None"),
+        ("names: 3", "got 3"),
+        ("nc: 1", "got None"),
         ("a: [", "YAML"),
         ("names: {a: b}", "names"),
-        ("names: [a]\nkpt_shape: 3", "kpt_shape.*actual 3"),
+        ("names: [a]\nkpt_shape: 3", "kpt_shape.*got 3"),
         ("names: [a]\nkpt_shape: [2, x]", "kpt_shape"),
     ):
         (folder / "data.yaml").write_text(text)
@@ -248,7 +248,7 @@ def test_names_of_yolos_classes_are_needed(tmp_path):
             read_boxes(folder, CELLS, target(3))
         assert "\n" not in str(error.value)
     (folder / "data.yaml").unlink()
-    with pytest.raises(DataError, match=r"actual 5; for YOLO's labels put their data\.yaml or classes\.txt beside"):
+    with pytest.raises(DataError, match=r"got 5; for YOLO's labels put their data\.yaml or classes\.txt beside"):
         read_boxes(folder / "labels", CELLS, target(3))
 
 
@@ -305,9 +305,9 @@ def test_every_command_reads_cocos_spellings(spelling, tmp_path):
 
 
 WRONG = {
-    "another size": (changed(width=127), "0.png to be 127x96 as in images[0]", "actual 128x96"),
-    "an id twice": (changed(id="1"), "images[1]", "actual 1;"),
-    "no id": (changed(id=True), "images[0]", "actual true"),
+    "another size": (changed(width=127), "0.png to be 127x96 as in images[0]", "got 128x96"),
+    "an id twice": (changed(id="1"), "images[1]", "got 1;"),
+    "no id": (changed(id=True), "images[0]", "got true"),
     "two entries": (another(file_name="0.png"), "second one of 0.png in images[3]"),
     "case": (changed(file_name="0.PNG"), "'0.PNG'", "did you mean '0.png'"),
     "no polygon": (lambda whole: whole["annotations"][0].update(bbox=None, segmentation=[[1, 2, 3]]), "three corners"),
@@ -315,9 +315,9 @@ WRONG = {
     "a mask of another size": (
         lambda whole: whole["annotations"][0].update(bbox=None, segmentation={"size": [2, 4], "counts": [1, 7]}),
         "a mask of 128x96 in annotations[0]",
-        "actual 4x2",
+        "got 4x2",
     ),
-    "no box": (lambda whole: whole["annotations"][0].update(bbox=None), "annotations[0]", "actual null"),
+    "no box": (lambda whole: whole["annotations"][0].update(bbox=None), "annotations[0]", "got null"),
     "a class twice": (lambda whole: whole["categories"][0].update(name="wbc"), "'wbc' more than once"),
 }
 

@@ -250,4 +250,4 @@ def test_a_run_proposes_by_what_it_reads(call, discs, fitted, target, tmp_path):
     done = call("label", fitted, *words, "--out", tmp_path / "one")
     assert done.code == 2 and "new or empty folder" in done.err
     done = call("label", discs.file, target.images, "--out", tmp_path / "three", "--labels", target.labels)
-    assert done.code == 2 and "actual all 40 labelled" in done.err and not (tmp_path / "three").exists()
+    assert done.code == 2 and "got all 40 labelled" in done.err and not (tmp_path / "three").exists()

@@ -135,7 +135,7 @@ def test_test_images_in_a_set_are_named(drawn, tmp_path):
 
     Image.open(drawn / "test" / "images" / "002.png").save(folder / "images" / "005.png", compress_level=1)
     change(folder, lambda record: record.update(annotations=[]))
-    with pytest.raises(DataError, match=r"actual 1 in .*set/images/005\.png is .*test/images/002\.png\. Take them out"):
+    with pytest.raises(DataError, match=r"got 1 in .*set/images/005\.png is .*test/images/002\.png\. Take them out"):
         trial(drawn / "test", tmp_path / "out", {"set": folder}, **SMALL)
     assert not (tmp_path / "out").exists()
 
@@ -146,13 +146,13 @@ def test_test_images_in_a_set_are_named(drawn, tmp_path):
         ({"baselines": ["none"]}, "baseline among"),
         ({"seeds": 0}, "positive number of seeds"),
         ({"workers": 0}, "positive number of workers"),
-        ({"size": (60, 64)}, "multiples of 32, actual 64x60"),
+        ({"size": (60, 64)}, "multiples of 32, got 64x60"),
         ({"detector": "yolo"}, "efficientnet or maskrcnn=FILE"),
         ({"detector": "maskrcnn=/nowhere"}, "file of weights"),
         ({"budget": Budget(rate=-1.0)}, "positive learning rate"),
         ({"budget": Budget(last=1.0)}, "between 0 and 1"),
-        ({"numbers": [10]}, "--real-numbers, actual neither"),
-        ({"hold_out": 2, "real": Path("x")}, "actual both"),
+        ({"numbers": [10]}, "--real-numbers, got neither"),
+        ({"hold_out": 2, "real": Path("x")}, "got both"),
         ({"hold_out": 60}, "hold out 1 to 5"),
         ({"classes": ["disc", "cross"]}, "rename cross there"),
     ],
@@ -167,13 +167,13 @@ def test_sets_are_all_checked_before_any_is_trained(drawn, sets, tmp_path):
     other = draw_set(tmp_path / "other", 2, 3, classes=("Disc", "square"))
     more = change(draw_set(tmp_path / "more", 2, 3), lambda r: r["categories"].append({"id": 3, "name": "ring"}))
     for sets_, said in (
-        ({**sets, "other": other}, r"classes disc, square in .*other, actual Disc, square \('Disc' differs in case\)"),
-        ({**sets, "more": more}, r"classes disc, square in .*more, actual ring, too; name the classes"),
-        ({**sets, "nine": f"{drawn / 'train'}:9"}, "at least 9 images .* 'nine', actual 8"),
+        ({**sets, "other": other}, r"classes disc, square in .*other, got Disc, square \('Disc' differs in case\)"),
+        ({**sets, "more": more}, r"classes disc, square in .*more, got ring, too; name the classes"),
+        ({**sets, "nine": f"{drawn / 'train'}:9"}, "at least 9 images .* 'nine', got 8"),
     ):
         with pytest.raises(DataError, match=said):
             trial(drawn / "test", tmp_path / "out", sets_, **SMALL)
     lacking = change(draw_set(tmp_path / "test", 2, 4), lambda record: record.update(annotations=[]))
-    with pytest.raises(DataError, match="objects of every class, actual none of disc, square"):
+    with pytest.raises(DataError, match="objects of every class, got none of disc, square"):
         trial(lacking, tmp_path / "out", sets, **SMALL)
     assert not (tmp_path / "out").exists()

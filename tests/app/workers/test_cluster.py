@@ -195,7 +195,7 @@ def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, tmp_pa
 def test_other_versions_are_refused(nodes, monkeypatch):
     here = crews.versions()
     monkeypatch.setattr(crews, "versions", lambda: {**here, "torch": "1.0"})
-    with pytest.raises(ProbsceneError, match="Expected torch 1.0 on node .*, as on this machine, actual 2"):
+    with pytest.raises(ProbsceneError, match="expected torch 1.0 on node .*, as on this machine, got 2"):
         nodes.crew(doubling, ()).run([1], lambda result: None)
 
 
@@ -204,7 +204,7 @@ def test_the_last_node_is_lost(simulated, nodes):
         while simulated.nodes:
             simulated.kill()
 
-    with pytest.raises(MachineError, match="Expected a node with 1 cores .*, actual .*goes on where it stopped"):
+    with pytest.raises(MachineError, match="expected a node with 1 cores .*, got .*goes on where it stopped"):
         nodes.crew(doubling, (0.1,)).run(range(1000), done)
 
 
@@ -212,7 +212,7 @@ def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
     run = RunFolder.at(fitted)
     assert run.guide_hash() and run.guide  # as of another machine's disk, which nodes do not have
     run.path = tmp_path / "elsewhere"
-    with pytest.raises(ProbsceneError, match="On node .*: Expected a run folder .*elsewhere.*by the same paths"):
+    with pytest.raises(ProbsceneError, match="On node .*: expected a run folder .*elsewhere.*by the same paths"):
         nodes.crew(_actor, (run.path, 10, tmp_path / "out", 0, ("coco",), 0.0, False)).run([0], lambda result: None)
 
 
@@ -220,14 +220,14 @@ def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
 def test_a_cluster_that_is_not_there_is_one_line(call, fitted, tmp_path, address):
     result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
     assert result.code == 1 and result.err.count("\n") == 1
-    assert f"Expected a Ray cluster at {address}, actual none" in result.err and not (tmp_path / "out").exists()
+    assert f"expected a Ray cluster at {address}, got none" in result.err and not (tmp_path / "out").exists()
 
 
 def test_a_fit_without_its_cluster_leaves_no_run(call, discs, target, tmp_path):
     result = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "out", "--cluster", "127.0.0.1:1")
     assert result.code == 1 and result.err.count("\n") == 1
-    assert "Expected a Ray cluster at 127.0.0.1:1" in result.err and not (tmp_path / "out").exists()
-    with pytest.raises(MachineError, match="Expected a Ray cluster at 127.0.0.1:1"):
+    assert "expected a Ray cluster at 127.0.0.1:1" in result.err and not (tmp_path / "out").exists()
+    with pytest.raises(MachineError, match="expected a Ray cluster at 127.0.0.1:1"):
         fit(discs.file, target.images, out=tmp_path / "out", cluster="127.0.0.1:1", progress=False)
     assert not (tmp_path / "out").exists()
 
@@ -238,7 +238,7 @@ def test_what_is_not_ray_is_told_in_time(call, fitted, tmp_path, monkeypatch):
         address = f"127.0.0.1:{listening.getsockname()[1]}"
         result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
     assert result.code == 1 and result.err.count("\n") == 1
-    assert f"Expected a Ray cluster at {address}, actual none (something that is not Ray listens there" in result.err
+    assert f"expected a Ray cluster at {address}, got none (something that is not Ray listens there" in result.err
 
 
 def test_another_version_of_ray_is_no_missing_cluster(monkeypatch):
@@ -249,7 +249,7 @@ def test_another_version_of_ray_is_no_missing_cluster(monkeypatch):
 
     monkeypatch.setattr("ray.init", mismatched)
     monkeypatch.setattr(clusters, "_knocked", lambda address: address)
-    with pytest.raises(MachineError, match="actual Ray 2.1.0 and Python 3.9.1; install the same versions"):
+    with pytest.raises(MachineError, match="got Ray 2.1.0 and Python 3.9.1; install the same versions"):
         Cluster("10.0.0.1:6379")
 
 
@@ -262,5 +262,5 @@ def test_auto_starts_one_where_what_ray_remembers_is_gone(monkeypatch):
 
 
 def test_workers_or_a_cluster(fitted, tmp_path):
-    with pytest.raises(ProbsceneError, match="Expected workers or a cluster"):
+    with pytest.raises(ProbsceneError, match="expected workers or a cluster"):
         generate(RunFolder.at(fitted), 4, tmp_path / "out", workers=2, cluster=SimpleNamespace())

@@ -133,5 +133,5 @@ def test_a_network_counts_by_group_along_either_axis(shelves):
 def test_groups_that_make_no_sense():
     with pytest.raises(ModelError, match="along 'x' or 'y'"):
         Groups("road", along="z")
-    with pytest.raises(ModelError, match="actual 'y' and 0"):
+    with pytest.raises(ModelError, match="got 'y' and 0"):
         Groups("road", max_groups=0)

@@ -107,7 +107,7 @@ def test_few_pairs_have_a_bandwidth_too():
 )  # fmt: skip
 def test_what_cannot_be_projected_is_refused(spoil, part):
     one, other, _ = pairs(40)
-    with pytest.raises(ProbsceneError, match=rf"^Expected .*{part}"):
+    with pytest.raises(ProbsceneError, match=rf"^expected .*{part}"):
         discriminant(spoil(one), spoil(other), 3, 40)
 
 

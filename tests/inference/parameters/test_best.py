@@ -75,7 +75,7 @@ def test_training_that_made_it_surely_worse_is_undone(trays):
 
 
 def test_sites_that_would_keep_their_prior_do_not_decide_about_others(trays):
-    """What is learnt of ``floor.turn`` is wrong, and more so after the second training, which mends the other site."""
+    """What is learnt of ``floor.turn`` is wrong, and more so after the second training, which fixes the other site."""
     first, second, turn = (-1.0, -2.0), (2.0, -4.0), frozenset(["floor.turn"])
     judges = held((0.6, 1.0), (0.8, 1.0))
 

@@ -93,12 +93,12 @@ def test_an_interval_is_the_same_for_the_same_seed(values, seed):
 
 @pytest.mark.parametrize("values", [[], [1.5, 2.0], [-1, 2], [[1, 2]]])
 def test_what_is_no_count_is_refused(values):
-    with pytest.raises(ProbsceneError, match="Expected counts of 0 or more"):
+    with pytest.raises(ProbsceneError, match="expected counts of 0 or more"):
         metrics.histogram(values)
 
 
 def test_wrong_arguments_are_refused():
-    with pytest.raises(ProbsceneError, match="below 3, actual 7"):
+    with pytest.raises(ProbsceneError, match="below 3, got 7"):
         metrics.histogram([7], 3)
     with pytest.raises(ProbsceneError, match="sum to 1"):
         metrics.total_variation([0.5, 0.4], [1.0])

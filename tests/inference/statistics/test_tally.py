@@ -109,5 +109,5 @@ def test_figures_without_resamples_have_no_width():
 
 @pytest.mark.parametrize("count, image", [([-1], [0]), ([1], [2]), ([1], [-1]), ([1, 2], [0])])
 def test_what_is_no_unit_of_an_image_is_refused(count, image):
-    with pytest.raises(ProbsceneError, match="Expected counts of 0 or more in images 0..1"):
+    with pytest.raises(ProbsceneError, match="expected counts of 0 or more in images 0..1"):
         tally(count, image, resamples(2, 3))

@@ -188,9 +188,9 @@ def test_wide_features_are_judged_by_their_principal_components():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda g, r, p: (g, r[:39], p), "at least 40 real images, actual 39"),
+        (lambda g, r, p: (g, r[:39], p), "at least 40 real images, got 39"),
         (lambda g, r, p: (g, np.repeat(r[:1], 60, 0), p), "60 images with the same features"),
-        (lambda g, r, p: (g[:39], r, p), "generated features .40 or more, 7., actual .39, 7."),
+        (lambda g, r, p: (g[:39], r, p), "generated features .40 or more, 7., got .39, 7."),
         (lambda g, r, p: (g, r, p[:, :5]), "prior features"),
         (lambda g, r, p: (np.where(g > 3, np.nan, g), r, p), "finite generated features"),
     ],

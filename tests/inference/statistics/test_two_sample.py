@@ -125,11 +125,11 @@ def test_principal_components_keep_what_varies():
 @pytest.mark.parametrize(
     ("real", "says"),
     [
-        (np.eye(39), "at least 40 real images, actual 39"),
+        (np.eye(39), "at least 40 real images, got 39"),
         (np.ones((60, 4)), "60 images with the same features"),
         (np.ones((60, 4)) + 1e-7 * np.arange(60)[:, None], "zero variance in all 4 features"),
         (np.full((60, 4), np.nan), "finite"),
-        (np.ones(60), "actual .60,."),
+        (np.ones(60), "got .60,."),
     ],
 )
 def test_features_that_cannot_be_judged(real, says):
