@@ -36,7 +36,7 @@ from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import preset
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.inference.statistics.metrics import histogram, total_variation
@@ -119,7 +119,7 @@ def figures(model: SceneModel, policy: Policy, truth: np.ndarray, held_out: Deri
 
 def of_variant(args, seed: int, truth: np.ndarray, held_out: Derivation, name: str) -> dict:
     """The row of a variant, which is fitted in a process of its own; the others are as of ``figures``."""
-    keep_freed_memory()
+    tune_malloc()
     use_threads(1)
     start, variant = time.monotonic(), VARIANTS[name]
     other = changed(load_model(args.model), args.model, variant)
@@ -187,7 +187,7 @@ def main():
     parser.add_argument("--workers", type=int, default=cores(), help="fits at a time (%(default)s)")
     args = parser.parse_args()
     args.out /= args.model
-    keep_freed_memory()
+    tune_malloc()
     rows = []
     for seed in args.seeds:
         rows += of_seed(args, seed)

@@ -29,7 +29,7 @@ from probscene.app.chunks import CHUNK
 from probscene.app.datasets.generate import generate
 from probscene.app.files import write_json
 from probscene.app.fitting.run import RunFolder
-from probscene.app.workers.actor_pool import Crew
+from probscene.app.workers.actor_pool import ActorPool
 from probscene.app.workers.cluster import Cluster
 
 SHORT = {"count.steps": 60, "batches": 8, "num_scenes": 300, "pretrain_derivations": 500, "learn": "structure"}
@@ -132,7 +132,7 @@ def main():
         print(name, json.dumps(found[name]), flush=True)
     simulated.whole()
     shutil.rmtree(out / "nodes", ignore_errors=True)
-    run_crew, parts = Crew.run, []
+    run_crew, parts = ActorPool.run, []
 
     def disturbed(crew, tasks, done):
         def each(result):
@@ -144,7 +144,7 @@ def main():
 
         run_crew(crew, tasks, each)
 
-    Crew.run = disturbed
+    ActorPool.run = disturbed
     with CPU() as cost:
         ps.fit("multi_mnist", target / "images", out=out / "nodes", cluster=simulated.address, **fit)
     guides = [(out / name / "guide.safetensors").read_bytes() for name in ("alone", "nodes")]

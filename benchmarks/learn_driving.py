@@ -28,10 +28,10 @@ from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import STRUCTURE
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, Observer
+from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.derive import derive_complete
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
@@ -80,7 +80,7 @@ def sampled_anew(model: SceneModel, num: int) -> np.ndarray:
 def correlations(model: SceneModel, policy: Policy, net: FeatureNet, least: float) -> dict[str, float]:
     """By class, of what the features read in scenes and what is seen there of ``least`` of its silhouette or more."""
     seed_everything(99)
-    observer, parts = Observer(model, 1), []
+    observer, parts = RenderedFeatures(model, 1), []
     for _ in range(0, READ, RENDERED_AT_ONCE):
         drawn = observer.labelled(sample(model, policy, RENDERED_AT_ONCE))
         label = drawn.label.masked_fill(drawn.visible < least, -1)
@@ -103,7 +103,7 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=3000)
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     model, rows = load_model(args.model), []
     for seed in args.seeds:
         target = model.target(seed)

@@ -33,7 +33,7 @@ from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import PRESETS
 from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
 
@@ -77,7 +77,7 @@ def main():
     parser.add_argument("--min-height", type=float, default=0.0, help="of boxes that are counted, pixels")
     args = parser.parse_args()
     needed(args.labels, "a model, a folder of images, and their labels")
-    keep_freed_memory()
+    tune_malloc()
     model = load_model(args.model)
     folder = ImageFolder(args.images, model.canvas, model.channels)
     every = read_labels(args.labels, model, folder, min_height=args.min_height)

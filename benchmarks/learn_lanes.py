@@ -28,7 +28,7 @@ from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
 from probscene.app.fitting.store import timing
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.statistics.image_metrics import kid
@@ -110,7 +110,7 @@ def main():
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     rows = []
     for seed in args.seeds:
         rows.append(measured(seed, args))

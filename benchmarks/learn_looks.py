@@ -36,7 +36,7 @@ from probscene.app.fitting.parameter_stage import NAME, beside, learnt_by
 from probscene.app.fitting.preset import BOTH
 from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.sites import NEAR, quantiles_of, site_name, within
@@ -158,7 +158,7 @@ def main():
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     model, rows = load_model(args.model), []
     for seed in args.seeds:
         rows.append(measured(model, seed, args))

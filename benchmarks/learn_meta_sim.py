@@ -23,7 +23,7 @@ from torch import Tensor
 from probscene.app.files import write_json
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
-from probscene.app.fitting.rendered_features import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
@@ -45,7 +45,7 @@ def figures(transform: ParameterTransform | None, structure: Policy) -> tuple[di
     seed_everything(1)
     with torch.no_grad():
         scenes = sample(model, structure, TRIED)
-    return row_errors([scenes]), Observer(MODEL, 1).labelled(scenes, slice(0, SIDE**2)).image
+    return row_errors([scenes]), RenderedFeatures(MODEL, 1).labelled(scenes, slice(0, SIDE**2)).image
 
 
 def task_of(target: int, structure: Policy, labelled: int) -> PresenceTask:
@@ -53,9 +53,9 @@ def task_of(target: int, structure: Policy, labelled: int) -> PresenceTask:
     assert MODEL.target is not None
     truth = MODEL.target(target)
     seed_everything(2)
-    drawn = Observer(truth, 1).labelled(sample(truth, structure, labelled))
+    drawn = RenderedFeatures(truth, 1).labelled(sample(truth, structure, labelled))
     shown = torch.stack([(drawn.label == c).any(1) for c in range(len(CLASSES))], 1)
-    return PresenceTask(Observer(MODEL, 1).labelled, drawn.image, shown)
+    return PresenceTask(RenderedFeatures(MODEL, 1).labelled, drawn.image, shown)
 
 
 def learnt(name: str, training: Training, transform: ParameterTransform, structure: Policy) -> dict:
@@ -97,7 +97,7 @@ def main():
     settings = ["parameter_method=meta-sim", *(f"meta_sim.{setting}" for setting in args.set)]
     schedule = override(QUICK, settings).meta_sim
     look = EfficientNetLite(schedule.feature_size)
-    seen = Observer(MODEL, 1).observe(look)
+    seen = RenderedFeatures(MODEL, 1).observe(look)
     matching = MetaSimLearning(MODEL, structure, seen, look.embed(images), schedule, args.seed)
     transform = matching.guide
     assert transform is not None

@@ -35,7 +35,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.store import timing
 from probscene.app.fitting.structure_stage import BEFORE
 from probscene.app.loading import renderer_for
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.statistics.image_metrics import Figure, kid
@@ -135,7 +135,7 @@ def main():
     parser.add_argument("--parameters", nargs="+", default=[LIKELIHOOD], help="ways of learning them")
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     args.mnist = needed_mnist(args.mnist)
     rows = []
     for target in args.targets:

@@ -50,7 +50,7 @@ from probscene.app.fitting.preset import BOTH, STRUCTURE
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.kitti import DONT_CARE, read_objects
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.statistics.image_metrics import fid, kid
@@ -223,7 +223,7 @@ def main():
     args = parser.parse_args()
     args.images = needed(args.images, "a folder of street frames, and the file or folder of their labels")
     args.labels = needed(args.labels, "the frames' labels, KITTI's label_2 or a CSV of counts, after their folder")
-    keep_freed_memory()
+    tune_malloc()
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"

@@ -4,11 +4,11 @@
 
 MODEL is a model's name or file, IMAGES a folder of photographs without labels. One in five judges, and is not learnt
 from. Printed for each seed are squared energy distances of renders from these, by EfficientNet's features and by what
-can plainly be said of an image (``plain``), in units of how far the photographs are apart, without bias, with the
-interval that holds 95 % of bootstraps over images; for the prior, the start (the structures that a fit begins with,
-under the prior's parameters), what was learnt (the same structures, learnt parameters), and the floor, the photographs
-that were learnt from. Then the sites that were moved, renders, and CPU seconds. FOLDER holds ``results.json``, and a
-picture of each seed, ``scenes-K.png``: start, learnt, photographs.
+can plainly be said of an image (``image_statistics``), in units of how far the photographs are apart, without bias,
+with the interval that holds 95 % of bootstraps over images; for the prior, the start (the structures that a fit begins
+with, under the prior's parameters), what was learnt (the same structures, learnt parameters), and the floor, the
+photographs that were learnt from. Then the sites that were moved, renders, and CPU seconds. FOLDER holds
+``results.json``, and a picture of each seed, ``scenes-K.png``: start, learnt, photographs.
 """
 
 import argparse
@@ -29,13 +29,13 @@ from probscene.app.fitting.overrides import override
 from probscene.app.fitting.parameter_stage import HELD
 from probscene.app.fitting.preset import TILTING
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, Observer
+from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.app.progress import Display
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.parameters.tilting.image_statistics import plain
+from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import TiltingLearning
 from probscene.inference.statistics.tally import around, resamples
 from probscene.inference.statistics.two_sample import Features
@@ -77,7 +77,7 @@ def picture(panels: list[Tensor], path: Path) -> None:
     cv2.imwrite(str(path), np.concatenate(blocks[:-1], 1)[..., ::-1])
 
 
-def renders(observer: Observer, model: SceneModel, policy: Policy, number: int) -> Tensor:
+def renders(observer: RenderedFeatures, model: SceneModel, policy: Policy, number: int) -> Tensor:
     """Images ``(number, C, H, W)``, of one seed."""
     seed_everything(99)
     parts = [min(RENDERED_AT_ONCE, number - i) for i in range(0, number, RENDERED_AT_ONCE)]
@@ -85,12 +85,12 @@ def renders(observer: Observer, model: SceneModel, policy: Policy, number: int) 
 
 
 def learn(
-    model: SceneModel, observer: Observer, photographs: Tensor, seed: int, settings: list[str]
+    model: SceneModel, observer: RenderedFeatures, photographs: Tensor, seed: int, settings: list[str]
 ) -> TiltingLearning:
     """Parameters, learnt from photographs."""
     given = [f"parameter_method={TILTING}", *(f"tilting.{setting}" for setting in settings)]
     schedule = override(preset("quick"), given).tilting
-    seen_by = EfficientNetLite(schedule.feature_size).embed, plain
+    seen_by = EfficientNetLite(schedule.feature_size).embed, image_statistics
     real = tuple(embed(photographs) for embed in seen_by)
     learning = TiltingLearning(model, model.pretraining_policy, observer.labelled, seen_by, real, schedule, seed)
     with Display() as show:
@@ -108,15 +108,15 @@ def main():
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the schedule's field")
     args = parser.parse_args()
     needed(args.photographs, "a model and a folder of photographs")
-    keep_freed_memory()
+    tune_malloc()
     torch.set_num_threads(1)
     make_folder(args.out)
     model, rows = load_model(args.model), []
     folder = ImageFolder(args.photographs, model.canvas, model.channels)
     target = torch.stack([folder.load(i) for i in range(len(folder))])
     held = torch.arange(len(target)) % HELD == HELD - 1
-    observer, start = Observer(model, 1), model.pretraining_policy
-    judges = {"efficientnet": EfficientNetLite().embed, "plain": plain}
+    observer, start = RenderedFeatures(model, 1), model.pretraining_policy
+    judges = {"efficientnet": EfficientNetLite().embed, "plain": image_statistics}
 
     def seen(images: Tensor) -> dict[str, Features]:
         return {judge: embed(images).double().numpy() for judge, embed in judges.items()}

@@ -23,7 +23,7 @@ LEAST_UNIT = 0.3  # objects
 ONE = KDELogRatio(variance=1.0, marginal_variance=None)  # of each kind, in bandwidths
 
 
-class Held:
+class PriorCountPenalty:
     """Counts of some kinds that are to stay as in a model's prior. Its structures are drawn when this is made.
 
     Args:

@@ -15,7 +15,7 @@ from probscene.sampling import seed_everything
 
 from .guides.base import Guide
 from .objective import ScoreFunction
-from .render_cache import RenderPool
+from .render_cache import RenderCache
 from .training import Report, batch_seed, check_finite, of_prefix, restore_training, training_state
 
 
@@ -52,7 +52,7 @@ class Trainer:
         learning_rate: float = 1e-2,
         cosine: bool = True,
         seed: int = 0,
-        pool: RenderPool | None = None,
+        pool: RenderCache | None = None,
     ):
         self.pool = pool
         self.model, self.guide, self.objective, self.real = model, guide, objective, real

@@ -17,7 +17,7 @@ from probscene.model import SceneModel
 from probscene.sampling import Scenes
 
 
-class RenderPool:
+class RenderCache:
     """Renders of a fit, by the counts of their scenes: of all kinds, and of each group where a model has groups.
 
     Args:

@@ -38,12 +38,12 @@ class StepTraining:
         optimiser: torch.optim.Optimizer,
         steps: int,
         seed: int,
-        warming: int = 0,
-        longest: float = 5.0,
+        warmup_steps: int = 0,
+        max_grad_norm: float = 5.0,
     ):
         self.module, self.optimiser, self.total, self.seed, self.done = module, optimiser, steps, seed, 0
         self.rates = [group["lr"] for group in optimiser.param_groups]
-        self.warming, self.longest = warming, longest
+        self.warmup_steps, self.max_grad_norm = warmup_steps, max_grad_norm
 
     def loss(self) -> Tensor:
         """Of a step, with its gradient; it may draw random numbers."""
@@ -82,13 +82,13 @@ class StepTraining:
         self.done = int(restore_training(self.module, {"adam": self.optimiser}, tensors)["done"])
 
     def _step(self) -> float:
-        warm = min(1.0, (self.done + 1) / self.warming) if self.warming else 1.0
+        warm = min(1.0, (self.done + 1) / self.warmup_steps) if self.warmup_steps else 1.0
         factor = warm * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
         for group, rate in zip(self.optimiser.param_groups, self.rates, strict=True):
             group["lr"] = rate * factor
         loss = self.loss()
         self.optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.module.parameters(), self.longest)
+        torch.nn.utils.clip_grad_norm_(self.module.parameters(), self.max_grad_norm)
         self.optimiser.step()
         return loss.item()

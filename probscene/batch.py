@@ -7,7 +7,7 @@ from torch import Tensor
 from .request import Renderable
 
 
-class Space(NamedTuple):
+class SceneGeometry(NamedTuple):
     """What the render of a 3D scene has in addition; the camera's axes are KITTI's, see ``world``.
 
     Attributes:
@@ -58,7 +58,7 @@ class RenderBatch(NamedTuple):
     amodal_box: Tensor
     pixels: Tensor
     visible: Tensor
-    space: Space | None = None
+    space: SceneGeometry | None = None
     unknown: tuple[str, ...] = ()
     depth: Tensor | None = None
 

@@ -1,7 +1,8 @@
 """``derive``, the one Pyro program behind prior, PCFG and guide (Meta-Sim2, section 3.2).
 
 Each step samples the rule of the next nonterminal at the site ``rule_t`` from a Categorical whose illegal rules are
-masked. ``Given`` is an effect handler that hands ``derive`` what is derived already. Axis letters: N scenes, T steps.
+masked. ``ConditionDerivation`` is an effect handler that hands ``derive`` what is derived already. Axis letters: N
+scenes, T steps.
 """
 
 from collections.abc import Callable
@@ -35,7 +36,7 @@ def _derived(grammar: Grammar, choose: Chooser, num_scenes: int, max_steps: int)
 _effect = cast(Callable[..., Derivation], _derived)  # which takes a name as well
 
 
-class Given(Messenger):
+class ConditionDerivation(Messenger):
     """Inside it ``derive`` gives derivations that are known: the stack machine does not run, and no ``rule_t`` is a
     site. A program that derives scenes of another grammar, under another name, or another number of them, still
     samples.

@@ -6,7 +6,7 @@ Axis letters: N scenes, M nodes, H W.
 import torch
 from torch import Tensor
 
-from .batch import RenderBatch, Renderer, Space
+from .batch import RenderBatch, Renderer, SceneGeometry
 from .errors import ModelError
 from .request import Renderable
 
@@ -45,7 +45,7 @@ def _pairs(batch: RenderBatch, again: RenderBatch) -> list[tuple[str, Tensor, Te
     each = [(key, getattr(batch, key), getattr(again, key)) for key in batch._fields]
     pairs = [(key, one, other) for key, one, other in each if isinstance(one, Tensor) and isinstance(other, Tensor)]
     if batch.space is not None and again.space is not None:
-        parts = [key for key in Space._fields if key != "names"]
+        parts = [key for key in SceneGeometry._fields if key != "names"]
         pairs += [(f"space.{key}", getattr(batch.space, key), getattr(again.space, key)) for key in parts]
     return pairs
 
@@ -63,7 +63,7 @@ def _check_batch(name: str, batch: RenderBatch, drawing: Renderable, canvas: tup
         "pixels": (torch.int64, (N, M)), "visible": (torch.float32, (N, M)),
     })  # fmt: skip
     if batch.space is not None:
-        if not isinstance(batch.space, Space):
+        if not isinstance(batch.space, SceneGeometry):
             raise ModelError(f"expected {name} to return a Space as space, or None, got {type(batch.space).__name__}.")
         _check_tensors(name, "space.", batch.space, {
             "depth": (torch.float32, (N, H, W)), "semantic": (torch.uint8, (N, H, W)),

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from .derivation import Derivation
-from .derive import Given, derive_complete
+from .derive import ConditionDerivation, derive_complete
 from .errors import ModelError
 from .model import SceneModel
 from .policy import Policy
@@ -102,7 +102,7 @@ def run_program(
             f"expected complete derivations for model {name!r}, got {int((~derivation.complete).sum())} of {N} with "
             "nonterminals left; draw them with derive_complete."
         )
-    known = Given(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
+    known = ConditionDerivation(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
     with told(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)

@@ -22,8 +22,8 @@ from .request import Objects, Request, resolve_values
 from .scene_sites import seed_site
 from .world import Camera, Ground, Light, Meshes, MeshLayer, World, resolve_ground, resolve_meshes, resolve_scene
 
-Given = TypeVar("Given", Sprites, Meshes)
-Found = TypeVar("Found", Layer, MeshLayer)
+AnyPrimitive = TypeVar("AnyPrimitive", Sprites, Meshes)
+AnyLayer = TypeVar("AnyLayer", Layer, MeshLayer)
 
 
 class SceneGraph:
@@ -169,7 +169,9 @@ class SceneGraph:
         }  # fmt: skip
         return sample_photo(len(self.kind), looks)
 
-    def _resolved(self, layers: Iterable[Given], resolve: Callable[[Given, Tensor], Found]) -> tuple[Found, ...]:
+    def _resolved(
+        self, layers: Iterable[AnyPrimitive], resolve: Callable[[AnyPrimitive, Tensor], AnyLayer]
+    ) -> tuple[AnyLayer, ...]:
         found = []
         for layer in layers:
             kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds

@@ -123,11 +123,11 @@ class StructurePrior(Policy):
         """
         _, P, C, K = self.table.shape
         P, C = max(P, ranks), max(C, repeats)
-        table, rules = grown(self.table, P, C).clone(), self.grammar.rules
+        table, rules = expand_table(self.table, P, C).clone(), self.grammar.rules
         keep = torch.tensor(
             [[[bool(legal(str(r), c, p)) for r in rules] for c in range(repeats)] for p in range(ranks)]
         )
-        keep = grown(keep.unsqueeze(0), P, C)[0].expand(len(table) - 1, P, C, K)
+        keep = expand_table(keep.unsqueeze(0), P, C)[0].expand(len(table) - 1, P, C, K)
         if keep.all():
             raise GrammarError(
                 f"expected a production that is not legal somewhere, got all legal up to repeat {repeats - 1} and "
@@ -147,7 +147,7 @@ class StructurePrior(Policy):
                     f"expected a production of {self.grammar.nonterminals[symbol]} that is legal after {repeat} "
                     f"repeats at rank {rank}, got none that has a probability there."
                 )
-        table[:-1] = torch.where(empty, grown(self.table, P, C)[:-1], table[:-1])  # which nothing reaches
+        table[:-1] = torch.where(empty, expand_table(self.table, P, C)[:-1], table[:-1])  # which nothing reaches
         return made
 
     @staticmethod
@@ -171,7 +171,7 @@ class StructurePrior(Policy):
         table[0, :, :, : len(priors)] = _normalised(tuple(weights), len(priors), "weights of scenarios").log().float()
         table[V, :, :, 0] = 0.0
         for prior, v, k in zip(priors, first_symbol, first_rule, strict=True):
-            own = grown(prior.table[:-1], P, C)
+            own = expand_table(prior.table[:-1], P, C)
             table[v : v + own.shape[0], :, :, k : k + own.shape[3]] = own
         return StructurePrior.of_table(grammar, table)
 
@@ -201,7 +201,7 @@ class StructurePrior(Policy):
         return self.table.flatten(0, 2)[torch.from_numpy(row)]
 
 
-def grown(table: Tensor, P: int, C: int) -> Tensor:
+def expand_table(table: Tensor, P: int, C: int) -> Tensor:
     """A table ``(..., p, c, K)`` for more ranks and repeats, of which all later ones are as the last."""
     ranks, repeats = torch.arange(P).clamp(max=table.shape[-3] - 1), torch.arange(C).clamp(max=table.shape[-2] - 1)
     return table[..., ranks, :, :][..., repeats, :]

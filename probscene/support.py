@@ -20,7 +20,7 @@ from .branching import Branching
 from .derivation import Frontier
 from .grammar import Grammar
 from .policy import Policy
-from .structure import StructurePrior, grown
+from .structure import StructurePrior, expand_table
 
 LEAST = -1e9  # as a logit of probability 0: infinity has no gradient
 
@@ -75,11 +75,11 @@ class Support:
         C = max(C, P)  # a list's repeats are the rank that its elements read
         possible = torch.zeros(len(grammar.nonterminals) + 1, P, C, len(grammar.rules), dtype=torch.bool)
         for table in tables:
-            process = Branching(grammar, grown(table, P, C))
+            process = Branching(grammar, expand_table(table, P, C))
             state = torch.tensor([(t.symbol, t.parent_repeat, t.repeat) for t in process.types])[process.owner]
             possible[state[:, 0], state[:, 1], state[:, 2], torch.from_numpy(process.rule)] = True
         never = ~possible.any(-1, keepdim=True)  # nothing reaches it; a mask of nothing would be NaN
-        written = torch.stack([grown(table, P, C) > -torch.inf for table in tables]).any(0)
+        written = torch.stack([expand_table(table, P, C) > -torch.inf for table in tables]).any(0)
         return Support(grammar, possible | (never & written))
 
     def holding(self, prior: Policy, kinds: Sequence[str]) -> "Support":
@@ -137,7 +137,7 @@ class Support:
             possible[symbol] = legal
             return Support(self.grammar, possible)
         C = max(self.possible.shape[2], longest + 1)
-        possible = grown(self.possible, self.possible.shape[1], C).clone()
+        possible = expand_table(self.possible, self.possible.shape[1], C).clone()
         again = (self.grammar.children == symbol).any(1) & legal
         for p in range(possible.shape[1]) if rank is None else [rank]:
             here = possible[symbol, p]  # (C, K)

@@ -57,10 +57,10 @@ class FeatureNet(Protocol):
         """Features ``(N, D)`` float32, finite, of images ``(N, C, H, W)`` uint8, N >= 0. Renders come with C = 3;
         target images with C = 1 where the model's colour carries nothing, else 3.
 
-        A network may have three more beside it: ``embed_photographs``, which is then called for target images,
-        ``embed_drawn(examples)``, which is called for renders where their labels are at hand (their images may be black
-        if the network's ``by_labels`` is true), and ``cells(images)``, ``(N, classes, h, w)``, how many objects of each
-        of its ``classes`` each cell of the image holds, by which a verdict on layout goes."""
+        A network may have three more beside it: ``embed_real``, which is then called for target images,
+        ``embed_from_labels(examples)``, which is called for renders where their labels are at hand (their images may be
+        black if the network's ``uses_labels`` is true), and ``cells(images)``, ``(N, classes, h, w)``, how many objects
+        of each of its ``classes`` each cell of the image holds, by which a verdict on layout goes."""
         ...
 
 
@@ -159,7 +159,7 @@ class Features(Protocol):
         """How the network is trained in place; None where there is nothing to train.
 
         Args:
-            photographs: opens the target; a network that learns from it is bound to it, see ``taught_by``.
+            photographs: opens the target; a network that learns from it is bound to it, see ``target_fingerprint``.
             seed: of everything random.
         """
         return None
@@ -168,7 +168,7 @@ class Features(Protocol):
         """Suit a trained network to the target's images, in place, such as by choosing how counts are read in them.
 
         Args:
-            photographs: opens the target; a network that learns from it is bound to it, see ``taught_by``.
+            photographs: opens the target; a network that learns from it is bound to it, see ``target_fingerprint``.
             each: is told how many images have been looked at, and of how many.
 
         Returns:
@@ -181,7 +181,7 @@ class Features(Protocol):
         """The divergence that suits the network's features, given the fit's own."""
         return chosen
 
-    def taught_by(self, net: FeatureNet) -> str:
+    def target_fingerprint(self, net: FeatureNet) -> str:
         """The fingerprint of the photographs that the network has learnt from, empty for none: it is used with no
         others."""
         return ""

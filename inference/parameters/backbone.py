@@ -25,7 +25,7 @@ FINEST = 8  # pixels of what enters a pretrained network a cell
 DROPPED, SHIFT = 0.1, 0.2  # of the maps' channels that are left out; deviation of what is added to one, in its own
 
 
-class Eye(nn.Module):
+class Backbone(nn.Module):
     """``forward`` gives ``(N, WIDTH, h, w)`` of what ``enter`` gives.
 
     Attributes:
@@ -45,16 +45,16 @@ class Eye(nn.Module):
         return most
 
     @staticmethod
-    def of(net: FeatureNet) -> "Eye | None":
+    def of(net: FeatureNet) -> "Backbone | None":
         """That which suits what structure was learnt by; None where nothing does."""
         if isinstance(net, CountNet):
-            return RenderEye(net)
+            return RenderBackbone(net)
         if hasattr(net, "look"):  # torchvision takes seconds to import
-            return PhotographEye(cast("PretrainedCountNet", net))
+            return PhotographBackbone(cast("PretrainedCountNet", net))
         return None
 
 
-class RenderEye(Eye):
+class RenderBackbone(Backbone):
     """On a copy of a count network's convolutions, which know the classes."""
 
     def __init__(self, counts: CountNet):
@@ -73,17 +73,17 @@ class RenderEye(Eye):
         return F.pad(x, (0, -x.shape[-1] % (2 * STRIDE), 0, -x.shape[-2] % (2 * STRIDE)))
 
     def images_a_step(self, most: int) -> int:
-        """See ``Eye``; fewer where they are large."""
+        """See ``Backbone``; fewer where they are large."""
         return images_a_step(most, self.area)
 
     def forward(self, x: Tensor) -> Tensor:
-        """See ``Eye``."""
+        """See ``Backbone``."""
         fine = layers(self.fine, x)
         coarse = F.interpolate(self.down(self.coarse(fine)), scale_factor=2, mode="nearest")
         return self.both(self.side(fine) + coarse)
 
 
-class PhotographEye(Eye):
+class PhotographBackbone(Backbone):
     """On frozen maps.
 
     Args:
@@ -104,7 +104,7 @@ class PhotographEye(Eye):
         return images
 
     def forward(self, x: Tensor) -> Tensor:
-        """See ``Eye``."""
+        """See ``Backbone``."""
         net = self.net[0]
         maps, size = net.normal(net.look(x)), net.places(FINEST)
         if self.training:

@@ -12,13 +12,13 @@ from probscene.model import SceneModel
 
 from ..training import of_prefix
 from .energy import OwnReadings
-from .global_head import Overall
+from .global_head import GlobalHead
 from .graph import Graph
 from .likelihood import Values
-from .missed_objects import Missing
-from .reader import Found, Reader
-from .reader_training import MIN_VISIBLE, Valued
-from .scene_graph_builder import Assembly, assembly
+from .missed_objects import MissedObjects
+from .reader import Detections, Reader
+from .reader_training import MIN_VISIBLE, SupervisedBatch
+from .scene_graph_builder import SceneGraphBuilder, assembly
 from .sites import Site, having
 from .skill import ENOUGH, LEAST_SD, Skill
 
@@ -27,7 +27,7 @@ SHARP = 0.9  # share of a site's variance from which on it is read sharply
 NEAR_ENOUGH = 12.0  # pixels from an object that is found to that which it is
 
 
-class TriedReader:
+class CalibratedReader:
     """A reader of a model's sites; it is tried once, and reads from then on those of them that it can read.
 
     Args:
@@ -60,7 +60,7 @@ class TriedReader:
             self.skill = Skill(tensors["skill.way"], tensors["skill.share"])
             self.readings_of = tensors["readings"]
 
-    def settle(self, valued: Valued) -> tuple[Found, Tensor]:
+    def settle(self, valued: SupervisedBatch) -> tuple[Detections, Tensor]:
         """Settle how much of an object's unit has to be found: so little that in some renders the fewest objects are
         missed, found twice or found where there is none; up to chance, as of a target's objects less is found.
 
@@ -80,7 +80,7 @@ class TriedReader:
         enough = found.mass > self.reader.least
         return found.those(enough), which[enough]
 
-    def on(self, valued: Valued, images: Tensor) -> None:
+    def on(self, valued: SupervisedBatch, images: Tensor) -> None:
         """Try it on renders of the prior, and see how often it finds each class in the target's images."""
         found, which = self.settle(valued)
         of_nodes = Skill.of(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
@@ -123,13 +123,13 @@ class TriedReader:
         each = zip((*self.node_sites, *self.scene_sites), self.skill.share.tolist(), strict=True)
         return frozenset(site.name for site, share in each if site in self.good_sites and share < UNCLEAR)
 
-    def reading_anew(self) -> Overall:
+    def reading_anew(self) -> GlobalHead:
         """The network that unclear sites of scenes are read by from now on."""
         anew = [site.name in self.unclear for site in self.scene_sites]
         self.reader.anew.copy_(torch.tensor(anew))
         return self.reader.again
 
-    def lost(self, valued: Valued) -> dict[str, float]:
+    def lost(self, valued: SupervisedBatch) -> dict[str, float]:
         """Which of these cannot be read in renders that look like the target, but have the prior's values of them: what
         the prior's renders show may be hidden there, as a sun behind clouds. By name, the share of its variance that is
         read."""
@@ -164,7 +164,12 @@ class TriedReader:
         return {site.name: u.clamp(0, 1) for site, u in columns if site in self.good_sites}
 
     def values(
-        self, made: Assembly, found: Found, number: int, of: Tensor | None = None, missing: Missing | None = None
+        self,
+        made: SceneGraphBuilder,
+        found: Detections,
+        number: int,
+        of: Tensor | None = None,
+        missing: MissedObjects | None = None,
     ) -> tuple[Values, Tensor]:
         """Scene graphs of what was found in so many images, with the learnt sites, and of what is missing there; and
         what ``of (K,)`` says of each object, ``(L, M)`` int64, -1 where there is none."""
@@ -184,27 +189,29 @@ class TriedReader:
         values = Values(kind, parent, mean, sd, scene_mean, scene_sd, turns, both[..., -1].nan_to_num(0.0))
         return values, both[..., -2].nan_to_num(-1).long()
 
-    def own(self, made: Assembly, valued: Valued) -> OwnReadings:
+    def own(self, made: SceneGraphBuilder, valued: SupervisedBatch) -> OwnReadings:
         """What it reads in renders, with what they show."""
         found = self.reader.find(valued.drawn.image)
         read, which = self.values(made, found, len(valued.kind), matched(found, valued))
         node, scene = self.columns
         return OwnReadings(valued.kind, valued.parent, valued.u[..., node], valued.overall[:, scene], read, which)
 
-    def assembly(self, valued: Valued) -> Assembly:
+    def assembly(self, valued: SupervisedBatch) -> SceneGraphBuilder:
         """What some scenes of the prior have in common."""
         label, kind = valued.drawn.label, kinds_of(self.model, valued.drawn.label)
         centre = valued.drawn.centre.where((label >= 0).unsqueeze(-1), torch.nan)
         graph = Graph.of(kind, valued.parent)
         return assembly(self.model.grammar, self.model.classes, graph, centre, valued.group)
 
-    def missing(self, valued: Valued) -> Missing:
+    def missing(self, valued: SupervisedBatch) -> MissedObjects:
         """Objects that it does not find in some renders; by these is settled first how much has to be found."""
         found, which = self.settle(valued)
         there = torch.zeros_like(valued.kind, dtype=torch.bool)
         is_it = (which >= 0) & (found.label == valued.drawn.label[found.image, which])
         there[found.image[is_it], which[is_it]] = True
-        return Missing.of(valued, kinds_of(self.model, torch.arange(len(self.model.classes))), there, self.columns[0])
+        return MissedObjects.of(
+            valued, kinds_of(self.model, torch.arange(len(self.model.classes))), there, self.columns[0]
+        )
 
     def _skills(self) -> tuple[Skill, Skill]:
         """Of the sites of nodes, and of scenes."""
@@ -218,12 +225,12 @@ def kinds_of(model: SceneModel, label: Tensor) -> Tensor:
     return torch.tensor([*(model.grammar.kind(name) for name in model.classes), -1])[label]
 
 
-def visible(valued: Valued) -> Tensor:
+def visible(valued: SupervisedBatch) -> Tensor:
     """``(N, M)`` bool, the nodes that can be seen."""
     return (valued.drawn.label >= 0) & (valued.drawn.visible >= MIN_VISIBLE)
 
 
-def matched(found: Found, valued: Valued) -> Tensor:
+def matched(found: Detections, valued: SupervisedBatch) -> Tensor:
     """``(K,)`` the node nearest to each object that was found; -1 where none is near."""
     away = (valued.drawn.centre[found.image] - found.centre[:, None]).norm(dim=-1)
     away = away.masked_fill(~visible(valued)[found.image], torch.inf)

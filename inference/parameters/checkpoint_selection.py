@@ -6,13 +6,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..statistics.bootstrap_test import farther
+from ..statistics.bootstrap_test import bootstrap_test
 from ..statistics.two_sample import Features
 from ..training import of_prefix
 from .guide import ParameterGuide
 
 
-class HeldOut(NamedTuple):
+class HeldOutSet(NamedTuple):
     """What judges.
 
     Attributes:
@@ -31,7 +31,7 @@ class HeldOut(NamedTuple):
         return looks
 
 
-class Best:
+class CheckpointSelector:
     """Goes back to the best state where training has made a guide's scenes surely farther from the images.
 
     Attributes:
@@ -39,7 +39,7 @@ class Best:
         passed: names of its sites that had their prior where it was judged.
     """
 
-    def __init__(self, held: HeldOut):
+    def __init__(self, held: HeldOutSet):
         self.held, self.weights, self.passed = held, dict[str, Tensor](), frozenset[str]()
         self.looks: Features | None = None
 
@@ -56,7 +56,7 @@ class Best:
             guide.net.load_state_dict(self.weights)
             if self.looks is None:  # resumed
                 self.looks = self.held.looks(guide, self.passed)
-            if farther(looks, self.looks, self.held.real).sure:
+            if bootstrap_test(looks, self.looks, self.held.real).sure:
                 return
             guide.net.load_state_dict(now)
         self.weights, self.looks, self.passed = now, looks, passed
@@ -71,7 +71,7 @@ class Best:
         self.weights, self.passed = of_prefix(tensors, "weights."), frozenset(of_prefix(tensors, "passed."))
 
 
-def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:
+def uninformative_sites(guide: ParameterGuide, held: HeldOutSet) -> frozenset[str]:
     """Names of the sites whose learnt values do not surely bring renders nearer to the images, each tried alone.
 
     Those that do are tried together as well; where that is no nearer than the prior, all are named but the best one.
@@ -83,11 +83,11 @@ def useless(guide: ParameterGuide, held: HeldOut) -> frozenset[str]:
 
     prior, away = look(frozenset()), {}
     for name in sorted(names):
-        apart = farther(prior, look(frozenset((name,))), held.real)
+        apart = bootstrap_test(prior, look(frozenset((name,))), held.real)
         if apart.sure:
             away[name] = apart.other
     if len(away) > 1:
-        apart = farther(look(frozenset(away)), prior, held.real)
+        apart = bootstrap_test(look(frozenset(away)), prior, held.real)
         if apart.one >= apart.other:
             away = {min(away, key=away.__getitem__): 0.0}
     return names - frozenset(away)

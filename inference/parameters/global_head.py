@@ -15,7 +15,7 @@ NUMBERS = 6 + 5 * PICTURE[0] * PICTURE[1] + 4 * PROFILE
 FARTHEST = 5.0  # deviations that enter, at most
 
 
-class Overall(nn.Module):
+class GlobalHead(nn.Module):
     """What is said of the scenes' sites.
 
     Args:

@@ -20,7 +20,7 @@ SAME, SPACED = 0.3, 0.3  # shares of the arranged scenes' sites; the rest is ind
 JITTER = 0.08  # largest spread of u around a pattern
 
 
-class Arranged(Messenger):
+class LayoutAugmentation(Messenger):
     """Inside it some of a program's scenes are arranged.
 
     Args:

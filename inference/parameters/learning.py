@@ -27,19 +27,19 @@ from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
 from ..training import Report, Training, batch_seed, of_prefix
-from .backbone import Eye
-from .calibration import TriedReader
-from .checkpoint_selection import Best, HeldOut
+from .backbone import Backbone
+from .calibration import CalibratedReader
+from .checkpoint_selection import CheckpointSelector, HeldOutSet
 from .energy import EnergyDistance, OwnReadings, WeightedEnergyDistance, site_rows
 from .guide import ParameterGuide
 from .likelihood import MaximumLikelihood, Values
-from .missed_objects import Missing
+from .missed_objects import MissedObjects
 from .reader import Reader
-from .reader_training import OverallTraining, ReaderTraining, Valued
-from .scene_graph_builder import Assembly, along_the_widest
+from .reader_training import GlobalHeadTraining, ReaderTraining, SupervisedBatch
+from .scene_graph_builder import SceneGraphBuilder, order_by_variance
 from .schedule import EACH, ENERGY, LIKELIHOOD, OF_GUIDE, READING, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
 from .sites import Site, find_sites
-from .supervised_renders import Label, ValuedRenders, joined
+from .supervised_renders import Label, SupervisedRenders, joined
 
 TRIED = 500  # renders that a reader is tried on, and that are drawn at once at most, as they take memory
 ASSEMBLED, MISSED = 200, 400  # renders in which it is seen how objects of a scene go together; what is not found
@@ -76,15 +76,15 @@ class ParameterLearning:
         self,
         model: SceneModel,
         structure: Policy,
-        eye: Eye,
+        eye: Backbone,
         label: Label,
         images: Callable[[], Tensor],
         schedule: ParameterSchedule,
         seed: int = 0,
-        held: HeldOut | None = None,
+        held: HeldOutSet | None = None,
         settle: Callable[["ParameterLearning", bool], Collection[str]] | None = None,
     ):
-        self.best = None if held is None else Best(held)
+        self.best = None if held is None else CheckpointSelector(held)
         self.settle = settle or (lambda *_: frozenset[str]())
         self.settled: frozenset[str] | None = None
         self.model, self.structure, self.images, self.schedule, self.seed = model, structure, images, schedule, seed
@@ -93,15 +93,15 @@ class ParameterLearning:
         open_to = [site for site in self.sites if not site.keeps]
         self.node_sites = tuple(site for site in open_to if not site.of_scene)
         self.scene_sites = tuple(site for site in open_to if site.of_scene)
-        self.renders = ValuedRenders(model, label, self.node_sites, self.scene_sites)
+        self.renders = SupervisedRenders(model, label, self.node_sites, self.scene_sites)
         reader = Reader(eye, len(model.classes), len(self.node_sites), len(self.scene_sites))
-        self.tried = TriedReader(model, reader, self.node_sites, self.scene_sites)
+        self.tried = CalibratedReader(model, reader, self.node_sites, self.scene_sites)
         self.phases, self.lengths = zip(*schedule.phases(bool(self.scene_sites)), strict=True)
         self.total, self.done, self.phase = sum(self.lengths), 0, 0
         self.guide: ParameterGuide | None = None
-        self.missing: Missing | None = None  # while likelihood is gone up
+        self.missing: MissedObjects | None = None  # while likelihood is gone up
         self.inner: Training | None = None
-        self.ahead: tuple[tuple[int, int], list[Valued]] = (-1, -1), []
+        self.ahead: tuple[tuple[int, int], list[SupervisedBatch]] = (-1, -1), []
 
     @property
     def learnt(self) -> tuple[Site, ...]:
@@ -172,7 +172,7 @@ class ParameterLearning:
             if self.best is not None:
                 self.best.restore(of_prefix(tensors, "best."))
         missing, inner = of_prefix(tensors, "missing."), of_prefix(tensors, "inner.")
-        self.missing = Missing(**missing) if missing else None
+        self.missing = MissedObjects(**missing) if missing else None
         if inner:
             self.inner = self._begun()
             self.inner.restore(inner)
@@ -189,7 +189,7 @@ class ParameterLearning:
         if what in (SCENES, UNCLEAR):
             rate = schedule.scene_rate / (1 if first or what == UNCLEAR else 2)
             overall = self.tried.reader.overall if what == SCENES else self.tried.reading_anew()
-            return OverallTraining(overall, self._entered, EACH * steps, rate, seed)
+            return GlobalHeadTraining(overall, self._entered, EACH * steps, rate, seed)
         guide = self.guide
         assert guide is not None
         if what == LIKELIHOOD and self.missing is None:
@@ -230,7 +230,7 @@ class ParameterLearning:
         open_to = torch.tensor([not last or site.name in self._unclear for site in self.scene_sites])
         return torch.cat(entered), torch.cat([some.overall for some in drawn]).where(open_to, torch.nan)
 
-    def _drawn(self, num: int) -> Valued:
+    def _drawn(self, num: int) -> SupervisedBatch:
         """Renders for a step of the reader. Those of several steps are drawn together, which takes hardly longer: a
         program runs once, and a guide goes from node to node for many scenes as fast as for one."""
         training, own = cast(ReaderTraining, self.inner), 0 if self.guide is None else round(OWN * num)
@@ -260,12 +260,12 @@ class ParameterLearning:
         """Of the sites that can be read; None where there are none."""
         return ParameterGuide(self.model, self.learnt, self.structure) if self.learnt else None
 
-    def _read(self) -> tuple[Values, Assembly]:
+    def _read(self) -> tuple[Values, SceneGraphBuilder]:
         """What the reader reads in the target, with what is missing there, and how objects of a scene go together."""
         made, images = self._assembly, self.images()
         seed_everything(batch_seed(self.seed, 3, self.phase))
         found = self.tried.reader.find(images)
-        made = along_the_widest(made, found)
+        made = order_by_variance(made, found)
         return self.tried.values(made, found, len(images), missing=self.missing)[0], made
 
     @torch.no_grad()
@@ -273,13 +273,13 @@ class ParameterLearning:
         """What is read of each learnt site in images ``(L, C, H, W)`` uint8 of several sources, ``"target"`` among
         them: by site and source, see ``energy.site_rows``."""
         found = {name: self.tried.reader.find(some) for name, some in images.items()}
-        made = along_the_widest(self._assembly, found["target"])
+        made = order_by_variance(self._assembly, found["target"])
         seed_everything(batch_seed(self.seed, 6))
         read = {name: self.tried.values(made, objects, len(images[name]))[0] for name, objects in found.items()}
         names = [site.name for site in (*self.node_sites, *self.scene_sites) if site in self.tried.good_sites]
         return {s: {name: site_rows(values.site(i)) for name, values in read.items()} for i, s in enumerate(names)}
 
-    def own_scenes(self, kept: Collection[str] = (), num: int = TRIED) -> Valued:
+    def own_scenes(self, kept: Collection[str] = (), num: int = TRIED) -> SupervisedBatch:
         """The guide's renders, in which sites of some names have their prior, and those that are settled."""
         assert self.guide is not None
         self.guide.passed = frozenset(kept) | (self.settled or frozenset())
@@ -289,12 +289,12 @@ class ParameterLearning:
         return valued
 
     @torch.no_grad()
-    def _own(self, made: Assembly, num: int, kept: Collection[str] = ()) -> OwnReadings:
+    def _own(self, made: SceneGraphBuilder, num: int, kept: Collection[str] = ()) -> OwnReadings:
         """What it reads in renders of the guide, see ``own_scenes``."""
         return self.tried.own(made, self.own_scenes(kept, num))
 
     @cached_property
-    def _assembly(self) -> Assembly:
+    def _assembly(self) -> SceneGraphBuilder:
         """What the prior's scenes have in common; the same in every phase."""
         seed_everything(batch_seed(self.seed, 4))
         return self.tried.assembly(self.renders.draw(ASSEMBLED, self.model.pretraining_policy))

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..steps import StepTraining
 from .graph import Graph
-from .net import Chosen, Given, ParameterNet
+from .net import Conditioning, NodeSubset, ParameterNet
 from .reader import cut_draw
 from .sites import NEAR
 
@@ -147,11 +147,11 @@ class _Sites:
 
     def __init__(self, net: ParameterNet, graph: Graph):
         self.net, self.graph = net, graph
-        self.some: Chosen | None = None
+        self.some: NodeSubset | None = None
 
-    def given(self, scene: Tensor, nodes: Tensor, s: int) -> Given:
+    def given(self, scene: Tensor, nodes: Tensor, s: int) -> Conditioning:
         """What the mixtures of site ``s`` depend on."""
-        some = Chosen.of(~nodes[..., s].isnan())
+        some = NodeSubset.of(~nodes[..., s].isnan())
         if self.some is None or not torch.equal(self.some.has, some.has):
             self.some, self.siblings, self.ties, self.next = some, some.siblings(self.graph), None, 0
         own = some.taken(nodes.where(torch.arange(nodes.shape[2]) < s, torch.nan))
@@ -183,7 +183,7 @@ class MaximumLikelihood(StepTraining):
         learning_rate: float = 5e-3,
         seed: int = 0,
     ):
-        super().__init__(net, torch.optim.Adam(net.parameters(), lr=learning_rate), steps, seed, longest=10.0)
+        super().__init__(net, torch.optim.Adam(net.parameters(), lr=learning_rate), steps, seed, max_grad_norm=10.0)
         self.net, self.values, self.images = net, values, images
 
     def loss(self) -> Tensor:

@@ -17,15 +17,15 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from .graph import class_of
-from .reader import Found
-from .reader_training import Valued
+from .reader import Detections
+from .reader_training import SupervisedBatch
 
 FEWEST = 20  # objects of a class that are found, and that are not, by which it is told
 TOLD = 0.03  # least Wasserstein-1 distance between u of what is found and of all by which finding goes by a site
 MOST = 4.0  # weight
 
 
-class Missing(NamedTuple):
+class MissedObjects(NamedTuple):
     """Objects of N renders that were not found in them, K in all, render by render.
 
     Attributes:
@@ -46,7 +46,7 @@ class Missing(NamedTuple):
     rate: Tensor
 
     @staticmethod
-    def of(valued: Valued, kinds: Tensor, found: Tensor, sites: Tensor) -> "Missing":
+    def of(valued: SupervisedBatch, kinds: Tensor, found: Tensor, sites: Tensor) -> "MissedObjects":
         """Of renders.
 
         Args:
@@ -62,7 +62,7 @@ class Missing(NamedTuple):
                 counts[c] = torch.tensor([_told(u[..., s][here], u[..., s][of_class]) for s in range(len(sites))])
         n, m = ((label >= 0) & ~found & counts.any(1)[label]).nonzero(as_tuple=True)
         centre, above = valued.drawn.centre, valued.parent[n, m].clamp(min=0)
-        return Missing(
+        return MissedObjects(
             torch.tensor(len(found)),
             n,
             label[n, m],
@@ -72,7 +72,7 @@ class Missing(NamedTuple):
             label[found & (label >= 0)].bincount(minlength=len(kinds)) / len(found),
         )
 
-    def beside(self, found: Found, number: int) -> tuple[Found, Tensor, Tensor]:
+    def beside(self, found: Detections, number: int) -> tuple[Detections, Tensor, Tensor]:
         """With what was found in so many images, each has the objects that were not found in one of the renders.
 
         Returns:
@@ -84,7 +84,7 @@ class Missing(NamedTuple):
         render = torch.randint(max(int(self.renders), 1), (number,))
         image, which = (self.image == render[:, None]).nonzero(as_tuple=True)
         return (
-            Found(
+            Detections(
                 torch.cat([found.image, image]),
                 torch.cat([found.mass, found.mass.new_zeros(len(which))]),
                 torch.cat([found.label, self.label[which]]),

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from .graph import Graph
 from .mixture import LogisticMixture
-from .sibling_encoder import LOGITS, Mates, Ties
+from .sibling_encoder import LOGITS, SiblingEncoder, SiblingLinks
 
 COMPONENTS = 6
 MOST = 40  # ranks and numbers of siblings from here on are one
@@ -55,7 +55,7 @@ class ParameterNet(nn.Module):
         self.of_place = nn.Linear(6, hidden)
         self.of_values = nn.Linear(9 * max(S, 1), hidden)
         self.of_siblings = nn.Linear(3 * max(S, 1), hidden)
-        self.mates = Mates(S, hidden)
+        self.mates = SiblingEncoder(S, hidden)
         self.read = nn.Linear(hidden + 3 * S, hidden)
         self.cell = nn.GRU(hidden, hidden, batch_first=True)
         self.join = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
@@ -81,14 +81,14 @@ class ParameterNet(nn.Module):
             scene: ``(N, G)`` u, NaN where they are not known.
             values: ``(N, M, S)`` u, NaN where there are none; those of later sites are not looked at.
         """
-        given = self.given(graph, scene, values, s, Chosen.of(~values[..., s].isnan()))
+        given = self.given(graph, scene, values, s, NodeSubset.of(~values[..., s].isnan()))
         return LogisticMixture.of(given.some.put(self._raw_of(given, values, s)))
 
-    def chosen_mixture(self, given: "Given", values: Tensor, s: int) -> LogisticMixture:
+    def chosen_mixture(self, given: "Conditioning", values: Tensor, s: int) -> LogisticMixture:
         """``node_mixture`` of the chosen nodes alone, ``(N, R)``."""
         return LogisticMixture.of(self._raw_of(given, values, s))
 
-    def _raw_of(self, given: "Given", values: Tensor, s: int) -> Tensor:
+    def _raw_of(self, given: "Conditioning", values: Tensor, s: int) -> Tensor:
         """``(N, R, 3 K)``, from what is given and the values of site ``s`` of the nodes before each."""
         u = given.some.taken(values[..., s : s + 1]).where(given.some.there.unsqueeze(-1), torch.nan)
         place = given.place + self.mates(given.ties.place, given.ties.last, u[..., 0])
@@ -104,7 +104,7 @@ class ParameterNet(nn.Module):
             scene, values: as of ``node_mixture``, without site ``s``.
             has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
         """
-        some = Chosen.of(has)
+        some = NodeSubset.of(has)
         given = self.given(graph, scene, values, s, some)
         u = v.new_full((*some.index.shape, 1), torch.nan)  # parents and siblings before come earlier
         at, memory = v.gather(1, some.index), v.new_zeros(len(v), self.cell.hidden_size)
@@ -145,15 +145,15 @@ class ParameterNet(nn.Module):
         )
 
     def given(
-        self, graph: Graph, scene: Tensor, values: Tensor, s: int, some: "Chosen", ties: Ties | None = None
-    ) -> "Given":
+        self, graph: Graph, scene: Tensor, values: Tensor, s: int, some: "NodeSubset", ties: SiblingLinks | None = None
+    ) -> "Conditioning":
         """What some nodes' mixtures depend on, without the values of site ``s`` itself.
 
         Args:
             graph, scene, values: as of ``node_mixture``.
             s: number of the site.
             some: the nodes.
-            ties: see ``Mates``; found here where None.
+            ties: see ``SiblingEncoder``; found here where None.
         """
         known = values.where(torch.arange(self.node_sites) < s, torch.nan)
         own, kind = some.taken(known), graph.kind.gather(1, some.index)
@@ -162,7 +162,7 @@ class ParameterNet(nn.Module):
         share = some.taken(graph.together) / graph.number.gather(1, some.index).clamp(min=1).unsqueeze(-1)
         place = self.of_values(around) + self.of_siblings(share.to(own.dtype) @ code(known))
         start = self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s]
-        return Given(
+        return Conditioning(
             some,
             some.taken(self._place(graph, scene, s)) + place,
             self.read(torch.cat([start, code(own)], -1)),
@@ -203,7 +203,7 @@ class ParameterNet(nn.Module):
         return self.of_scene(torch.cat([counts.to(scene.dtype).log1p(), code(scene)], -1))
 
 
-class Chosen(NamedTuple):
+class NodeSubset(NamedTuple):
     """Some of a scene's nodes, in their order: R at most, those of a scene first.
 
     Attributes:
@@ -217,11 +217,11 @@ class Chosen(NamedTuple):
     has: Tensor
 
     @staticmethod
-    def of(has: Tensor) -> "Chosen":
+    def of(has: Tensor) -> "NodeSubset":
         """Those that have something, ``(N, M)`` bool; at least one is looked at in each scene."""
         R = max(1, int(has.sum(1).max()) if len(has) else 1)
         index = (~has).long().argsort(dim=1, stable=True)[:, :R]
-        return Chosen(index, has.gather(1, index), has)
+        return NodeSubset(index, has.gather(1, index), has)
 
     def taken(self, part: Tensor) -> Tensor:
         """``(N, R, ...)`` of ``(N, M, ...)``."""
@@ -243,7 +243,7 @@ class Chosen(NamedTuple):
         return part.gather(1, place).where(self.has.unsqueeze(-1), 0.0)
 
 
-class Given(NamedTuple):
+class Conditioning(NamedTuple):
     """Of the nodes that have a site.
 
     Attributes:
@@ -251,15 +251,15 @@ class Given(NamedTuple):
         place: ``(N, R, H)`` of the mixture.
         entering: ``(N, R, H)`` of the GRU.
         parent, before: ``(N, R)`` int64 which of them; -1 for none.
-        ties: see ``Mates``.
+        ties: see ``SiblingEncoder``.
     """
 
-    some: "Chosen"
+    some: "NodeSubset"
     place: Tensor
     entering: Tensor
     parent: Tensor
     before: Tensor
-    ties: Ties
+    ties: SiblingLinks
 
 
 @torch.no_grad()

@@ -17,8 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .backbone import WIDTH, Eye
-from .global_head import Overall, looks
+from .backbone import WIDTH, Backbone
+from .global_head import GlobalHead, looks
 
 HIDDEN = 96
 DROPPED_AGAIN = 0.5  # of what is seen of the whole scene, where a site is read anew
@@ -28,7 +28,7 @@ LOG_SD = -6.0, 0.5  # of u, least and largest
 HARMONICS = 4  # cosine and sine of one turn, and of two
 
 
-class Found(NamedTuple):
+class Detections(NamedTuple):
     """Objects found in N images, K of them in all, image by image.
 
     Attributes:
@@ -48,7 +48,7 @@ class Found(NamedTuple):
     raw: Tensor
     overall: Tensor
 
-    def those(self, which: Tensor) -> "Found":
+    def those(self, which: Tensor) -> "Detections":
         """Some of the objects, ``(K,)`` bool."""
         return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "overall"})
 
@@ -71,15 +71,15 @@ class Reader(nn.Module):
     least: Tensor
     anew: Tensor
 
-    def __init__(self, eye: Eye, classes: int, sites: int, scene_sites: int):
+    def __init__(self, eye: Backbone, classes: int, sites: int, scene_sites: int):
         super().__init__()
         self.eye, self.classes, self.sites, self.scene_sites = eye, classes, sites, scene_sites
         self.what = nn.Conv2d(WIDTH, 1 + classes, 1)
         self.hidden = nn.Linear(WIDTH + 2, HIDDEN)
         self.values = nn.Linear(HIDDEN, 2 + sites * (2 + HARMONICS))
-        self.overall = Overall(max(1, scene_sites), 2 + HARMONICS)
+        self.overall = GlobalHead(max(1, scene_sites), 2 + HARMONICS)
         with torch.random.fork_rng(devices=[]):
-            self.again = Overall(max(1, scene_sites), 2 + HARMONICS, DROPPED_AGAIN)
+            self.again = GlobalHead(max(1, scene_sites), 2 + HARMONICS, DROPPED_AGAIN)
         self.register_buffer("anew", torch.zeros(max(1, scene_sites), dtype=torch.bool))
         self.leasts = LEAST_MASS
         self.register_buffer("least", torch.tensor(LEAST_MASS[0]))
@@ -104,16 +104,16 @@ class Reader(nn.Module):
         return parent, values.unflatten(-1, (self.sites, 2 + HARMONICS))
 
     @torch.no_grad()
-    def find(self, images: Tensor) -> Found:
+    def find(self, images: Tensor) -> Detections:
         """Objects in ``(N, 1 or 3, H, W)`` uint8 images."""
         found = self.find_all(images)
         return found.those(found.mass > self.least)
 
     @torch.no_grad()
-    def find_all(self, images: Tensor) -> Found:
+    def find_all(self, images: Tensor) -> Detections:
         """With those of which less is found, but more than the first of ``leasts``."""
         parts = [self._find(some, i * 64) for i, some in enumerate(images.split(64))]
-        return Found(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        return Detections(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
     @torch.no_grad()
     def count(self, images: Tensor) -> Tensor:
@@ -126,7 +126,7 @@ class Reader(nn.Module):
             counts.index_put_((n + 64 * i, label), torch.ones(len(n)), accumulate=True)
         return counts
 
-    def _find(self, images: Tensor, first: int) -> Found:
+    def _find(self, images: Tensor, first: int) -> Detections:
         entered = self.eye.enter(images)
         seen, logits = self(entered)
         mass = logits.softmax(1)[:, 1:]
@@ -138,7 +138,7 @@ class Reader(nn.Module):
         here = torch.stack([columns, rows], -1) + 0.5
         scale = self.eye.cell
         overall = self._overall(entered) if self.scene_sites else seen.new_zeros(len(seen), 0, 2 + HARMONICS)
-        return Found(
+        return Detections(
             n + first,
             inside,
             label,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..features.counting.net import CountNet
-from .backbone import RenderEye
+from .backbone import RenderBackbone
 from .reader import Reader
 
 OF_COUNTS = ("eye.", "what.", "least")  # parts of a reader that find objects
@@ -24,7 +24,7 @@ class ReaderCounts:
 
     def __init__(self, net: CountNet, state: dict[str, Tensor]):
         self.names = net.names
-        self.reader = Reader(RenderEye(net), len(net.classes), 1, 0)
+        self.reader = Reader(RenderBackbone(net), len(net.classes), 1, 0)
         self.reader.load_state_dict(state, strict=False)
         self.reader.eval()
 

@@ -19,7 +19,7 @@ from ..features.counting.batches import STRIDE as CELL
 from ..features.counting.batches import cells, shares
 from ..steps import StepTraining
 from ..training import batch_seed
-from .global_head import NUMBERS, Overall, looks
+from .global_head import NUMBERS, GlobalHead, looks
 from .reader import Reader, value_loss
 from .schedule import EACH
 
@@ -29,7 +29,7 @@ SCENE_IMAGES = 64  # of a step on sites of scenes
 TOGETHER, APART = 256, 64  # renders that are drawn at once; steps from then until the next are
 
 
-class Valued(NamedTuple):
+class SupervisedBatch(NamedTuple):
     """Labelled renders and the values of their sites.
 
     Attributes:
@@ -48,10 +48,10 @@ class Valued(NamedTuple):
     u: Tensor
     overall: Tensor
 
-    def of(self, rows: slice) -> "Valued":
+    def of(self, rows: slice) -> "SupervisedBatch":
         """Some of the scenes."""
         drawn = self.drawn._replace(**{name: part[rows] for name, part in self.drawn._asdict().items()})
-        return Valued(drawn, *(part[rows] for part in self[1:]))
+        return SupervisedBatch(drawn, *(part[rows] for part in self[1:]))
 
 
 class ReaderTraining(StepTraining):
@@ -61,7 +61,7 @@ class ReaderTraining(StepTraining):
         reader: trained in place.
         draw: so many valued renders.
         steps: of AdamW.
-        images: a step, at most; see ``Eye.images_a_step``.
+        images: a step, at most; see ``Backbone.images_a_step``.
         learning_rate: the largest.
         seed: of everything random.
     """
@@ -71,7 +71,7 @@ class ReaderTraining(StepTraining):
     def __init__(
         self,
         reader: Reader,
-        draw: Callable[[int], Valued],
+        draw: Callable[[int], SupervisedBatch],
         steps: int = 1000,
         images: int = 12,
         learning_rate: float = 4e-3,
@@ -81,7 +81,7 @@ class ReaderTraining(StepTraining):
         rest = [parameter for parameter in reader.parameters() if not any(parameter is other for other in knowing)]
         groups = [{"params": rest}, *([{"params": knowing, "lr": KEPT * learning_rate}] if knowing else [])]
         adam = torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
-        super().__init__(reader, adam, steps, seed, warming=30)
+        super().__init__(reader, adam, steps, seed, warmup_steps=30)
         self.reader, self.draw, self.images = reader, draw, reader.eye.images_a_step(images)
 
     def loss(self) -> Tensor:
@@ -89,8 +89,8 @@ class ReaderTraining(StepTraining):
         return reader_loss(self.reader, self.draw(self.images))
 
 
-class OverallTraining(StepTraining):
-    """Resumable training of an ``Overall``. In its first half renders are drawn, from all of which it learns.
+class GlobalHeadTraining(StepTraining):
+    """Resumable training of an ``GlobalHead``. In its first half renders are drawn, from all of which it learns.
 
     Args:
         overall: trained in place.
@@ -104,14 +104,14 @@ class OverallTraining(StepTraining):
 
     def __init__(
         self,
-        overall: Overall,
+        overall: GlobalHead,
         draw: Callable[[int], tuple[Tensor, Tensor]],
         renders: int = 4096,
         learning_rate: float = 2e-3,
         seed: int = 0,
     ):
         adam = torch.optim.AdamW(overall.parameters(), lr=learning_rate, weight_decay=1e-2)
-        super().__init__(overall, adam, -(-renders // EACH), seed, warming=30)
+        super().__init__(overall, adam, -(-renders // EACH), seed, warmup_steps=30)
         self.overall, self.draw, self.drawn = overall, draw, 0
         self.looks, self.u = torch.empty(renders, NUMBERS), torch.empty(renders, overall.sites)
 
@@ -136,7 +136,7 @@ class OverallTraining(StepTraining):
         self.drawn = rows.stop
 
 
-def reader_loss(reader: Reader, valued: Valued) -> Tensor:
+def reader_loss(reader: Reader, valued: SupervisedBatch) -> Tensor:
     """Cross-entropy of the cells, the error of where parents are, and of u, summed over an image's objects."""
     drawn, scale = valued.drawn, reader.eye.cell
     seen, logits = reader(reader.eye.enter(drawn.image))

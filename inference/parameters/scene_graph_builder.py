@@ -16,13 +16,13 @@ from torch import Tensor
 from probscene.grammar import Grammar
 
 from .graph import Graph, class_of
-from .reader import Found
+from .reader import Detections
 
 FREE, SHUFFLED = -1, -2  # axes
 ORDERED = 0.9  # share of the prior's neighbouring siblings that stand in the order of an axis, which is then theirs
 
 
-class Assembly(NamedTuple):
+class SceneGraphBuilder(NamedTuple):
     """What a model's scenes have in common.
 
     Attributes:
@@ -38,7 +38,7 @@ class Assembly(NamedTuple):
     stage: Tensor
     axis: Tensor
 
-    def scenes(self, found: Found, number: int) -> list[list[tuple[int, int]]]:
+    def scenes(self, found: Detections, number: int) -> list[list[tuple[int, int]]]:
         """For each of so many images, the objects in the order of a derivation, each with the place of its parent in
         that list; -1 for none."""
         each = [[] for _ in range(number)]
@@ -75,7 +75,7 @@ class Assembly(NamedTuple):
 
         return [scene(some) for some in each]
 
-    def values(self, found: Found, number: int, mean: Tensor, sd: Tensor) -> tuple[Tensor, ...]:
+    def values(self, found: Detections, number: int, mean: Tensor, sd: Tensor) -> tuple[Tensor, ...]:
         """Kind and parent ``(L, M)`` of the scene graphs, and the mean and standard deviation of their sites
         ``(L, M, S)``, of what was read ``(K, S)``; NaN where a node is none."""
         scenes = self.scenes(found, number)
@@ -92,7 +92,7 @@ class Assembly(NamedTuple):
 
 def assembly(
     grammar: Grammar, classes: tuple[str, ...], graph: Graph, centre: Tensor, group: Tensor | None = None
-) -> Assembly:
+) -> SceneGraphBuilder:
     """From scenes of the prior.
 
     Args:
@@ -126,10 +126,10 @@ def assembly(
         of_first, of_later = (stage[label[scene, index]] for index in (first, later))
         for number_of in of_first[mixed & (of_first == of_later)].unique().tolist():
             axis[(stage == number_of) & (axis == FREE)] = SHUFFLED
-    return Assembly(kinds, above, stage, axis)
+    return SceneGraphBuilder(kinds, above, stage, axis)
 
 
-def along_the_widest(made: Assembly, found: Found) -> Assembly:
+def order_by_variance(made: SceneGraphBuilder, found: Detections) -> SceneGraphBuilder:
     """With an axis for the siblings that no program orders: that along which the objects found vary most."""
     axis = made.axis.clone()
     for stage in made.stage.unique().tolist():

@@ -17,7 +17,7 @@ FEATURES = 6  # of each way
 PAIRS = 4_000_000  # of nodes, times sites, that are looked at together, at most
 
 
-class Ties(NamedTuple):
+class SiblingLinks(NamedTuple):
     """Who is alike whom.
 
     Attributes:
@@ -29,7 +29,7 @@ class Ties(NamedTuple):
     last: Tensor
 
 
-class Mates(nn.Module):
+class SiblingEncoder(nn.Module):
     """From what is known of those alike to H units.
 
     Args:
@@ -41,7 +41,7 @@ class Mates(nn.Module):
         super().__init__()
         self.read = nn.Linear(2 * max(1, sites) * FEATURES, hidden)
 
-    def ties(self, together: Tensor, own: Tensor, before: Ties | None = None, first: int = 0) -> Ties:
+    def ties(self, together: Tensor, own: Tensor, before: SiblingLinks | None = None, first: int = 0) -> SiblingLinks:
         """Of nodes of which some sites are known.
 
         Args:
@@ -63,7 +63,7 @@ class Mates(nn.Module):
         if len(sites):
             found = [self._ties(*some) for some in parts]
             place[:, :, columns], last[:, :, columns] = (torch.cat(part) for part in zip(*found, strict=True))
-        return Ties(place.flatten(2), last)
+        return SiblingLinks(place.flatten(2), last)
 
     def _ties(self, together: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Of the ways of some sites, ``(N, M, W, 4)`` and ``(N, M, W)``."""
@@ -83,7 +83,7 @@ class Mates(nn.Module):
         """``(N, M', H)`` of some of the nodes.
 
         Args:
-            place, last: of them, ``(N, M', ...)``, see ``Ties``.
+            place, last: of them, ``(N, M', ...)``, see ``SiblingLinks``.
             u: of one site of all nodes so far, ``(N, J)``; NaN where they have none.
         """
         found = u.gather(1, last.clamp(min=0).flatten(1)).view(last.shape)

@@ -12,15 +12,15 @@ from probscene.sampling import Scenes, sample
 
 from ..features.base import Examples
 from .graph import Seen
-from .layout_augmentation import Arranged
-from .reader_training import Valued
+from .layout_augmentation import LayoutAugmentation
+from .reader_training import SupervisedBatch
 from .sites import Site, of_scenes, quantiles_of, within
 
 Label = Callable[[Scenes], Examples]
 """Renders scenes and labels them."""
 
 
-class ValuedRenders:
+class SupervisedRenders:
     """Renders of a model with the u of some sites.
 
     Args:
@@ -33,20 +33,22 @@ class ValuedRenders:
         self.model, self.label, self.node_sites, self.scene_sites = model, label, node_sites, scene_sites
 
     @torch.no_grad()
-    def draw(self, num: int, policy: Policy, drawn_by: SceneModel | None = None, arranged: float = 0.0) -> Valued:
+    def draw(
+        self, num: int, policy: Policy, drawn_by: SceneModel | None = None, arranged: float = 0.0
+    ) -> SupervisedBatch:
         """``num`` scenes of a policy.
 
         Args:
             drawn_by: the same model with other parameters.
-            arranged: share of the scenes whose sites of nodes are arranged, see ``Arranged``.
+            arranged: share of the scenes whose sites of nodes are arranged, see ``LayoutAugmentation``.
         """
         model = self.model if drawn_by is None else drawn_by
         if arranged:
             names = frozenset(site.name for site in self.node_sites)
-            model = within(model, Arranged(model.grammar, names, arranged))
+            model = within(model, LayoutAugmentation(model.grammar, names, arranged))
         return self.of(sample(model, policy, num, density=False))
 
-    def of(self, scenes: Scenes) -> Valued:
+    def of(self, scenes: Scenes) -> SupervisedBatch:
         """Of scenes of the model, whatever drew their parameters.
 
         Raises:
@@ -64,7 +66,7 @@ class ValuedRenders:
 
         u = torch.stack([found[site.name] for site in self.node_sites], -1) if self.node_sites else torch.zeros(N, M, 0)
         scene = [of_scenes(found[site.name]) for site in self.scene_sites]
-        return Valued(
+        return SupervisedBatch(
             drawn._replace(
                 label=nodes(drawn.label, -1),
                 centre=nodes(drawn.centre, 0.0),
@@ -88,12 +90,12 @@ class ValuedRenders:
                 )
 
 
-def joined(parts: list[Valued]) -> Valued:
+def joined(parts: list[SupervisedBatch]) -> SupervisedBatch:
     """Several batches as one."""
     nodes = max(part.parent.shape[1] for part in parts)
 
     def all_of(name: str, empty: float = -1) -> Tensor:
-        found = [getattr(part if name in Valued._fields else part.drawn, name) for part in parts]
+        found = [getattr(part if name in SupervisedBatch._fields else part.drawn, name) for part in parts]
         return torch.cat([_padded(one, nodes, empty) for one in found])
 
     drawn = parts[0].drawn._replace(
@@ -101,7 +103,7 @@ def joined(parts: list[Valued]) -> Valued:
         **{name: all_of(name) for name in ("label", "centre", "size", "visible")},
     )
     overall = torch.cat([part.overall for part in parts])
-    return Valued(drawn, all_of("kind"), all_of("parent"), all_of("group"), all_of("u", torch.nan), overall)
+    return SupervisedBatch(drawn, all_of("kind"), all_of("parent"), all_of("group"), all_of("u", torch.nan), overall)
 
 
 def _padded(part: Tensor, nodes: int, empty: float) -> Tensor:

@@ -16,7 +16,7 @@ RESAMPLES, SURE = 2000, 0.9
 EXAMINED = 1000  # rows of each sample
 
 
-class Farther(NamedTuple):
+class BootstrapTest(NamedTuple):
     """Two distances from the same real sample.
 
     Attributes:
@@ -34,9 +34,9 @@ class Farther(NamedTuple):
         return self.one > self.other and self.share >= SURE
 
 
-def farther(
+def bootstrap_test(
     one: Features, other: Features, real: Features, seed: int = 0, images: tuple[Features, ...] | None = None
-) -> Farther:
+) -> BootstrapTest:
     """Energy distances of two samples ``(N, D)`` and ``(P, D)`` from ``real (L, D)``, and the bootstrap's doubt.
 
     Args:
@@ -61,7 +61,7 @@ def farther(
     drawn = [_resampled(rng, each) for each in number]
     resampled, others = (_energy(*kernels[i], within, drawn[i], drawn[2]) for i in (0, 1))
     distance, of_other = (float(np.sqrt(max(0.0, value))) for value in found)
-    return Farther(distance, of_other, float((resampled > others).mean()))
+    return BootstrapTest(distance, of_other, float((resampled > others).mean()))
 
 
 def _of_images(image: NDArray[np.integer]) -> csr_array:

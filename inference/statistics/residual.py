@@ -34,7 +34,7 @@ COMMON = 0.5  # of the real rows whose number the other sample has, too
 Metric = Literal["euclidean", "cityblock"]
 
 
-class Word(StrEnum):
+class Grade(StrEnum):
     """How good a part of a fit is; the best first."""
 
     GOOD = "good"
@@ -42,10 +42,10 @@ class Word(StrEnum):
     NO_BETTER = "no better than the prior"
 
 
-def worst(words: Iterable[Word | None]) -> Word | None:
+def worst(words: Iterable[Grade | None]) -> Grade | None:
     """The worst of them; good where there are none. None is what cannot be judged: it may be no better than the prior,
     and is not known to be."""
-    order = (Word.GOOD, Word.BETTER, None, Word.NO_BETTER)
+    order = (Grade.GOOD, Grade.BETTER, None, Grade.NO_BETTER)
     return order[max((order.index(word) for word in words), default=0)]
 
 
@@ -61,7 +61,7 @@ class Sample(NamedTuple):
     number: NDArray[np.floating] | None = None
 
 
-class Nearness(NamedTuple):
+class ResidualRatio(NamedTuple):
     """Squared distances from the real sample, and what follows from them.
 
     Attributes:
@@ -93,15 +93,15 @@ class Nearness(NamedTuple):
         return self.learnt <= self.floor
 
     @property
-    def word(self) -> Word | None:
+    def word(self) -> Grade | None:
         """Good where at most a tenth is surely left of the nearest other's distance, or surely less than half and no
         more than chance leaves; better where surely a tenth or more is covered. None where chance would leave as much,
         and the rows are too few to say whether the other is farther: the prior, if it is right, is not called good."""
         if self.left is not None and (self.high <= NEAR or (self.close and self.high < HALF)):
-            return Word.GOOD
+            return Grade.GOOD
         if self.left is not None and self.high <= CLEARLY:
-            return Word.BETTER
-        return None if self.close and self.low < HALF else Word.NO_BETTER
+            return Grade.BETTER
+        return None if self.close and self.low < HALF else Grade.NO_BETTER
 
     def record(self) -> dict[str, Any]:
         """For JSON; distances are square roots, so metrics."""
@@ -117,14 +117,14 @@ def root(squared: float) -> float:
     return float(np.sqrt(max(0.0, squared)))
 
 
-def nearness(
+def residual_ratio(
     real: Sample,
     learnt: Sample,
     others: Mapping[str, Sample],
     metric: Metric = "euclidean",
     tests: int = 1,
     seed: int = 0,
-) -> Nearness | None:
+) -> ResidualRatio | None:
     """Compare samples with the real one; None where the learnt sample has too few rows of the real numbers.
 
     Args:
@@ -162,7 +162,7 @@ def nearness(
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratios = np.where(theirs > 0, mine / theirs, np.inf)[1:]
             low, high = (float(np.quantile(ratios, q, method="inverted_cdf")) for q in (tail, 1 - tail))
-    return Nearness(float(mine[0]), values, floor, left, low, high, len(real.features))
+    return ResidualRatio(float(mine[0]), values, floor, left, low, high, len(real.features))
 
 
 class _Side(NamedTuple):

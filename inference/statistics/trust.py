@@ -19,10 +19,10 @@ from .modes import effective_share, interval, modes
 from .two_sample import (
     EXAMINED,
     NEEDED,
-    Apart,
+    EnergyTest,
     Features,
-    apart,
     check_features,
+    energy_test,
     marginals,
     permutation_p,
     principal,
@@ -136,8 +136,8 @@ def trust(
     first, second = some[: len(some) // 2], some[len(some) // 2 : len(some) // 2 * 2]
 
     read_generated, read_whole, read_some = (_read(each, resolution, rng) for each in (generated, whole, some))
-    joint, single = apart(generated, whole, seed=seed), marginals(read_generated, read_whole, seed=seed)
-    from_prior = None if before is None else apart(generated, before, seed=seed)
+    joint, single = energy_test(generated, whole, seed=seed), marginals(read_generated, read_whole, seed=seed)
+    from_prior = None if before is None else energy_test(generated, before, seed=seed)
     to_generated = likeness(some, generated, resolution=resolution)
     to_prior = None if before is None else likeness(some, before, resolution=resolution)
     to_real = likeness(generated, some, resolution=resolution)
@@ -172,7 +172,10 @@ def trust(
     )
     explained = nowhere.sum() > 0 and len(some) - nowhere.sum() >= NEEDED
     if explained:
-        rest = apart(generated, some[~nowhere], seed=seed), marginals(read_generated, read_some[~nowhere], seed=seed)
+        rest = (
+            energy_test(generated, some[~nowhere], seed=seed),
+            marginals(read_generated, read_some[~nowhere], seed=seed),
+        )
         explained = _halved(rest[0], joint) and _halved(rest[1].largest, single.largest)
     verdict, because = decide(figures, explained)
     return Trust(verdict, because, figures, pretrained)
@@ -183,7 +186,7 @@ def _read(features: Features, resolution: float, rng: np.random.Generator) -> Fe
     return features + resolution * rng.standard_normal(features.shape)
 
 
-def _halved(rest: Apart, whole: Apart) -> bool:
+def _halved(rest: EnergyTest, whole: EnergyTest) -> bool:
     """Whether what is more than chance of a distance is less than half of what it was."""
     excess = [max(0.0, each.distance**2 - each.floor**2) for each in (rest, whole)]
     return rest.close or 4 * excess[0] < excess[1]
@@ -218,7 +221,7 @@ def _difference(figures: Figures) -> dict[str, Any]:
     }
 
 
-def _apart(found: Apart) -> dict[str, Any]:
+def _apart(found: EnergyTest) -> dict[str, Any]:
     return {**found._asdict(), "ratio": _finite(found.ratio), "close": found.close}
 
 

@@ -24,7 +24,7 @@ EXAMINED = 2000  # images of each side, at most: distances are between all pairs
 JUDGED = EXAMINED // 2  # images that the judge sees of each side, where there are so many
 
 
-class Apart(NamedTuple):
+class EnergyTest(NamedTuple):
     """How far two sets are apart.
 
     Attributes:
@@ -94,7 +94,9 @@ def marginal_distances(a: ArrayLike, b: ArrayLike) -> Features:
     return np.sqrt(2 * (step**2 * width).sum(0))
 
 
-def apart(generated: Features, real: Features, judged: int = JUDGED, splits: int = 100, seed: int = 0) -> Apart:
+def energy_test(
+    generated: Features, real: Features, judged: int = JUDGED, splits: int = 100, seed: int = 0
+) -> EnergyTest:
     """The energy distance between generated ``(N, D)`` and real ``(L, D)`` features beside its floor."""
     rng = np.random.default_rng(seed)
     n = min(judged, len(generated), len(real) // 2)
@@ -121,7 +123,7 @@ class Marginals(NamedTuple):
     """
 
     each: Features
-    largest: Apart
+    largest: EnergyTest
     worst: int
 
 
@@ -184,7 +186,7 @@ def _roots(values: Features) -> Features:
     return np.sqrt(values.clip(min=0))
 
 
-def _beside(found: Features, floor: Features, judged: int) -> Apart:
+def _beside(found: Features, floor: Features, judged: int) -> EnergyTest:
     distance = float(found.mean())
     low, high = np.quantile(floor, [0.025, 0.975])
-    return Apart(distance, float(floor.mean()), float(low), float(high), float((floor >= distance).mean()), judged)
+    return EnergyTest(distance, float(floor.mean()), float(low), float(high), float((floor >= distance).mean()), judged)

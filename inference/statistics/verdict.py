@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from .difference_test import DifferenceTest
 from .domain_shift import Fidelity
 from .modes import Modes
-from .two_sample import Apart, Marginals
+from .two_sample import EnergyTest, Marginals
 
 ALIEN, DOUBTFUL = 0.5, 0.2  # of the real images: another domain; and what is said beside "not fitted yet"
 SHARE = 0.05  # of the real images: what is smaller is a figure and no verdict
@@ -105,11 +105,11 @@ class Figures(NamedTuple):
         numbers: of the generated, the real and the prior's images.
     """
 
-    joint: Apart
+    joint: EnergyTest
     single: Marginals
     difference: DifferenceTest
     names: tuple[str, ...]
-    from_prior: Apart | None
+    from_prior: EnergyTest | None
     p_value: float
     real_unmatched: Gap
     real_out_of_support: Gap
@@ -130,7 +130,7 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
     modes, outside, differ = found.modes, found.real_out_of_support, found.difference
     number = f"{differ.numbers[0]} generated and {differ.numbers[1]} real images"
     feature = "all features together" if differ.feature is None else f"the feature {found.names[differ.feature]!r}"
-    apart = f"{number} can be told apart, most by {feature} (total variation {differ.total_variation:.2f})"
+    most_different = f"{number} can be told apart, most by {feature} (total variation {differ.total_variation:.2f})"
     if found.foreign > ALIEN:
         how = (
             "show what is unlike anything in scenes"
@@ -148,7 +148,7 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
     doubt = found.by_appearance and found.foreign > DOUBTFUL
     beside = f" {_percent(found.foreign)} of the real images show what is unlike anything in scenes." if doubt else ""
     if differ.significant and found.from_prior is not None and found.from_prior.close:
-        return Verdict.NOT_FITTED, f"{apart}, while generated and prior scenes cannot be told apart.{beside}"
+        return Verdict.NOT_FITTED, f"{most_different}, while generated and prior scenes cannot be told apart.{beside}"
     if gap and outside.share > max(0.5, lost):
         return Verdict.OUT_OF_REACH, f"{_outside(outside)}."
     if lost > max(0.0, found.generated_unmatched.share - found.generated_unmatched.floor):
@@ -159,7 +159,7 @@ def decide(found: Figures, explained: bool) -> tuple[Verdict, str]:
             f"{_percent(left)} of the generated ones: surely less than a quarter of their share.",
         )
     if differ.significant:
-        return Verdict.APART, f"{apart}.{beside}"
+        return Verdict.APART, f"{most_different}.{beside}"
     return (
         Verdict.GOOD,
         f"{number} cannot be told apart{_detectable(differ)}; {_percent(found.real_unmatched.share)} of the real "

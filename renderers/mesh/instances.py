@@ -39,8 +39,8 @@ class Placed(NamedTuple):
 class Instances(NamedTuple):
     """The kernel's tables, flat, of at least one row each, and what the host tells about the scenes.
 
-    ``first (N + 1,)`` int32, where each scene's instances begin; ``drawn (N, M)`` bool, which nodes have a label;
-    ``box (N, M, 7)`` float64 as of ``Space``; ``most``: vertices of the largest mesh, and triangles in sight of the
+    ``first (N + 1,)`` int32, where each scene's instances begin; ``drawn (N, M)`` bool, which nodes have a label; ``box
+    (N, M, 7)`` float64 as of ``SceneGeometry``; ``most``: vertices of the largest mesh, and triangles in sight of the
     fullest scene.
     """
 
@@ -225,7 +225,7 @@ def _fill(whole, real, placed: Placed, sight: Sight, canvas: tuple[int, int], ma
 
 
 def _boxes(placed: Placed, sight: Sight, N: int, M: int) -> np.ndarray:
-    """3D boxes as of ``Space``; several layers of a node share one, turned as the first of them is."""
+    """3D boxes as of ``SceneGeometry``; several layers of a node share one, turned as the first of them is."""
     box = np.zeros((N * M, 7))
     labelled = placed.node >= 0
     scene, at, yaw = placed.scene[labelled], placed.at[labelled], placed.yaw[labelled]

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from probscene.batch import RenderBatch, Space
+from probscene.batch import RenderBatch, SceneGeometry
 from probscene.errors import ModelError
 from probscene.request import Renderable
 from probscene.world import World
@@ -105,7 +105,7 @@ class MeshRenderer:
             instance=torch.from_numpy(instance[: N * pixels].reshape(N, height, width)),
             kind=torch.where(torch.from_numpy(drawn), world.kind.cpu(), -1),
             **_labels(result[:N, :M], extent[:N, :M], self.canvas),
-            space=Space(
+            space=SceneGeometry(
                 depth=torch.from_numpy(depth[: N * pixels].reshape(N, height, width)),
                 semantic=torch.from_numpy(semantic[: N * pixels].reshape(N, height, width)),
                 names=names(world),

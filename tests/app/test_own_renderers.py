@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from probscene.app.loading import load_model, renderer_for
-from probscene.batch import Space
+from probscene.batch import SceneGeometry
 from probscene.errors import ModelError
 from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
@@ -76,7 +76,7 @@ def without_labels(batch):
 def in_space(batch, **more):
     N, M, (H, W) = *batch.kind.shape, batch.image.shape[2:]
     sky, nothing = torch.zeros(N, H, W, dtype=torch.uint8), torch.zeros(N, M)
-    space = Space(torch.ones(N, H, W), sky, ("sky",), nothing, torch.zeros(N, M, 7), torch.zeros(N, 3, 3))
+    space = SceneGeometry(torch.ones(N, H, W), sky, ("sky",), nothing, torch.zeros(N, M, 7), torch.zeros(N, 3, 3))
     return batch._replace(space=space._replace(**more))
 
 

@@ -100,10 +100,10 @@ def goes_on(tmp_path, tables, monkeypatch):
 
         options = {"preset": "quick", "settings": SHORT, "threads": 1, "cache": False, "progress": False, **options}
         whole = ps.fit(TABLETOP, tables, out=tmp_path / "whole", **options)
-        kept = checkpoints.Keeper.__call__
+        kept = checkpoints.Checkpointer.__call__
         with monkeypatch.context() as patch:
             patch.setattr(checkpoints, "SAVE_EVERY", -1.0)
-            patch.setattr(checkpoints.Keeper, "__call__", stop)
+            patch.setattr(checkpoints.Checkpointer, "__call__", stop)
             with pytest.raises(Interrupted):
                 ps.fit(TABLETOP, tables, out=tmp_path / "parts", **options)
         assert list((tmp_path / "parts").glob("*-checkpoint.safetensors"))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import probscene as ps
-from probscene.app.fitting.rendered_features import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.app.modules import import_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -53,7 +53,7 @@ def test_it_goes_on_to_the_same_bytes(goes_on, stage):
 
 def test_it_learns_to_count():
     ps.seed_everything(0)
-    renders, net = Observer(MODEL, 1), OWN.TinyNet(MODEL.classes)
+    renders, net = RenderedFeatures(MODEL, 1), OWN.TinyNet(MODEL.classes)
     shown = renders.draw(100)
     counts = OWN.visible_counts(shown, len(MODEL.classes))
     OWN.TinyTraining(net, renders, 80, seed=1).run()

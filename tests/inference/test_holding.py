@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from probscene.derive import derive_complete
-from probscene.inference.count_penalty import Held
+from probscene.inference.count_penalty import PriorCountPenalty
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.learn import Trainer
@@ -31,7 +31,7 @@ def learnt(dots, held, seed=0):
 
 def test_held_kinds_keep_their_number_while_others_are_learnt(dots):
     torch.manual_seed(1)
-    free, kept = learnt(dots, Held(dots, (), 100)), learnt(dots, Held(dots, ("blue",), 100))
+    free, kept = learnt(dots, PriorCountPenalty(dots, (), 100)), learnt(dots, PriorCountPenalty(dots, ("blue",), 100))
     assert abs(free[1] - 1) > 0.3  # the prior's mean is 1
     assert kept[0] == pytest.approx(2.3, abs=0.3)
     assert kept[1] == pytest.approx(1, abs=0.2)
@@ -39,7 +39,7 @@ def test_held_kinds_keep_their_number_while_others_are_learnt(dots):
 
 def test_nothing_held_changes_no_cost_and_draws_nothing(dots):
     torch.manual_seed(0)
-    held = Held(dots, (), 100)
+    held = PriorCountPenalty(dots, (), 100)
     assert torch.equal(torch.rand(3), torch.rand(3, generator=torch.Generator().manual_seed(0)))
     generated, real = torch.randn(20, 2), torch.randn(30, 2)
     assert torch.equal(held.added_to(KDELogRatio())(generated, real), KDELogRatio()(generated, real))
@@ -47,7 +47,7 @@ def test_nothing_held_changes_no_cost_and_draws_nothing(dots):
 
 def test_costs_are_zero_in_the_mean_where_the_numbers_are_the_priors(dots):
     torch.manual_seed(0)
-    held = Held(dots, ("red", "blue"), 500)
+    held = PriorCountPenalty(dots, ("red", "blue"), 500)
     drawn, _ = derive_complete(dots.grammar, dots.prior, 500, dots.max_steps)
     counts = drawn.counts(len(dots.grammar.kinds))[:, held.kinds] / held.unit
     cost = held.added_to(lambda generated, real: torch.zeros(len(generated)))(

@@ -14,7 +14,7 @@ from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
-from probscene.inference.render_cache import RenderPool
+from probscene.inference.render_cache import RenderCache
 from probscene.model import Groups, SceneModel
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
@@ -37,7 +37,7 @@ class Observe:
 @settings(deadline=None, max_examples=20)
 def test_features_are_of_a_scene_of_equal_counts_and_as_few_as_asked_are_rendered(dots, seed, least):
     seed_everything(seed)
-    observe, pool, drawn = Observe(dots, noise=0.01), RenderPool(dots, least), {}
+    observe, pool, drawn = Observe(dots, noise=0.01), RenderCache(dots, least), {}
     features = pool.around(observe)
     for number in (7, 30, 1, 60):
         scenes = sample(dots, dots.prior, number)
@@ -55,7 +55,7 @@ def test_features_are_of_a_scene_of_equal_counts_and_as_few_as_asked_are_rendere
 
 def test_which_render_is_taken_again_is_chance(dots):
     seed_everything(0)
-    pool = RenderPool(dots, 5)
+    pool = RenderCache(dots, 5)
     features = pool.around(Observe(dots, noise=1e-3))
     derivation, _ = derive_complete(dots.grammar, dots.prior, 1, dots.max_steps)
     several = run_program(dots, derivation[torch.zeros(5, dtype=torch.int64)])
@@ -77,11 +77,11 @@ def test_groups_are_told_apart(dots):
         plates = [i for i, k in enumerate(kind) if k == 0]
         each = [sum(k == 1 and p == plate for k, p in zip(kind, parent, strict=True)) for plate in plates]
         on.append((len(plates), sum(each), each[0], sum(each[1:])))  # those after the last group count with it
-    table = RenderPool(grouped, 1)._counts_of(derivation)
+    table = RenderCache(grouped, 1)._counts_of(derivation)
     for i in range(200):
         for j in range(i):
             assert torch.equal(table[i], table[j]) == (on[i] == on[j])
-    whole = RenderPool(model, 1)._counts_of(derivation)
+    whole = RenderCache(model, 1)._counts_of(derivation)
     assert len(whole.unique(dim=0)) == len({row[:2] for row in on}) < len(table.unique(dim=0))
 
 
@@ -95,9 +95,9 @@ def trainer(dots, pool, batches):
 
 
 def test_an_interrupted_training_goes_on_to_the_same_bytes(dots):
-    _, whole = trainer(dots, RenderPool(dots, 2), 6)
+    _, whole = trainer(dots, RenderCache(dots, 2), 6)
     whole.run()
-    _, part = trainer(dots, RenderPool(dots, 2), 6)
+    _, part = trainer(dots, RenderCache(dots, 2), 6)
 
     def interrupt(training, told):
         if training.done == 3:
@@ -106,7 +106,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bytes(dots):
     with pytest.raises(KeyboardInterrupt):
         part.run(interrupt)
     state = {key: value.clone() for key, value in part.state().items()}
-    _, rest = trainer(dots, RenderPool(dots, 2), 6)
+    _, rest = trainer(dots, RenderCache(dots, 2), 6)
     rest.restore(state)
     rest.run()
     for key, value in whole.state().items():
@@ -116,7 +116,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bytes(dots):
 
 def test_a_pool_that_never_takes_again_changes_nothing(dots):
     _, plain = trainer(dots, None, 3)
-    observe, pooled = trainer(dots, RenderPool(dots, 10**9), 3)
+    observe, pooled = trainer(dots, RenderCache(dots, 10**9), 3)
     plain.run()
     pooled.run()
     assert observe.seen == 120
@@ -136,6 +136,6 @@ def test_learning_ends_as_near_with_a_tenth_of_the_renders(dots):
         drawn = derive_complete(dots.grammar, guide.eval(), 2000, dots.max_steps)[0].counts(2)
         return drawn.float().mean(0), observe.seen
 
-    (plain, every), (pooled, few) = mean_reds(None), mean_reds(RenderPool(dots, 4))
+    (plain, every), (pooled, few) = mean_reds(None), mean_reds(RenderCache(dots, 4))
     assert few < 0.1 * every == 400
     assert pooled.tolist() == pytest.approx([2, 1], abs=0.25) and plain.tolist() == pytest.approx([2, 1], abs=0.25)

@@ -10,7 +10,7 @@ from pyro.infer import SVI
 from pyro.optim.lr_scheduler import PyroLRScheduler
 from torch.optim.lr_scheduler import LambdaLR
 
-from probscene.app.fitting.rendered_features import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features.counting.batches import CountSchedule
@@ -46,28 +46,30 @@ class Means(torch.nn.Module):
 def counting(dots, small):
     net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
     schedule = CountSchedule(steps=20, images=2, crops=4, crop=32, window=2)
-    return CountTraining(net, Observer(dots, 1).draw, schedule, seed=1), net
+    return CountTraining(net, RenderedFeatures(dots, 1).draw, schedule, seed=1), net
 
 
 def presence(dots, small):
     net = PresenceNet(dots.classes, 4, 8)
-    return PresenceTraining(net, Observer(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
+    return PresenceTraining(net, RenderedFeatures(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
 
 
 def counts_one_hot(dots, small):
     net = PresenceNet(dots.classes, 4, 8, ways=5)
-    return PresenceTraining(net, Observer(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
+    return PresenceTraining(net, RenderedFeatures(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
 
 
 def pretrained_counting(dots, small):
     net = PretrainedCountNet(dots.classes, dots.canvas, held=8, sizes=(160, 160))
     photographs = torch.randint(0, 256, (5, 3, *dots.canvas), dtype=torch.uint8)
-    return PretrainedCountTraining(net, Observer(dots, 1).draw_twice, 8, 2, 4, photographs=photographs, seed=1), net
+    return PretrainedCountTraining(
+        net, RenderedFeatures(dots, 1).draw_twice, 8, 2, 4, photographs=photographs, seed=1
+    ), net
 
 
 def projection(dots, small):
     net = Projected(Means(), 2)
-    return ProjectionTraining(net, Observer(dots, 1), 140, 2, 30, seed=1), net
+    return ProjectionTraining(net, RenderedFeatures(dots, 1), 140, 2, 30, seed=1), net
 
 
 def structure(dots, small, divergence=None, **options):

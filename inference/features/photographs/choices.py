@@ -72,7 +72,7 @@ class PretrainedCountFeatures(Features):
         """Of things as chosen, of stuff none."""
         return Blockwise(cast("PretrainedCountNet", net).blocks, (chosen, None))
 
-    def taught_by(self, net: FeatureNet) -> str:
+    def target_fingerprint(self, net: FeatureNet) -> str:
         """The images that heads and rules are suited to."""
         return cast("PretrainedCountNet", net).taught_by_fingerprint
 

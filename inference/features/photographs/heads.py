@@ -63,9 +63,9 @@ class PretrainedCountNet(nn.Module):
             none was drawn.
     """
 
-    by_labels = True
+    uses_labels = True
     unit: Tensor
-    taught_by: Tensor
+    target_fingerprint: Tensor
     rules: Tensor
     scope: Tensor
     apart: Tensor
@@ -116,12 +116,12 @@ class PretrainedCountNet(nn.Module):
 
     @property
     def taught_by_fingerprint(self) -> str:
-        """``taught_by`` in hexadecimal; empty for none."""
-        return bytes(self.taught_by.tolist()).hex() if self.taught_by.any() else ""
+        """``target_fingerprint`` in hexadecimal; empty for none."""
+        return bytes(self.target_fingerprint.tolist()).hex() if self.target_fingerprint.any() else ""
 
     def bind(self, fingerprint: str) -> None:
-        """Say which images heads and rules are suited to, see ``taught_by``; in hexadecimal."""
-        self.taught_by.copy_(torch.tensor(list(bytes.fromhex(fingerprint)), dtype=torch.uint8))
+        """Say which images heads and rules are suited to, see ``target_fingerprint``; in hexadecimal."""
+        self.target_fingerprint.copy_(torch.tensor(list(bytes.fromhex(fingerprint)), dtype=torch.uint8))
 
     def places(self, stride: int) -> tuple[int, int]:
         """h and w of places so far apart."""
@@ -262,7 +262,7 @@ class PretrainedCountNet(nn.Module):
             out.append(found)
         return torch.cat(out)
 
-    def embed_drawn(self, drawn: Examples) -> Tensor:
+    def embed_from_labels(self, drawn: Examples) -> Tensor:
         """``(N, D)`` features of renders by their labels."""
         return self._features(self.true_counts(drawn)[:, self.scope, torch.arange(len(self.scope))])
 
@@ -270,7 +270,7 @@ class PretrainedCountNet(nn.Module):
         """``(N, D)`` features of renders ``(N, 1 or 3, H, W)`` uint8, read."""
         return self._embed(images, False)
 
-    def embed_photographs(self, images: Tensor) -> Tensor:
+    def embed_real(self, images: Tensor) -> Tensor:
         """``(N, D)`` features of images of the target ``(N, 1 or 3, H, W)`` uint8, read by their own rules."""
         return self._embed(images, True)
 

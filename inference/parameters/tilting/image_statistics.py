@@ -12,7 +12,7 @@ FINE = 10.0  # noise and edges are so many times smaller than light
 AT_ONCE = 8  # images, so that they stay in the processor's cache from one number to the next
 
 
-def plain(images: Tensor) -> Tensor:
+def image_statistics(images: Tensor) -> Tensor:
     """``(N, D)`` of ``(N, 1 or 3, H, W)`` uint8 images, all about 0 to 1: mean and deviation of each colour, brightness
     of each part from top to bottom, saturation, how strong edges are, and noise, by the Laplacian [1].
 

@@ -49,7 +49,7 @@ from ..guide import ParameterGuide
 from ..likelihood import MaximumLikelihood, Values, log_density
 from ..net import ParameterNet
 from ..sites import NEAR, Site, find_sites
-from ..supervised_renders import Label, ValuedRenders, joined
+from ..supervised_renders import Label, SupervisedRenders, joined
 from .schedule import TiltingSchedule
 
 AT_ONCE = 100  # scenes that are drawn and rendered together
@@ -99,7 +99,7 @@ class TiltingLearning:
         seed_everything(batch_seed(seed, 0))
         self.sites = find_sites(model)
         self.open_to = tuple(site for site in self.sites if site.of_scene and not site.keeps)
-        self.renders = ValuedRenders(model, label, (), self.open_to)
+        self.renders = SupervisedRenders(model, label, (), self.open_to)
         self.guide = ParameterGuide(model, self.open_to, structure) if self.open_to else None
         self.dependence = torch.zeros(len(self.open_to), 2)
         self.chosen = torch.zeros(len(self.open_to), dtype=torch.bool)

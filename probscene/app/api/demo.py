@@ -20,7 +20,7 @@ from probscene.errors import ModelError
 from probscene.model import SceneModel
 
 from ..datasets.generate import generate, generate_scenes
-from ..evaluation.diagnose import judge
+from ..evaluation.diagnose import diagnose
 from ..evaluation.evaluate import evaluate
 from ..evaluation.labels import counts_of_dataset, read_labels
 from ..evaluation.list_warnings import tell
@@ -115,7 +115,7 @@ def _begun(
 def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:
     model = run.model
     found = evaluate(run, target, read_labels(out / "truth.csv", model, target), show)
-    judged = judge(run, target, show, evaluation=found)
+    judged = diagnose(run, target, show, evaluation=found)
     write_json(out / "evaluation.json", found.record() | {"trust": judged.record()})
     report.write(run, found, target, judged=judged)
     sources = policies(run)

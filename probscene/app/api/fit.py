@@ -18,7 +18,7 @@ from ..arguments import checked_seed
 from ..evaluation.list_warnings import tell
 from ..fitting import session
 from ..fitting.overrides import override
-from ..fitting.plugins import GuideMaker, Parts, in_memory, is_file_part, lasting_word, load_part
+from ..fitting.plugins import GuideMaker, Plugins, in_memory, is_file_part, lasting_word, load_part
 from ..fitting.preset import BOTH, FOR_PHOTOGRAPHS, FOR_RENDERS, STRUCTURE, Preset
 from ..fitting.presets import preset as preset_of
 from ..loading import load_model
@@ -154,7 +154,7 @@ def chosen_preset(
     guide: str | GuideMaker | None,
     settings: Mapping[str, Any] | Sequence[str],
     instead: str = FOR_PHOTOGRAPHS,
-) -> tuple[Preset, Parts]:
+) -> tuple[Preset, Plugins]:
     """The preset with all that was chosen beside it, and the user's own parts of it, of objects and of files; arguments
     as of ``fit``.
 

@@ -18,7 +18,7 @@ from ..datasets.generate import Dataset
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.labels import Labels
 from ..files import make_folder
-from ..fitting.plugins import GuideMaker, Parts, as_divergence, as_features, as_guide_maker
+from ..fitting.plugins import GuideMaker, Plugins, as_divergence, as_features, as_guide_maker
 from ..fitting.run import RunFolder
 from ..fitting.store import check_free
 from ..targets import Target
@@ -114,13 +114,13 @@ class Run(RunFolder):
         return type(self)(path, self.record, self._model, self.parts)
 
 
-def parts_of(features: Any, divergence: Any, guide: Any) -> Parts:
+def parts_of(features: Any, divergence: Any, guide: Any) -> Plugins:
     """The parts of a fit that are objects; None for what is not.
 
     Raises:
         ModelError: one that is no such part.
     """
-    return Parts(
+    return Plugins(
         None if features is None else as_features(features),
         None if divergence is None else as_divergence(divergence),
         None if guide is None else as_guide_maker(guide),

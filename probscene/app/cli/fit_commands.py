@@ -74,7 +74,7 @@ def fit(
     from rich.console import Console
 
     from ..api.fit import chosen_preset, preset_for_photographs, with_learn
-    from ..evaluation.diagnose import judge
+    from ..evaluation.diagnose import diagnose
     from ..evaluation.list_warnings import tell
     from ..fitting import session
     from ..fitting.pipeline import open_target
@@ -131,7 +131,7 @@ def fit(
         if unfinished:
             tell(run, show)
             if not no_verdict:
-                judged = judge(run, images or open_target(run, show), show)
+                judged = diagnose(run, images or open_target(run, show), show)
     if judged is not None:
         show_parts(judged.record(), Console(highlight=False))
     print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")

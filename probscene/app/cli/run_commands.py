@@ -119,7 +119,7 @@ def evaluate(
         images = open_images(target, opened.model, opened.record["skip_bad"], show, chosen)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
         found = evaluate(opened, images, truth, show, num, features=features or (), images=most, visible=visible)
-        judged = verdict.judge(opened, images, show, scenes, found) if scenes != 0 else None
+        judged = verdict.diagnose(opened, images, show, scenes, found) if scenes != 0 else None
     console = Console(highlight=False)
     if judged is not None:
         verdict_text.show(judged, console)

@@ -3,8 +3,8 @@
 Beyond the format's own keys an annotation has ``visible_fraction``, visible pixels over those of the whole silhouette,
 and ``amodal_bbox``, the box of the whole silhouette, which others may cover and the canvas may cut. Of a 3D scene it
 also has ``truncated``, the share of that box beyond the canvas, and ``box_3d``: height, width, length, x, y, z and
-rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within the canvas. What a renderer does not
-know is left out, see ``RenderBatch.unknown``.
+rotation as in ``SceneGeometry``; ``visible_fraction`` is then of the silhouette within the canvas. What a renderer does
+not know is left out, see ``RenderBatch.unknown``.
 
 Where the program's sprites name keypoints, categories have ``keypoints``, their names, and an empty ``skeleton``, and
 annotations ``keypoints``, x, y and visibility of each, and ``num_keypoints``, see ``probscene.keypoints``; x and y are

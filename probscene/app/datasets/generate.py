@@ -101,7 +101,7 @@ def generate(
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped. See also
-            ``Crew.run``.
+            ``ActorPool.run``.
     """
     if workers < 1:
         raise ProbsceneError(f"expected a positive number of workers, got {workers}.")

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from probscene.inference.statistics.residual import CLEARLY, Nearness, Word
+from probscene.inference.statistics.residual import CLEARLY, Grade, ResidualRatio
 from probscene.inference.statistics.trust import Trust
 from probscene.inference.statistics.verdict import Verdict
 
@@ -53,13 +53,13 @@ def longer(run: RunFolder, names: tuple[str, ...]) -> str:
     return f"Fit again for longer, such as twice the {' and '.join(map(str, had))} of this fit: {words}."
 
 
-def remedy(run: RunFolder, part: str, word: Word, figures: Nearness, would_tell: str) -> str:
+def remedy(run: RunFolder, part: str, word: Grade, figures: ResidualRatio, would_tell: str) -> str:
     """What to do about ``layout`` or ``looks``, in a few sentences.
 
     Args:
         would_tell: what would make the comparison surer.
     """
-    if word is Word.GOOD:
+    if word is Grade.GOOD:
         return "Use it."
     said = [_learn(run), _unread(run.parameters), _far(run.parameters)]
     said += [PHOTO] if part == "looks" else []

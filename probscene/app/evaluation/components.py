@@ -14,7 +14,7 @@ from torch import Tensor
 
 from probscene.inference.parameters.calibration import UNCLEAR
 from probscene.inference.parameters.sites import LEARN, MEANT, find_sites
-from probscene.inference.statistics.residual import Nearness, Sample, Word, nearness, worst
+from probscene.inference.statistics.residual import Grade, ResidualRatio, Sample, residual_ratio, worst
 from probscene.inference.statistics.trust import Trust
 from probscene.inference.statistics.verdict import Verdict
 
@@ -23,7 +23,7 @@ from ..fitting.preset import BOTH
 from ..fitting.run import RunFolder
 from .advice import of_structure, remedy
 from .estimate import class_counts, counted_classes
-from .source_features import ALL, IMAGES, LEARNT, PRIOR, STRUCTURE, TARGET, Looked
+from .source_features import ALL, IMAGES, LEARNT, PRIOR, STRUCTURE, TARGET, SourceFeatures
 
 COUNTED = 1000  # rows of each source whose counts are compared
 KINDS = ("structure", "layout", "looks")
@@ -32,7 +32,7 @@ AGREES = 2.0  # floors up to which what is read of a site in the prior's renders
 
 
 @dataclass(frozen=True, eq=False)
-class Aspect:
+class VerdictComponent:
     """One part of a verdict.
 
     Attributes:
@@ -43,10 +43,10 @@ class Aspect:
         verdict: how it is called in a table; of structure the verdict's own word.
     """
 
-    word: Word | None
+    word: Grade | None
     because: str
     remedy: str = ""
-    figures: Nearness | None = None
+    figures: ResidualRatio | None = None
     verdict: str = ""
 
     def record(self) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class Aspect:
 
 
 @dataclass(frozen=True, eq=False)
-class Aspects:
+class VerdictComponents:
     """All parts.
 
     Attributes:
@@ -67,27 +67,27 @@ class Aspects:
         doubtful: those of them whose prior is not known to be the target's.
     """
 
-    parts: dict[str, Aspect]
+    parts: dict[str, VerdictComponent]
     classes: dict[str, dict[str, str]]
     unread: dict[str, str]
     doubtful: tuple[str, ...] = ()
 
     @property
-    def overall(self) -> Word | None:
+    def overall(self) -> Grade | None:
         """The worst of the parts; None where that cannot be judged, or where all are good and a site is in doubt."""
         word = worst(part.word for part in self.parts.values())
-        return None if word is Word.GOOD and self.doubtful else word
+        return None if word is Grade.GOOD and self.doubtful else word
 
     @property
-    def head(self) -> Aspect:
+    def head(self) -> VerdictComponent:
         """The part that the whole is called by: structure where it is not good, else the worst one; or what the sites
         leave open."""
         structure = self.parts["structure"]
-        if structure.word is not Word.GOOD:
+        if structure.word is not Grade.GOOD:
             return structure
         found = next((part for part in self.parts.values() if part.word is self.overall), None)
         if found is None:
-            return Aspect(None, *_open(self.doubtful))
+            return VerdictComponent(None, *_open(self.doubtful))
         return found
 
     @property
@@ -110,8 +110,8 @@ class Aspects:
 
 
 def aspects(
-    run: RunFolder, found: Trust, features: dict[str, Tensor], looked: dict[str, Looked], seed: int = 0
-) -> Aspects:
+    run: RunFolder, found: Trust, features: dict[str, Tensor], looked: dict[str, SourceFeatures], seed: int = 0
+) -> VerdictComponents:
     """Judge all parts.
 
     Args:
@@ -120,7 +120,7 @@ def aspects(
         looked: of the sources.
     """
     layout, of_classes = _layout(run, looked, seed)
-    looks = nearness(*_sides(looked, lambda seen: seen.looks), seed=seed)
+    looks = residual_ratio(*_sides(looked, lambda seen: seen.looks), seed=seed)
     counts = _counts(run, features, seed)
     words = {}
     for name in run.model.classes:
@@ -131,7 +131,7 @@ def aspects(
         "layout": layout,
         "looks": _aspect(run, "looks", looks, "", _would_tell(looked)),
     }
-    return Aspects(parts, words, unread_sites(run), doubtful_sites(run))
+    return VerdictComponents(parts, words, unread_sites(run), doubtful_sites(run))
 
 
 def unread_sites(run: RunFolder) -> dict[str, str]:
@@ -166,47 +166,47 @@ def _open(doubtful: tuple[str, ...]) -> tuple[str, str]:
     return because, f"Set these priors by hand, and say infer={{{LEARN!r}: False}} of those that are meant as they are."
 
 
-def called(word: Word | None, verdict: Verdict) -> Word | None:
+def called(word: Grade | None, verdict: Verdict) -> Grade | None:
     """The word for structure: its verdict may be worse than how near its features are."""
     if verdict is Verdict.GOOD:
-        return Word.GOOD
+        return Grade.GOOD
     if word is None or verdict in (Verdict.NOT_FITTED, Verdict.ANOTHER_DOMAIN):
-        return Word.NO_BETTER
-    return worst((word, Word.BETTER))
+        return Grade.NO_BETTER
+    return worst((word, Grade.BETTER))
 
 
-def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: int) -> Aspect:
+def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: int) -> VerdictComponent:
     net = run.network()
     which = None if net is None else compared(net)
     sides = {name: Sample(_some(each if which is None else each[:, which])) for name, each in features.items()}
-    figures = nearness(sides[TARGET], sides[LEARNT], {PRIOR: sides[PRIOR]}, seed=seed)
+    figures = residual_ratio(sides[TARGET], sides[LEARNT], {PRIOR: sides[PRIOR]}, seed=seed)
     word = called(None if figures is None else figures.word, found.verdict)
-    return Aspect(word, found.because, of_structure(run, found), figures, str(found.verdict))
+    return VerdictComponent(word, found.because, of_structure(run, found), figures, str(found.verdict))
 
 
-def said(figures: Nearness | None) -> str:
+def said(figures: ResidualRatio | None) -> str:
     """The word for a comparison, as a person reads it."""
     if figures is None:
         return ABSENT
     return UNSURE if figures.word is None else str(figures.word)
 
 
-def _layout(run: RunFolder, looked: dict[str, Looked], seed: int) -> tuple[Aspect, dict[str, str]]:
+def _layout(run: RunFolder, looked: dict[str, SourceFeatures], seed: int) -> tuple[VerdictComponent, dict[str, str]]:
     """Good only where no class is no better than in the prior."""
     if not looked[TARGET].layouts:
         why = f"Not judged: {run.features.name} features do not say where objects are."
-        return Aspect(None, why, "Take --features count to have it judged."), {}
+        return VerdictComponent(None, why, "Take --features count to have it judged."), {}
     names, found = list(looked[TARGET].layouts), {}
     for name in names:
         sides = _sides(looked, lambda seen, name=name: seen.layouts[name])
-        found[name] = nearness(*sides, metric="cityblock", tests=1 if name == ALL else len(names) - 1, seed=seed)
+        found[name] = residual_ratio(*sides, metric="cityblock", tests=1 if name == ALL else len(names) - 1, seed=seed)
     whole = found.pop(ALL)
     words = {name: said(figures) for name, figures in found.items()}
-    worse = [name for name, word in words.items() if word == Word.NO_BETTER]
+    worse = [name for name, word in words.items() if word == Grade.NO_BETTER]
     return _aspect(run, "layout", whole, ", ".join(worse), _would_tell(looked)), words
 
 
-def _would_tell(looked: dict[str, Looked]) -> str:
+def _would_tell(looked: dict[str, SourceFeatures]) -> str:
     """What would make a comparison surer: more than there are of what there are fewer of, as long as they are looked
     at."""
     target, scenes = (len(looked[name].looks.features) for name in (TARGET, LEARNT))
@@ -215,20 +215,20 @@ def _would_tell(looked: dict[str, Looked]) -> str:
     return "More scenes would tell: --scenes." if scenes < IMAGES else "As many images as are looked at do not tell."
 
 
-def _aspect(run: RunFolder, name: str, figures: Nearness | None, worse: str, would_tell: str) -> Aspect:
+def _aspect(run: RunFolder, name: str, figures: ResidualRatio | None, worse: str, would_tell: str) -> VerdictComponent:
     if figures is None:
         why = "Not judged: too few learnt scenes have as many objects as the target's images."
-        return Aspect(None, why, "Fix the structure first.")
+        return VerdictComponent(None, why, "Fix the structure first.")
     word, because = figures.word, _because(figures)
     if word is None:
         why = f"Of {figures.rows} images neither what was learnt nor the prior can be told from the target."
-        return Aspect(None, why, would_tell, figures, UNSURE)
-    if worse and word is Word.GOOD:
-        word, because = Word.BETTER, f"{because} By themselves these are not nearer than in the prior: {worse}."
-    return Aspect(word, because, remedy(run, name, word, figures, would_tell), figures, str(word))
+        return VerdictComponent(None, why, would_tell, figures, UNSURE)
+    if worse and word is Grade.GOOD:
+        word, because = Grade.BETTER, f"{because} By themselves these are not nearer than in the prior: {worse}."
+    return VerdictComponent(word, because, remedy(run, name, word, figures, would_tell), figures, str(word))
 
 
-def _because(figures: Nearness) -> str:
+def _because(figures: ResidualRatio) -> str:
     if figures.left is None:
         return "It is farther from the target than chance leaves, and the prior is not."
     limits = f"{_percent(figures.low)} to {_percent(figures.high)}"
@@ -241,7 +241,9 @@ def _percent(share: float) -> str:
     return f"{100 * max(0.0, share):.0f} %" if np.isfinite(share) else "any share"
 
 
-def _sides(looked: dict[str, Looked], of: Callable[[Looked], Sample]) -> tuple[Sample, Sample, dict[str, Sample]]:
+def _sides(
+    looked: dict[str, SourceFeatures], of: Callable[[SourceFeatures], Sample]
+) -> tuple[Sample, Sample, dict[str, Sample]]:
     others = {name: of(looked[name]) for name in (STRUCTURE, PRIOR) if name in looked}
     return of(looked[TARGET]), of(looked[LEARNT]), others
 
@@ -262,7 +264,7 @@ def _counts(run: RunFolder, features: dict[str, Tensor], seed: int) -> dict[str,
             words[name] = UNREAD if name in run.unread else ABSENT
             continue
         real, learnt, prior = (Sample(_some(each[source][:, c : c + 1])) for source in (TARGET, LEARNT, PRIOR))
-        figures = nearness(real, learnt, {PRIOR: prior}, tests=len(names), seed=seed)
+        figures = residual_ratio(real, learnt, {PRIOR: prior}, tests=len(names), seed=seed)
         words[name] = said(figures)
     return words
 

@@ -28,14 +28,14 @@ from probscene.threads import threads
 from ..chunks import CHUNK, chunk_randomness
 from ..fitting.outcome import compared
 from ..fitting.pipeline import Progress
-from ..fitting.rendered_features import Observer
+from ..fitting.rendered_features import RenderedFeatures
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..pictures import Pixels, pixels, shrunk
 from . import sizes as size_figures
 from . import source_features as looked
 from .advice import label
-from .components import Aspects, aspects
+from .components import VerdictComponents, aspects
 from .evaluate import Evaluation
 from .label_agreement import Agreement, agreement
 from .sizes import Sizes, given_boxes, sizes, with_sizes
@@ -46,7 +46,7 @@ THUMB = 128  # pixels
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class FitDiagnostics:
     """A verdict and what it was made from.
 
     Attributes:
@@ -71,7 +71,7 @@ class Judged:
     agreement: Agreement | None = None
     walls: str = ""
     usable: str = ""
-    aspects: Aspects | None = None
+    aspects: VerdictComponents | None = None
     basis: dict[str, Any] = field(default_factory=dict)
     sizes: dict[str, Sizes] = field(default_factory=dict)
 
@@ -89,14 +89,14 @@ class Judged:
         return self.trust.record() | parts | more
 
 
-def judge(
+def diagnose(
     run: RunFolder,
     target: Images,
     progress: Progress,
     num: int | None = None,
     evaluation: Evaluation | None = None,
     seed: int = 0,
-) -> Judged:
+) -> FitDiagnostics:
     """Judge a finished run by a folder of real images.
 
     Args:
@@ -113,9 +113,9 @@ def judge(
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
     if run.readings and set(run.unread) == set(run.model.classes) - set(run.model.stuff):
-        return Judged(None, usable(run))
+        return FitDiagnostics(None, usable(run))
     if len(target) < NEEDED:
-        return Judged(
+        return FitDiagnostics(
             None, f"expected at least {NEEDED} real images for a verdict, got {len(target)} in {target.path}."
         )
     preset, model, net = run.preset, run.model, own_net(run)
@@ -154,21 +154,21 @@ def judge(
             pretrained=run.features.pretrained,
         )
     except DataError as error:
-        return Judged(None, str(error))
+        return FitDiagnostics(None, str(error))
     real_unmatched = tuple(int(i) for i in found.figures.real_unmatched.worst[:SHOWN])
     generated_unmatched = tuple(eyes[0].thumbs[i] for i in found.figures.generated_unmatched.worst[:SHOWN])
     names = tuple(target.paths[i].name for i in real_unmatched)
-    by_labels = None
+    uses_labels = None
     if evaluation is not None and "truth" in evaluation.sources:
         sources = evaluation.sources
-        by_labels = agreement(sources["learnt"], sources["truth"], evaluation.classes, label(run))
+        uses_labels = agreement(sources["learnt"], sources["truth"], evaluation.classes, label(run))
     walls = "" if evaluation is None else evaluation.walls
     features = {looked.LEARNT: scenes[0], looked.PRIOR: scenes[1], looked.TARGET: real}
     found_sizes = {} if boxes is None else sizes(run, boxes, each, seed)
     parts = with_sizes(aspects(run, found, features, seen, seed), found_sizes)
     basis = {"images": len(target), "folder": str(target.path), "fitted_to": own, "scenes": num}
     shown = real_unmatched, generated_unmatched, names
-    return Judged(found, "", *shown, by_labels, walls, usable(run), parts, basis, found_sizes)
+    return FitDiagnostics(found, "", *shown, uses_labels, walls, usable(run), parts, basis, found_sizes)
 
 
 def usable(run: RunFolder) -> str:
@@ -190,8 +190,8 @@ class _Eyes:
         self.net, self.each, self.keep = net, each, keep
         self.names, self.thumbs = net.names, []
         if hasattr(net, "embed_drawn"):
-            self.embed_drawn = self._embed_drawn
-            self.by_labels = not keep and getattr(net, "by_labels", False)
+            self.embed_from_labels = self._embed_drawn
+            self.uses_labels = not keep and getattr(net, "by_labels", False)
 
     def embed(self, images: Tensor) -> Tensor:
         self._look(images)
@@ -199,7 +199,7 @@ class _Eyes:
 
     def _embed_drawn(self, drawn: Examples) -> Tensor:
         self._look(drawn.image)
-        return self.net.embed_drawn(drawn)  # pyright: ignore[reportAttributeAccessIssue]: asked for before
+        return self.net.embed_from_labels(drawn)  # pyright: ignore[reportAttributeAccessIssue]: asked for before
 
     def _look(self, images: Tensor) -> None:
         if self.keep:
@@ -209,7 +209,7 @@ class _Eyes:
 
 def _features(run: RunFolder, policy: Policy, net: FeatureNet, draws_per_structure: int, num: int, seed: int) -> Tensor:
     """``(num, D)`` features of scenes, seen as the fit has seen them; the same for the same seed."""
-    view = Observer(run.model, run.record["threads"])
+    view = RenderedFeatures(run.model, run.record["threads"])
     observe, parts = view.observe(net, draws_per_structure), []
     for chunk in range(-(-num // CHUNK)):
         with threads(1), chunk_randomness(seed, chunk):

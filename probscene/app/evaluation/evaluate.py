@@ -36,10 +36,10 @@ from .estimate import class_counts, counted_classes, estimated
 from .image_distances import IMAGES, Distances, image_distances
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
-from .saturated_lists import Piled, piled, sentences
+from .saturated_lists import SaturatedList, saturated_lists, sentences
 from .sources import ESTIMATE, FITTED, LEARNT, READ, Source, before
 from .structure_counts import Relation
-from .unreachable_counts import Inexpressible, inexpressible
+from .unreachable_counts import UnreachableCounts, unreachable_counts
 from .visible import Visible, counted, number_of, seen_by, whole_note
 
 IN_RENDERS = 1000  # renders of each source, at most, that the network reads
@@ -71,8 +71,8 @@ class Evaluation:
     likelihoods: dict[str, Likelihood] = field(default_factory=dict)
     images: dict[str, Distances] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    piled: tuple[Piled, ...] = ()
-    inexpressible: tuple[Inexpressible, ...] = ()
+    saturated_lists: tuple[SaturatedList, ...] = ()
+    unreachable_counts: tuple[UnreachableCounts, ...] = ()
     errors: dict[str, CountErrors | None] = field(default_factory=dict)
     read: dict[str, Source] = field(default_factory=dict)
     boxes: Boxes | None = None
@@ -112,13 +112,13 @@ class Evaluation:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the model is too narrow for, with what to change."""
-        return (*sentences(self.piled), *(f"Warning: {found}" for found in self.inexpressible))
+        return (*sentences(self.saturated_lists), *(f"Warning: {found}" for found in self.unreachable_counts))
 
     @property
     def walls(self) -> str:
         """The same in one sentence; empty where there is nothing."""
-        short = ", ".join(dict.fromkeys(found.name for found in self.piled if not found.past))
-        images = len({row for found in self.inexpressible for row in found.rows})
+        short = ", ".join(dict.fromkeys(found.name for found in self.saturated_lists if not found.past))
+        images = len({row for found in self.unreachable_counts for row in found.rows})
         said = [f"lists pile up at their longest ({short})"] if short else []
         said += [f"{images} images have numbers of objects that the model cannot have"] if images else []
         return f"Mind the prior: {' and '.join(said)}; the warnings say what to change." if said else ""
@@ -173,8 +173,8 @@ class Evaluation:
             "distances": self.distances(),
             "count_errors": {name: _plain(found) for name, found in self.errors.items()},
             "walls": {
-                "lists": [found.record() for found in self.piled],
-                "images": [found.record() for found in self.inexpressible],
+                "lists": [found.record() for found in self.saturated_lists],
+                "images": [found.record() for found in self.unreachable_counts],
             },
             "sources": {name: self._source(source) for name, source in self.sources.items()},
             "read_in_renders": {name: self._source(source) for name, source in self.read.items()},
@@ -261,7 +261,7 @@ def evaluate(
     path = run.target if target is None else target.path
     classes = tuple(run.model.classes[c] for c in columns)
     notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
-    short = piled(run.model, run.guide, None if run.unread else estimate, seed)
+    short = saturated_lists(run.model, run.guide, None if run.unread else estimate, seed)
     beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
     errors = {} if truth is None else _errors(run, classes, truth, reading)
     boxes = None if truth is None else truth.boxes
@@ -275,7 +275,7 @@ def _inexpressible(
     truth: Labels | None,
     target: Images | None,
     visible: bool,
-) -> tuple[Inexpressible, ...]:
+) -> tuple[UnreachableCounts, ...]:
     """By the labels, else by the estimate of the classes whose instances can be counted."""
     by = next((name for name in ("truth", ESTIMATE) if name in sources), None)
     if by is None:
@@ -286,7 +286,7 @@ def _inexpressible(
         classes, source = tuple(classes[c] for c in columns), source.only(columns)
     names = [] if target is None else [file.name for file in target.paths]
     names = names if len(names) == len(source.counts) else []
-    return inexpressible(run.model, source, classes, by == "truth", names, visible)
+    return unreachable_counts(run.model, source, classes, by == "truth", names, visible)
 
 
 def network_counts(run: RunFolder, target: Images | None, progress: Progress) -> Source | None:

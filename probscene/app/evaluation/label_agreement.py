@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.inference.statistics.residual import Word
+from probscene.inference.statistics.residual import Grade
 from probscene.inference.statistics.two_sample import JUDGED
 from probscene.inference.statistics.verdict import Verdict
 
@@ -108,14 +108,14 @@ class Agreement(NamedTuple):
         if self.close:
             return verdict
         words = verdict["classes"]
-        wrong = {name for name in words if name in self.wrong and words[name]["counts"] == Word.GOOD}
+        wrong = {name for name in words if name in self.wrong and words[name]["counts"] == Grade.GOOD}
         found = verdict | {"classes": {n: w | ({"counts": DISAGREE} if n in wrong else {}) for n, w in words.items()}}
         structure = verdict["parts"]["structure"]
-        if structure["word"] != Word.GOOD:
+        if structure["word"] != Grade.GOOD:
             return found
         said = {"verdict": DISAGREE, "because": self._disagreement, "remedy": self._what_to_do}
-        overall = str(Word.BETTER) if verdict["overall"] == Word.GOOD else verdict["overall"]
-        parts = verdict["parts"] | {"structure": structure | {"word": str(Word.BETTER)} | said}
+        overall = str(Grade.BETTER) if verdict["overall"] == Grade.GOOD else verdict["overall"]
+        parts = verdict["parts"] | {"structure": structure | {"word": str(Grade.BETTER)} | said}
         return found | said | {"overall": overall, "parts": parts}
 
     def record(self, verdict: Verdict) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from ..fitting.run import RunFolder
 from ..progress import Display
 from .evaluate import network_counts
-from .saturated_lists import Piled, piled, sentences
+from .saturated_lists import SaturatedList, saturated_lists, sentences
 
 
 def tell(run: RunFolder, show: Display) -> None:
@@ -12,6 +12,6 @@ def tell(run: RunFolder, show: Display) -> None:
         show.say(text)
 
 
-def too_short(run: RunFolder, show: Display) -> tuple[Piled, ...]:
+def too_short(run: RunFolder, show: Display) -> tuple[SaturatedList, ...]:
     """The lists that are too short for the run's own target, by its guide and by what its network has counted."""
-    return piled(run.model, run.guide, network_counts(run, None, show))
+    return saturated_lists(run.model, run.guide, network_counts(run, None, show))

@@ -40,7 +40,7 @@ FIRST_TRY = 1.5  # times the list's length, where nothing is seen of it
 
 
 @dataclass(frozen=True)
-class Piled:
+class SaturatedList:
     """A list that is too short.
 
     Attributes:
@@ -85,7 +85,7 @@ class Piled:
         return {**vars(self), "sentence": str(self)}
 
 
-def sentences(found: Iterable[Piled]) -> list[str]:
+def sentences(found: Iterable[SaturatedList]) -> list[str]:
     """What to say of them: a warning for each list at its end, and one note for all those that are past the prior's."""
     found = list(found)
     out = [f"Warning: {each}" for each in found if not each.past]
@@ -100,7 +100,7 @@ def sentences(found: Iterable[Piled]) -> list[str]:
     return out
 
 
-def piled(model: SceneModel, guide: Policy, read: Source | None, seed: int = 0) -> tuple[Piled, ...]:
+def saturated_lists(model: SceneModel, guide: Policy, read: Source | None, seed: int = 0) -> tuple[SaturatedList, ...]:
     """The lists that are too short, in the grammar's order; none where nothing declares a longest.
 
     Args:
@@ -173,7 +173,7 @@ def _piled(
     declared: float,
     learnt: NDArray[np.int64],
     seen: NDArray[np.int64] | None,
-) -> Piled:
+) -> SaturatedList:
     end = bounds.prior if past else bounds.longest
     beyond, length = None, math.ceil(FIRST_TRY * end)
     if past:
@@ -185,7 +185,9 @@ def _piled(
             length = max(math.ceil((1 + MARGIN) * wanted), length if past else 0)
     length = max(length, end + 1 if past else end + 2)
     name = called(model.grammar, bounds.symbol)
-    return Piled(name, bounds.rank, end, past, share, declared, beyond, length, more_room(model, bounds, length))
+    return SaturatedList(
+        name, bounds.rank, end, past, share, declared, beyond, length, more_room(model, bounds, length)
+    )
 
 
 def _percent(share: float) -> str:

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from probscene.dataset import Images
 from probscene.errors import DataError
-from probscene.inference.statistics.residual import RESAMPLES, Word, worst
+from probscene.inference.statistics.residual import RESAMPLES, Grade, worst
 from probscene.policy import Policy
 
 from ..chunks import CHUNK, draw_chunk
 from ..datasets.coco import labelled
 from ..fitting.run import RunFolder
 from ..labels.boxes import Boxes
-from ..labels.partial_labels import read_few
+from ..labels.partial_labels import read_partial_labels
 from ..loading import renderer_for
-from .components import UNSURE, Aspect, Aspects
+from .components import UNSURE, VerdictComponent, VerdictComponents
 
 SCENES = 200  # of the prior, and of the fit
 ENOUGH = 10  # boxes of a class
@@ -70,7 +70,7 @@ class Sizes(NamedTuple):
     off: float
     off_low: float
     off_high: float
-    word: Word | None
+    word: Grade | None
     worse: bool
     boxes: int
 
@@ -89,7 +89,7 @@ def given_boxes(run: RunFolder, target: Images) -> Boxes | None:
     if "labels" not in run.record:
         return None
     try:
-        few = read_few(run.record["labels"]["path"], run.model, target)
+        few = read_partial_labels(run.record["labels"]["path"], run.model, target)
     except DataError:
         return None
     return None if few.boxes is None else Boxes(few.rows.tolist(), few.boxes, few.classes)
@@ -109,15 +109,15 @@ def sizes(run: RunFolder, boxes: Boxes, each: Callable[[int], None], seed: int =
     }
 
 
-def with_sizes(found: Aspects, each: dict[str, Sizes]) -> Aspects:
+def with_sizes(found: VerdictComponents, each: dict[str, Sizes]) -> VerdictComponents:
     """A verdict with a part for sizes. Looks are no better than the prior's where sizes are farther off than these."""
     if not each:
         return found
     words = [size.word for size in each.values()]
     word = worst(known) if (known := [word for word in words if word is not None]) else None
-    word = None if word is Word.GOOD and None in words else word
+    word = None if word is Grade.GOOD and None in words else word
     because = "; ".join(f"{name}: {size}" for name, size in each.items()) + "."
-    wrong = [name for name, size in each.items() if size.word is Word.NO_BETTER]
+    wrong = [name for name, size in each.items() if size.word is Grade.NO_BETTER]
     remedy = (
         f"Sizes of {', '.join(wrong)} are wrong: set the priors of the sites that they hang on by these figures, and "
         "leave those sites out of learning (infer={'learn': False})."
@@ -126,11 +126,13 @@ def with_sizes(found: Aspects, each: dict[str, Sizes]) -> Aspects:
         if word is None
         else ""
     )
-    parts = found.parts | {"sizes": Aspect(word, because, remedy, None, UNSURE if word is None else str(word))}
+    parts = found.parts | {
+        "sizes": VerdictComponent(word, because, remedy, None, UNSURE if word is None else str(word))
+    }
     looks, worse = parts["looks"], ", ".join(name for name, size in each.items() if size.worse)
-    if worse and looks.word in (Word.GOOD, Word.BETTER):
+    if worse and looks.word in (Grade.GOOD, Grade.BETTER):
         because = f"{looks.because} But the sizes of {worse} are farther from those given than the prior's."
-        lowered = {"word": Word.NO_BETTER, "verdict": str(Word.NO_BETTER), "because": because, "remedy": remedy}
+        lowered = {"word": Grade.NO_BETTER, "verdict": str(Grade.NO_BETTER), "because": because, "remedy": remedy}
         parts["looks"] = replace(looks, **lowered)
     return replace(found, parts=parts)
 
@@ -153,11 +155,11 @@ def compared(given: Boxed, prior: Boxed, learnt: Boxed, seed: int = 0) -> Sizes:
     worse = bool(farther and off_high > TOLERATED)
     word = None
     if off_high <= TOLERATED:
-        word = Word.GOOD
+        word = Grade.GOOD
     elif nearer:
-        word = Word.BETTER
+        word = Grade.BETTER
     elif worse or off_low > TOLERATED:
-        word = Word.NO_BETTER
+        word = Grade.NO_BETTER
     return Sizes(
         given=_pair(real[0]),
         low=_pair(low),

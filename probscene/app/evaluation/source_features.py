@@ -40,7 +40,7 @@ class Appearance(Protocol):
     def places(self, images: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
-class Looked(NamedTuple):
+class SourceFeatures(NamedTuple):
     """What is seen in the images of one source.
 
     Attributes:
@@ -80,7 +80,7 @@ def look(
     each: Each,
     num: int,
     seed: int = 0,
-) -> dict[str, Looked]:
+) -> dict[str, SourceFeatures]:
     """Look at up to ``num`` images of the target, evenly spread, and ``num`` of each of the other sources.
 
     Args:
@@ -91,7 +91,7 @@ def look(
         ModelError: a user's own network whose ``cells`` are none.
     """
 
-    def seen(parts) -> Looked:
+    def seen(parts) -> SourceFeatures:
         looks, places, cells = [], [], []
         for images in parts:
             pooled, standing_out = appearance.places(images)
@@ -101,7 +101,7 @@ def look(
             cells += [] if found is None else [found]
             each(len(images))
         whole = torch.cat(cells) if cells else None
-        return Looked(
+        return SourceFeatures(
             Sample(torch.cat(looks).double().numpy()),
             torch.cat(places).numpy(),
             {} if whole is None else _layouts(run, located(run, net), whole),

@@ -29,7 +29,7 @@ ALL = "objects in all"
 
 
 @dataclass(frozen=True)
-class Inexpressible:
+class UnreachableCounts:
     """Images whose numbers a model cannot have for one reason.
 
     Attributes:
@@ -73,14 +73,14 @@ class Inexpressible:
         return {**vars(self), "images": self.images, "sentence": str(self)}
 
 
-def inexpressible(
+def unreachable_counts(
     model: SceneModel,
     source: Source,
     classes: Sequence[str],
     labelled: bool,
     names: Sequence[str] = (),
     visible: bool = False,
-) -> tuple[Inexpressible, ...]:
+) -> tuple[UnreachableCounts, ...]:
     """What the model cannot have of the images of a source.
 
     Args:
@@ -118,9 +118,9 @@ class _Walls:
     def reach(self, support: Support, max_steps: int | None = None) -> Reach:
         return Reach(self.grammar, support, max_steps, self.kinds)
 
-    def found(self) -> tuple[Inexpressible, ...]:
+    def found(self) -> tuple[UnreachableCounts, ...]:
         reach, bad = self.reach(self.support, self.model.max_steps), np.zeros(len(self.numbers), bool)
-        cases: list[tuple[Inexpressible, str | _Room]] = []
+        cases: list[tuple[UnreachableCounts, str | _Room]] = []
         for s, what in enumerate([*self.classes, ALL][: len(self.kinds)]):
             number, own = self.numbers[:, s], s < len(self.classes)
             for side in (MORE, FEWER):
@@ -142,10 +142,10 @@ class _Walls:
 
     def finding(
         self, what: str, side: str, limit: int | None, rows: NDArray[np.bool_], remedy: str = ""
-    ) -> Inexpressible:
+    ) -> UnreachableCounts:
         which = np.flatnonzero(rows).tolist()
         names = tuple(self.names[i] for i in which) if self.names else ()
-        return Inexpressible(what, side, limit, len(rows), tuple(which), names, self.labelled, remedy)
+        return UnreachableCounts(what, side, limit, len(rows), tuple(which), names, self.labelled, remedy)
 
     def said(self, remedy: "str | _Room", rooms: "list[_Room]") -> str:
         """A remedy in words; a list gets as much room as all of the remedies give it."""
@@ -221,7 +221,7 @@ class _Walls:
         nowhere = self.grammar.legal[symbol] & ~self.support.possible[symbol].any(0).any(0)
         return " and ".join(f"'{self.grammar.rules[k]}'" for k in nowhere.nonzero().flatten().tolist())
 
-    def together(self, reach: Reach, rows: NDArray[np.bool_]) -> list[Inexpressible]:
+    def together(self, reach: Reach, rows: NDArray[np.bool_]) -> list[UnreachableCounts]:
         """Of the images that no one number keeps out, those that their numbers together do."""
         counts = np.column_stack([self.numbers[:, : len(self.classes)], np.full(len(rows), -1)])
         different, which = np.unique(counts[rows], axis=0, return_inverse=True)

@@ -6,19 +6,19 @@ from torch import Tensor
 
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
-from probscene.inference.parameters.tilting.image_statistics import plain
+from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import TiltingLearning
 from probscene.inference.training import batch_seed
 
-from .rendered_features import Observer
+from .rendered_features import RenderedFeatures
 
 if TYPE_CHECKING:
     from .run import RunFolder
 
-WholeLearning = MetaSimLearning | TiltingLearning
+ImageLevelTraining = MetaSimLearning | TiltingLearning
 
 
-def meta_sim_learning(run: "RunFolder", observer: Observer, guide: Guide, images: Tensor) -> MetaSimLearning:
+def meta_sim_learning(run: "RunFolder", observer: RenderedFeatures, guide: Guide, images: Tensor) -> MetaSimLearning:
     """Meta-Sim's training, by EfficientNet's pooled features.
 
     Args:
@@ -33,18 +33,18 @@ def meta_sim_learning(run: "RunFolder", observer: Observer, guide: Guide, images
     return MetaSimLearning(run.model, guide, observer.observe(look), look.embed(images), schedule, seed)
 
 
-def tilting_learning(run: "RunFolder", observer: Observer, guide: Guide, images: Tensor) -> TiltingLearning:
+def tilting_learning(run: "RunFolder", observer: RenderedFeatures, guide: Guide, images: Tensor) -> TiltingLearning:
     """The training that tilts, by the same features and what can plainly be said; arguments as of
     ``meta_sim_learning``."""
     from probscene.inference.features.pretrained import EfficientNetLite
 
     schedule, seed = run.preset.tilting, batch_seed(run.record["seed"], 5)
-    looks = EfficientNetLite(schedule.feature_size).embed, plain
+    looks = EfficientNetLite(schedule.feature_size).embed, image_statistics
     real = tuple(look(images) for look in looks)
     return TiltingLearning(run.model, guide, observer.labelled, looks, real, schedule, seed)
 
 
-def sites_record(learning: WholeLearning) -> list[dict[str, Any]]:
+def sites_record(learning: ImageLevelTraining) -> list[dict[str, Any]]:
     """For JSON, as of ``parameters``; nothing is read, so no site has a skill."""
     sites = []
     for site in learning.sites:

@@ -16,15 +16,15 @@ from torch import Tensor
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.features.photographs.readability import ENOUGH, histogram_scores, scores
 from probscene.inference.guides.base import Guide
-from probscene.inference.statistics.bootstrap_test import farther
+from probscene.inference.statistics.bootstrap_test import bootstrap_test
 from probscene.inference.training import batch_seed
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
 
-from ..labels.partial_labels import FewLabels
+from ..labels.partial_labels import PartialLabels
 from ..progress import Progress
 from .parameter_stage import NAME, beside
-from .rendered_features import RENDERED_AT_ONCE, Observer
+from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import PRIOR_KEPT, RunFolder
 
 SCENES = 500  # of each policy, at most; fewer where the fit's batches are smaller
@@ -46,7 +46,7 @@ def give_up(run: RunFolder) -> str:
 
 
 def conclude(
-    run: RunFolder, observer: Observer, net: FeatureNet, real: Tensor, guide: Guide, progress: Progress
+    run: RunFolder, observer: RenderedFeatures, net: FeatureNet, real: Tensor, guide: Guide, progress: Progress
 ) -> str:
     """Keep the guide or the prior; sentences where it is the prior, where a class that cannot be read has another
     number than in the prior, and where the labels' histogram is better than what was learnt, else nothing.
@@ -74,7 +74,7 @@ def conclude(
             progress("outcome", i * number + first + len(parts[-1]), 2 * number, "")
         found.append(torch.cat(parts)[:, which].double().numpy())
         numbers.append(torch.cat(counts).double())
-    apart = farther(found[0], found[1], real[:, which].double().numpy())
+    apart = bootstrap_test(found[0], found[1], real[:, which].double().numpy())
     record: dict[str, Any] = {"kept": "learnt", "scenes": number, "learnt": apart.one, "prior": apart.other}
     if not apart.sure:
         unread = run.unread
@@ -110,7 +110,7 @@ def moved(learnt: Tensor, prior: Tensor, kinds: dict[str, int]) -> dict[str, tup
     return found
 
 
-def worse_than_labels(labels: FewLabels, learnt: dict[str, NDArray[np.float64]]) -> dict[str, tuple[float, float]]:
+def worse_than_labels(labels: PartialLabels, learnt: dict[str, NDArray[np.float64]]) -> dict[str, tuple[float, float]]:
     """Classes whose labels are surely predicted worse by learnt scenes than by the labels' own histogram: the mean
     continuous ranked probability scores of both.
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from probscene.dataset import Images
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.guides.base import Guide
-from probscene.inference.parameters.backbone import Eye, RenderEye
+from probscene.inference.parameters.backbone import Backbone, RenderBackbone
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
@@ -26,12 +26,12 @@ from probscene.sampling import seed_everything
 from probscene.scenarios import JointGrammar
 
 from ..progress import Progress
-from .image_level import WholeLearning, meta_sim_learning, sites_record, tilting_learning
+from .image_level import ImageLevelTraining, meta_sim_learning, sites_record, tilting_learning
 from .plugins import inner
 from .preset import LIKELIHOOD, META_SIM
-from .rendered_features import Observer
-from .site_selection import held_out, judged, settling
-from .store import Keeper
+from .rendered_features import RenderedFeatures
+from .site_selection import held_out, select_sites, settling
+from .store import Checkpointer
 
 if TYPE_CHECKING:
     from .run import RunFolder
@@ -44,7 +44,7 @@ JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and where these are
 
 def learn_parameters(
     run: "RunFolder",
-    observer: Observer,
+    observer: RenderedFeatures,
     net: FeatureNet,
     guide: Guide,
     images: Callable[[], Images],
@@ -63,7 +63,7 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     seed_everything(batch_seed(run.record["seed"], 5))
-    eye, method = Eye.of(inner(net)), run.preset.parameter_method
+    eye, method = Backbone.of(inner(net)), run.preset.parameter_method
     by_reading, joint = method == LIKELIHOOD, method == META_SIM and isinstance(run.model.grammar, JointGrammar)
     if joint or (by_reading and eye is None):
         who = "models of several scenarios are" if joint else f"{run.features.name} features are"
@@ -89,7 +89,7 @@ def learn_parameters(
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
         else:
             learning = tilting_learning(run, observer, guide, _some(target, ~held, run.preset.tilting.images))
-        keep = Keeper(run, NAME, learning)
+        keep = Checkpointer(run, NAME, learning)
 
         def each(training: Training, line: dict[str, float]) -> None:
             keep({"stage": NAME, "step": training.done, **line})
@@ -97,7 +97,7 @@ def learn_parameters(
 
         learning.run(each)
         keep.finish()
-        if isinstance(learning, ParameterLearning) and isinstance(eye, RenderEye):
+        if isinstance(learning, ParameterLearning) and isinstance(eye, RenderBackbone):
             run.write_tensors(READER, of_counts(learning.tried.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
         judges = _some(target, held, JUDGED), lambda: _some(target, held, DOUBTFUL)
@@ -155,18 +155,18 @@ def _some(images: Images, which: Tensor, most: int) -> Tensor:
 def _record(
     run: "RunFolder",
     guide: Guide,
-    learning: ParameterLearning | WholeLearning,
+    learning: ParameterLearning | ImageLevelTraining,
     held: Tensor,
     more: Callable[[], Tensor],
 ) -> dict[str, Any]:
-    """For JSON, see ``judged``."""
+    """For JSON, see ``select_sites``."""
     method = {"method": run.preset.parameter_method}
     if not isinstance(learning, ParameterLearning):
-        return method | {"sites": sites_record(learning), **judged(run, guide, learning, held, more).distances}
+        return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held, more).distances}
     assert learning.tried.skill is not None
     shares = learning.tried.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
-    found = judged(run, guide, learning, held, more)
+    found = select_sites(run, guide, learning, held, more)
     passed = frozenset() if learning.guide is None else learning.guide.passed
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:

@@ -23,17 +23,17 @@ from probscene.sampling import seed_everything
 from probscene.threads import threads
 
 from ..files import write_text
-from ..labels.partial_labels import FewLabels, PartlyLabelled
+from ..labels.partial_labels import PartialLabels, PartlyLabelled
 from ..progress import Progress
 from ..workers.cluster import Cluster
 from .cache import NetworkCache
 from .outcome import compared, conclude, give_up
 from .parameter_stage import READER, learn_parameters
 from .plugins import inner
-from .rendered_features import RENDERED_AT_ONCE, Observer
+from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import RunFolder
 from .scene_features import fingerprint
-from .store import Keeper, load_state, state_of
+from .store import Checkpointer, load_state, state_of
 from .structure_stage import AGAIN, FIRST, learn_structure, learn_structure_again
 
 Say = Callable[[str], None]
@@ -47,7 +47,7 @@ def fit(
     cache_in: Path | None = None,
     use_cache: bool = True,
     say: Say | None = None,
-    labels: FewLabels | None = None,
+    labels: PartialLabels | None = None,
     cluster: Cluster | None = None,
 ) -> Policy:
     """Finish a run: take the stages that it lacks.
@@ -74,7 +74,7 @@ def fit(
             "in files, which nodes can open."
         )
     images = cache(lambda: open_target(run, progress) if target is None else target)
-    observer = Observer(run.model, run.record["threads"])
+    observer = RenderedFeatures(run.model, run.record["threads"])
     with threads(run.record["threads"]):
         net = _Network(run, observer, progress, images, labels)
         net.finish(cache_in, use_cache, say or (lambda text: None))
@@ -104,10 +104,10 @@ class _Network:
     def __init__(
         self,
         run: RunFolder,
-        observer: Observer,
+        observer: RenderedFeatures,
         progress: Progress,
         target: Callable[[], Images],
-        labels: FewLabels | None,
+        labels: PartialLabels | None,
     ):
         self.run, self.observer, self.progress, self.target = run, observer, progress, target
         self.photographs = cache(lambda: PartlyLabelled(target(), labels))
@@ -138,7 +138,7 @@ class _Network:
     def _finish(self, training: Training, folder: Path | None, use_cache: bool, say: Say) -> None:
         """Load what was trained before from the cache, else train."""
         run, net = self.run, self.net
-        taught = run.features.taught_by(inner(net))
+        taught = run.features.target_fingerprint(inner(net))
         kept = NetworkCache(run, inner(net), folder, taught) if use_cache else None
         cached = None if kept is None else kept.load()
         if cached is not None and kept is not None:
@@ -151,7 +151,7 @@ class _Network:
                 kept.save(state_of(net), lines)
 
     def _train(self, training: Training, say: Say) -> list[str]:
-        keep = Keeper(self.run, "features", training)
+        keep = Checkpointer(self.run, "features", training)
         self._check_taught()
 
         def each(training: Training, line: dict[str, float]) -> None:
@@ -174,8 +174,8 @@ class _Network:
 
     def _check_taught(self) -> None:
         """See that a network that taught itself on images did so on those of the run, begun anew or going on."""
-        taught_by = self.run.features.taught_by(inner(self.net))
-        if taught_by and self.target().fingerprint != taught_by:
+        target_fingerprint = self.run.features.target_fingerprint(inner(self.net))
+        if target_fingerprint and self.target().fingerprint != target_fingerprint:
             raise _others(self.target())
 
 

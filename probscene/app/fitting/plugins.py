@@ -33,7 +33,7 @@ GuideMaker = Callable[[Grammar, int], Guide]
 
 
 @dataclass(frozen=True)
-class Parts:
+class Plugins:
     """What a user brings as objects; None for what the preset names."""
 
     features: Features | None = None
@@ -172,7 +172,7 @@ def _called(given: Any) -> str:
     return f"{name}{inspect.signature(given)}" if callable(given) else name
 
 
-class CheckedNet:
+class ValidatedNet:
     """A user's feature network, whose first answer is looked at."""
 
     def __init__(self, net: Any, features: Any):
@@ -214,10 +214,10 @@ class CheckedNet:
 
 def inner(net: FeatureNet) -> FeatureNet:
     """The network itself, without the checks around a user's."""
-    return net.net if isinstance(net, CheckedNet) else net
+    return net.net if isinstance(net, ValidatedNet) else net
 
 
-class CheckedDivergence:
+class ValidatedDivergence:
     """A user's divergence, whose answers are looked at."""
 
     def __init__(self, divergence: Divergence):

@@ -17,7 +17,7 @@ from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.schedule import ParameterSchedule
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 
-from .plugins import IN_MEMORY, CheckedDivergence, as_divergence, as_features, is_file_part, load_part
+from .plugins import IN_MEMORY, ValidatedDivergence, as_divergence, as_features, is_file_part, load_part
 
 FOR_RENDERS, FOR_PHOTOGRAPHS = "count", COUNT_ON_PRETRAINED
 TRAINED = (FOR_RENDERS, FOR_PHOTOGRAPHS, PRESENCE, PRESENCE_COUNTS)  # on the prior's renders
@@ -66,7 +66,7 @@ class Preset:
             batches structures stay those that guides are pretrained on, and parameters alone are learnt.
         draws_per_structure: drawings of each structure, of which the clearest is looked at.
         reuse: renders of scenes of equal counts before one of them, at random, is taken again instead of a new one,
-            for renderers that are slow; every scene is rendered where 0. See ``RenderPool``.
+            for renderers that are slow; every scene is rendered where 0. See ``RenderCache``.
         baseline, scale, incompletion_weight, prior_kl_weight: see ``ScoreFunction``, whose prior is the policy
             that guides are pretrained on.
         hidden, num_latents, index: see ``LSTMGuide``; the first two also of ``GrammarVAE``.
@@ -273,7 +273,7 @@ class Preset:
             ModelError: see ``load_part``.
         """
         if is_file_part(self.objective):
-            return CheckedDivergence(as_divergence(load_part(self.objective)))
+            return ValidatedDivergence(as_divergence(load_part(self.objective)))
         if self.objective in ("mmd", "witness"):
             return MMD(self.variance, self.objective == "mmd", self.stabilised)
         ratio = JensenShannon if self.objective == "js" else KDELogRatio

@@ -21,7 +21,7 @@ from probscene.threads import threads
 
 from ..chunks import chunk_randomness
 from ..loading import renderer_for
-from ..workers.actor_pool import Crew
+from ..workers.actor_pool import ActorPool
 
 RENDERED_AT_ONCE = 64  # images in memory
 
@@ -29,7 +29,7 @@ Observe = Callable[[Scenes], Tensor]
 """Features ``(N, D)`` of scenes."""
 
 
-class Part(NamedTuple):
+class Chunk(NamedTuple):
     """Some structures of a batch, ``rules (N, T)``, and what their parameters are drawn from."""
 
     rules: Tensor
@@ -37,7 +37,7 @@ class Part(NamedTuple):
     number: int
 
 
-class Observer:
+class RenderedFeatures:
     """A model seen through its renderer: ``Renders`` to train on, and features of scenes.
 
     Args:
@@ -99,32 +99,36 @@ class Observer:
                 network that goes by labels counts what can be seen, of one drawing.
         """
 
-        embed_drawn, pictured = getattr(net, "embed_drawn", None), not getattr(net, "by_labels", False)
+        embed_from_labels, pictured = getattr(net, "embed_drawn", None), not getattr(net, "by_labels", False)
 
         def features(scenes: Scenes) -> Tensor:
             with threads(self.threads):
                 starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
-                if embed_drawn is not None:
+                if embed_from_labels is not None:
                     parts = (self.labelled(scenes, slice(i, i + RENDERED_AT_ONCE), pictured) for i in starts)
-                    return torch.cat([embed_drawn(some) for some in parts])
+                    return torch.cat([embed_from_labels(some) for some in parts])
                 images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
                 return torch.cat([net.embed(self._as_read(some)) for some in images])
 
         return features
 
-    def observe_anew(self, net: FeatureNet, draws_per_structure: int = 1, crew: Crew | None = None) -> Observe:
+    def resample_and_embed(
+        self, net: FeatureNet, draws_per_structure: int = 1, crew: ActorPool | None = None
+    ) -> Observe:
         """Features of scenes of the same structures, their parameters drawn anew: each part of a batch from a seed and
         its number, so that it does not matter where that is done.
 
         Args:
             draws_per_structure: see ``observe``.
-            crew: actors that do it, prepared to do ``Part``s by ``part``; else this process does.
+            crew: actors that do it, prepared to do ``Chunk``s by ``part``; else this process does.
         """
 
         def features(scenes: Scenes) -> Tensor:
             seed = int(torch.randint(1 << 62, ()))
             some = scenes.derivation.rules.split(RENDERED_AT_ONCE)
-            parts = [Part(rules.clone(), seed, number) for number, rules in enumerate(some)]  # a view has all to pickle
+            parts = [
+                Chunk(rules.clone(), seed, number) for number, rules in enumerate(some)
+            ]  # a view has all to pickle
             if crew is None:
                 return torch.cat([self.part(part, net, draws_per_structure)[1] for part in parts])
             found: list[tuple[int, Tensor]] = []
@@ -133,7 +137,7 @@ class Observer:
 
         return features
 
-    def part(self, some: "Part", net: FeatureNet, draws_per_structure: int) -> tuple[int, Tensor]:
+    def part(self, some: "Chunk", net: FeatureNet, draws_per_structure: int) -> tuple[int, Tensor]:
         """A part's number and its features ``(N, D)``."""
         with chunk_randomness(some.seed, some.number), torch.no_grad():
             derivation = Derivation.of(self.model.grammar, some.rules)

@@ -16,16 +16,16 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 
 from ..files import make_folder, write_json, write_whole
-from ..labels.partial_labels import FewLabels
+from ..labels.partial_labels import PartialLabels
 from ..loading import BUILT_IN, assets_record, lasting_reference, load_model, recorded_model, split_reference
 from ..modules import file_digest
 from ..neighbours import neighbours
 from .parameter_stage import apart, with_parameters
 from .plugins import (
     IN_MEMORY,
-    CheckedDivergence,
-    CheckedNet,
-    Parts,
+    Plugins,
+    ValidatedDivergence,
+    ValidatedNet,
     as_divergence,
     as_guide_maker,
     check_guide,
@@ -54,11 +54,13 @@ class RunFolder(Storage):
         few: labels of some of the target's images.
     """
 
-    def __init__(self, path: Path, record: dict[str, Any], model: SceneModel | None = None, parts: Parts | None = None):
+    def __init__(
+        self, path: Path, record: dict[str, Any], model: SceneModel | None = None, parts: Plugins | None = None
+    ):
         super().__init__(path, record)
-        self.parts, self._model = parts or Parts(), model
+        self.parts, self._model = parts or Plugins(), model
         self.built: FeatureNet | None = None
-        self.few: FewLabels | None = None
+        self.few: PartialLabels | None = None
         self._network: FeatureNet | None = None
 
     @classmethod
@@ -69,7 +71,7 @@ class RunFolder(Storage):
         record: dict[str, Any],
         assets: Path | None = None,
         loaded: SceneModel | None = None,
-        parts: Parts | None = None,
+        parts: Plugins | None = None,
     ) -> Self:
         """A new run folder; ``record`` is kept in ``run.json``.
 
@@ -109,7 +111,7 @@ class RunFolder(Storage):
         return run
 
     @classmethod
-    def at(cls, path: Path, model: SceneModel | None = None, parts: Parts | None = None) -> Self:
+    def at(cls, path: Path, model: SceneModel | None = None, parts: Plugins | None = None) -> Self:
         """An existing run folder.
 
         Args:
@@ -192,7 +194,7 @@ class RunFolder(Storage):
             ModelError: a user's own that cannot be built, or that is no network.
         """
         net = self.features.build(self.model)
-        return net if _is_ours(net) else CheckedNet(net, self.features)
+        return net if _is_ours(net) else ValidatedNet(net, self.features)
 
     def network(self) -> FeatureNet | None:
         """The feature network with its state, once it is trained; None before. Loaded once, see ``load_state``."""
@@ -220,13 +222,13 @@ class RunFolder(Storage):
         """
         word = self.preset.objective
         if self.parts.divergence is not None:
-            chosen: Divergence = CheckedDivergence(self.parts.divergence)
+            chosen: Divergence = ValidatedDivergence(self.parts.divergence)
         else:
             self.check_objects("divergence")
             self._unchanged_part(word)
             chosen = self.preset.divergence()
         found = self.features.divergence(net, chosen)
-        return found if _is_ours(found) else CheckedDivergence(as_divergence(found))
+        return found if _is_ours(found) else ValidatedDivergence(as_divergence(found))
 
     def new_guide(self) -> Guide:
         """An untrained guide of the kind and size that the run was begun with; one that names no kind has an LSTM.

@@ -24,10 +24,10 @@ from ..loading import renderer_for
 from .rendered_features import RENDERED_AT_ONCE
 from .run import RunFolder
 
-RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``unlike`` judges
+RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``domain_shift`` judges
 NEIGHBOURS = 8
 ALIKE = 0.5  # below this share no more renders are asked for
-UNLIKE = 0.87  # from this share on the target's images look unlike renders
+DOMAIN_SHIFT_SHARE = 0.87  # from this share on the target's images look unlike renders
 
 Each = Callable[[int], None]
 """Told how many more images are done."""
@@ -56,7 +56,7 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
         yield as_written(model, render(scenes.drawing[: num - first]).image)
 
 
-def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], None] | None = None) -> float:
+def domain_shift(model: SceneModel, target: Images, progress: Callable[[int, int], None] | None = None) -> float:
     """The share of the target's images that lie ``outside`` renders, by EfficientNet-Lite's pooled features or by the
     texture in its finest maps, whichever is less. Images of other structures and layouts lie among renders of the
     pretraining policy, at least in part; a camera's do not. Fewer renders do where they hold half of the images.

@@ -23,7 +23,7 @@ from probscene.threads import default_threads
 from ..checking.generator_check import cost
 from ..checking.model_check import QUICK, check_model
 from ..files import write_json
-from ..labels.partial_labels import FewLabels, labels_record, read_few
+from ..labels.partial_labels import PartialLabels, labels_record, read_partial_labels
 from ..loading import drawn_with, folder_digest, lasting_reference, load_model, split_reference
 from ..modules import file_digest, module_digests
 from ..neighbours import neighbours
@@ -31,11 +31,11 @@ from ..progress import Display
 from ..targets import Target, lasting_target, open_images, say_notes
 from ..workers.cluster import Cluster
 from .pipeline import check_target, fit, open_target
-from .plugins import Parts, in_memory, is_file_part, part_file
+from .plugins import Plugins, in_memory, is_file_part, part_file
 from .preset import Preset
 from .presets import takers_of_labels
 from .run import RunFolder
-from .scene_features import UNLIKE, unlike
+from .scene_features import DOMAIN_SHIFT_SHARE, domain_shift
 from .store import OTHER, TIMING, check_free, timing
 
 BEFORE = ("reading", "likeness", "looking", "features", "readings", "target", "pretraining")
@@ -65,7 +65,7 @@ def begin(
     threads: int | None,
     show: Display,
     assets: Path | None = None,
-    parts: Parts | None = None,
+    parts: Plugins | None = None,
     make: type[RunFolder] = RunFolder,
     labels: Path | None = None,
     photographs: Preset | None = None,
@@ -78,13 +78,13 @@ def begin(
         assets: a folder that the model is drawn with.
         parts: what the user brought as objects.
         make: the class of the run.
-        labels: of some of the target's images, see ``read_few``.
+        labels: of some of the target's images, see ``read_partial_labels``.
         photographs: the preset to take instead where there are labels, or the target looks unlike renders.
         value_range: of images of 16 bits, see ``ImageFolder``.
 
     Raises:
         ProbsceneError: a number of threads that is not positive, labels for features that take none; see also
-            ``checked_model``, ``open_images``, ``check_target``, ``read_few`` and ``RunFolder.create``.
+            ``checked_model``, ``open_images``, ``check_target``, ``read_partial_labels`` and ``RunFolder.create``.
     """
     if threads is not None and threads < 1:
         raise ProbsceneError(f"expected a positive number of threads, got {threads}.")
@@ -118,7 +118,7 @@ def begin(
     if labels is not None:
         record["labels"] = labels_record(labels)
         check_takes_labels(run.features)
-        few = read_few(labels, loaded, images)
+        few = read_partial_labels(labels, loaded, images)
         say_notes(few.notes, show)
     seed_everything(batch_seed(seed, 0))
     net = run.build_network()
@@ -136,7 +136,7 @@ def resume(
     target: Target | None = None,
     preset: Preset | None = None,
     assets: Path | None = None,
-    parts: Parts | None = None,
+    parts: Plugins | None = None,
     make: type[RunFolder] = RunFolder,
     labels: Path | None = None,
     photographs: Preset | None = None,
@@ -156,7 +156,7 @@ def resume(
 
     Raises:
         RunError: there is no run, or it was begun with something else, or its labels have changed.
-        DataError: see ``ImageFolder`` and ``read_few``.
+        DataError: see ``ImageFolder`` and ``read_partial_labels``.
     """
     run = make.at(out, model if isinstance(model, SceneModel) else None, parts)
     before = dict(run.record)
@@ -237,8 +237,8 @@ def _suited(
     """The preset for renders or that for photographs; which, and why, is said where it is the latter."""
     if labelled:
         return photographs
-    share = unlike(model, images, show.stage("likeness"))
-    if share < UNLIKE:
+    share = domain_shift(model, images, show.stage("likeness"))
+    if share < DOMAIN_SHIFT_SHARE:
         return preset
     show.say(
         f"Note: the target's images look unlike the model's renders ({share:.0%} of them like none), so features "
@@ -300,7 +300,7 @@ def _relocate(
     return images
 
 
-def _same_labels(run: RunFolder, images: Images) -> FewLabels | None:
+def _same_labels(run: RunFolder, images: Images) -> PartialLabels | None:
     """The labels that a run was begun with."""
     kept = run.record.get("labels")
     if kept is None:
@@ -311,4 +311,4 @@ def _same_labels(run: RunFolder, images: Images) -> FewLabels | None:
             f"expected the labels in {path} as they were when the run in {run.path} was begun, got others; put them "
             "back, or begin a new run."
         )
-    return read_few(path, run.model, images)
+    return read_partial_labels(path, run.model, images)

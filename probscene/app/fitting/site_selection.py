@@ -14,18 +14,18 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from probscene.inference.guides.base import Guide
-from probscene.inference.parameters.checkpoint_selection import HeldOut, useless
+from probscene.inference.parameters.checkpoint_selection import HeldOutSet, uninformative_sites
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.tilting.learning import TiltingLearning
-from probscene.inference.statistics.bootstrap_test import SURE, Farther, farther
+from probscene.inference.statistics.bootstrap_test import SURE, BootstrapTest, bootstrap_test
 from probscene.inference.statistics.two_sample import Features
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
 
-from .image_level import WholeLearning
-from .rendered_features import RENDERED_AT_ONCE, Observer
+from .image_level import ImageLevelTraining
+from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 
 if TYPE_CHECKING:
     from .run import RunFolder
@@ -34,7 +34,7 @@ QUANTILES = np.linspace(0, 1, 21)
 LEAST_MOVED = 0.1  # of u; readings of little skill are off by as much in renders that merely resemble the target
 
 
-class Judged(NamedTuple):
+class SiteSelection(NamedTuple):
     """For JSON.
 
     Attributes:
@@ -54,18 +54,18 @@ class Judged(NamedTuple):
     sites: dict[str, dict[str, Any]]
 
 
-def judged(
+def select_sites(
     run: "RunFolder",
     guide: Guide,
-    learning: ParameterLearning | WholeLearning,
+    learning: ParameterLearning | ImageLevelTraining,
     held: Tensor,
     more: Callable[[], Tensor],
-) -> Judged:
+) -> SiteSelection:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features.
     Which sites are learnt takes ``more`` of them to tell, see ``settling`` and ``of_unclear``."""
     learnt = learning.guide
     if learnt is None:
-        return Judged({"kept": "prior"}, {}, {})
+        return SiteSelection({"kept": "prior"}, {}, {})
     judge = learning.best.held if isinstance(learning, ParameterLearning) and learning.best is not None else None
     look, images = _embed(), {"target": held}
     real = look(held) if judge is None else judge.real
@@ -76,8 +76,8 @@ def judged(
 
     of_prior = drawn("prior", run.model)
 
-    def compared() -> Farther:
-        return farther(drawn("learnt", learnt.suited(run.model)), of_prior, real)
+    def compared() -> BootstrapTest:
+        return bootstrap_test(drawn("learnt", learnt.suited(run.model)), of_prior, real)
 
     apart = compared()
     kept, because = "learnt" if apart.one < apart.other else "prior", dict[str, str]()
@@ -91,7 +91,7 @@ def judged(
         if learnt.passed:
             apart = compared()
         if apart.sure and judge is not None:
-            learnt.passed = useless(learnt, judge) | because.keys()
+            learnt.passed = uninformative_sites(learnt, judge) | because.keys()
             apart = compared()
         kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
         if kept == "prior":
@@ -100,7 +100,7 @@ def judged(
         kept = "prior"
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if not isinstance(learning, ParameterLearning):  # which reads nothing
-        return Judged(distances, {}, {})
+        return SiteSelection(distances, {}, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
     readings = {name: learning.tried.readings(some) for name, some in images.items()}
     halves = [learning.tried.readings(held[i::2]) for i in (0, 1)]
@@ -111,13 +111,13 @@ def judged(
             name: _distance(readings[name][site.name], readings["target"][site.name]) for name in ("prior", "learnt")
         }
         sites[site.name] = each | {"distance": away | {"floor": _distance(*(half[site.name] for half in halves))}}
-    return Judged(distances, because, sites)
+    return SiteSelection(distances, because, sites)
 
 
 def settling(
     run: "RunFolder", guide: Guide, held: Callable[[bool], Tensor]
 ) -> Callable[[ParameterLearning, bool], frozenset[str]]:
-    """What names sites that keep their prior, of those that are read well, as ``judged`` will have it: after each
+    """What names sites that keep their prior, of those that are read well, as ``select_sites`` will have it: after each
     training of the guide, and for good before the others are learnt, which is done from renders that look like the
     target.
 
@@ -147,10 +147,10 @@ def settling(
             return names
         judge = learning.best.held
         looks = judge.looks(learning.guide, frozenset())
-        apart = farther(looks, of_prior(), judge.real)
+        apart = bootstrap_test(looks, of_prior(), judge.real)
         if apart.one < apart.other:
             names = passed(learning, read, False)
-        return needless(learning.guide, judge, looks, names)
+        return redundant_resets(learning.guide, judge, looks, names)
 
     def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
         assert learning.guide is not None
@@ -164,12 +164,14 @@ def settling(
     return settled
 
 
-def needless(guide: ParameterGuide, judge: HeldOut, looks: Features, names: frozenset[str]) -> frozenset[str]:
+def redundant_resets(
+    guide: ParameterGuide, judge: HeldOutSet, looks: Features, names: frozenset[str]
+) -> frozenset[str]:
     """Of some sites those without which renders are not surely farther from held-out images than with all, which have
     ``looks``: what is read of an object and of its sibling before hardly shows that a row is even, which whole images
     do."""
     without = {name: judge.looks(guide, frozenset((name,))) for name in sorted(names)}
-    return frozenset(name for name, found in without.items() if not farther(found, looks, judge.real).sure)
+    return frozenset(name for name, found in without.items() if not bootstrap_test(found, looks, judge.real).sure)
 
 
 def passed(
@@ -240,7 +242,7 @@ def _share(of: dict[str, tuple[Tensor, Tensor]], far: str, near: str) -> float:
     images = tuple(image.numpy() for _, image in sources)
     if not min(map(len, (one, other, target))):
         return 0.0
-    apart = farther(one, other, target, images=(images[0], images[1], images[2]))
+    apart = bootstrap_test(one, other, target, images=(images[0], images[1], images[2]))
     return apart.share if apart.one > apart.other else 0.0
 
 
@@ -250,7 +252,7 @@ def _compared(run: "RunFolder", model: SceneModel, guide: Guide, number: int, na
     return _renders(run, model, guide, number)
 
 
-def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
+def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOutSet:
     """What judges guides while they are trained, by the same images and features. It remembers the latest weights'."""
     embed = _embed()
     of, known = b"", dict[frozenset[str], Features]()
@@ -265,7 +267,7 @@ def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOut:
             known[learnt.passed] = embed(_renders(run, learnt.suited(run.model), guide, len(held)))
         return known[learnt.passed]
 
-    return HeldOut(look, embed(held))
+    return HeldOutSet(look, embed(held))
 
 
 def _digest(*states: dict[str, Tensor]) -> bytes:
@@ -285,7 +287,7 @@ def _embed() -> Callable[[Tensor], Features]:
 
 
 def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> Tensor:
-    observer = Observer(model, run.record["threads"])
+    observer = RenderedFeatures(model, run.record["threads"])
     sizes = [min(RENDERED_AT_ONCE, number - i) for i in range(0, number, RENDERED_AT_ONCE)]
     return torch.cat([observer.labelled(sample(model, guide, size, density=False)).image for size in sizes])
 

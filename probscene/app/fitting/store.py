@@ -145,7 +145,7 @@ class Storage:
         save_tensors(self.path / f"{name}.safetensors", tensors)
 
 
-class Keeper:
+class Checkpointer:
     """Checkpoints of one training, at most every ``SAVE_EVERY`` seconds, with the lines of the log that belong to them.
 
     The log is written before the checkpoint, and lines past the checkpoint are dropped when a run goes on.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from probscene.dataset import Images
-from probscene.inference.count_penalty import Held
+from probscene.inference.count_penalty import PriorCountPenalty
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.counting.net import CountNet
@@ -21,22 +21,22 @@ from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.parameters.reader_counts import ReaderCounts
 from probscene.inference.pretrain import pretrain
-from probscene.inference.render_cache import RenderPool
-from probscene.inference.statistics.bootstrap_test import farther
+from probscene.inference.render_cache import RenderCache
+from probscene.inference.statistics.bootstrap_test import bootstrap_test
 from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
 
 from ..progress import Progress
-from ..workers.actor_pool import Crew
+from ..workers.actor_pool import ActorPool
 from ..workers.cluster import Cluster
 from .outcome import compared
 from .parameter_stage import NAME, READER, beside, with_parameters
 from .plugins import inner
 from .preset import Preset
-from .rendered_features import RENDERED_AT_ONCE, Observe, Observer, Part
+from .rendered_features import RENDERED_AT_ONCE, Chunk, Observe, RenderedFeatures
 from .run import RunFolder
-from .store import Keeper
+from .store import Checkpointer
 
 FIRST, AGAIN = "guide", "structure-again"  # of the checkpoints
 BEFORE = "guide-first"  # of the guide that parameters are learnt with
@@ -45,7 +45,7 @@ SLOWER = 0.2  # of the first pass's rate
 
 def learn_structure(
     run: RunFolder,
-    observer: Observer,
+    observer: RenderedFeatures,
     net: FeatureNet,
     real: Tensor,
     progress: Progress,
@@ -67,11 +67,11 @@ def learn_structure(
         guide.load_state_dict(known)
         return guide
     pool, crew = _pool(run, run.model), _crew(run, cluster, preset.draws_per_structure)
-    observe = observer.observe_anew(net, preset.draws_per_structure, crew)
+    observe = observer.resample_and_embed(net, preset.draws_per_structure, crew)
     objective = _objective(run, run.model, observe, net, guide, pool)
     rate, seeds = preset.learning_rate, batch_seed(seed, 3)
     trainer = _trainer(run, run.model, guide, objective, real, preset.batches, rate, seeds, pool)
-    keep = Keeper(run, FIRST, trainer)
+    keep = Checkpointer(run, FIRST, trainer)
     if trainer.done == 0:
         epochs = preset.pretrain_epochs
         pretrain(
@@ -114,31 +114,34 @@ def learn_structure_again(
         return
     seed_everything(batch_seed(seed, 8))
     model = guide.suits(run.model)
-    observer, before = Observer(model, run.record["threads"]), {k: v.clone() for k, v in guide.state_dict().items()}
+    observer, before = (
+        RenderedFeatures(model, run.record["threads"]),
+        {k: v.clone() for k, v in guide.state_dict().items()},
+    )
     finder = _finder(run, net, observer, guide)
     if finder is not None:
         net, real = finder, embed_all(finder, images().batches(RENDERED_AT_ONCE))
     pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True, finder=finder is not None)
-    objective = _objective(run, model, observer.observe_anew(net, 1, crew), net, guide, pool)
+    objective = _objective(run, model, observer.resample_and_embed(net, 1, crew), net, guide, pool)
     rate, seeds = SLOWER * preset.learning_rate, batch_seed(seed, 7)
     trainer = _trainer(run, model, guide, objective, real, preset.batches_again, rate, seeds, pool)
     seen = _seen(run, observer, net, guide)
-    _run(trainer, Keeper(run, AGAIN, trainer), AGAIN, progress, crew)
+    _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
     which = compared(net)
     which = slice(None) if which is None else which
     now, then, target = (part[:, which].double().numpy() for part in (_seen(run, observer, net, guide), seen, real))
-    if farther(now, then, target).sure:
+    if bootstrap_test(now, then, target).sure:
         guide.load_state_dict(before)
 
 
-def _seen(run: RunFolder, observer: Observer, net: FeatureNet, guide: Guide) -> Tensor:
+def _seen(run: RunFolder, observer: RenderedFeatures, net: FeatureNet, guide: Guide) -> Tensor:
     """Features of scenes of the guide, as many as a batch has."""
     seed_everything(batch_seed(run.record["seed"], 9))
     with torch.no_grad():
         return observer.observe(net)(sample(run.model, guide, run.preset.num_scenes))
 
 
-def _finder(run: RunFolder, net: FeatureNet, observer: Observer, guide: Guide) -> ReaderCounts | None:
+def _finder(run: RunFolder, net: FeatureNet, observer: RenderedFeatures, guide: Guide) -> ReaderCounts | None:
     """Counts of what the reader finds, where they are nearer to those of a guide's scenes than the network's are."""
     finder = _reader_counts(run, net)
     if finder is None:
@@ -163,18 +166,18 @@ def _reader_counts(run: RunFolder, net: FeatureNet) -> ReaderCounts | None:
     return ReaderCounts(counts, state) if state and isinstance(counts, CountNet) and counts.groups is None else None
 
 
-def _pool(run: RunFolder, model: SceneModel) -> RenderPool | None:
-    return RenderPool(model, run.preset.reuse) if run.preset.reuse else None
+def _pool(run: RunFolder, model: SceneModel) -> RenderCache | None:
+    return RenderCache(model, run.preset.reuse) if run.preset.reuse else None
 
 
 def _crew(
     run: RunFolder, cluster: Cluster | None, draws_per_structure: int, again: bool = False, finder: bool = False
-) -> Crew | None:
+) -> ActorPool | None:
     task = run.path.resolve(), draws_per_structure, again, finder
     return None if cluster is None else cluster.crew(_actor, task, run.record["threads"])
 
 
-def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> Callable[[Part], tuple[int, Tensor]]:
+def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> Callable[[Chunk], tuple[int, Tensor]]:
     """What a node of a cluster does with a part of a batch."""
     run = RunFolder.at(path)
     model, net = run.model, run.network()
@@ -182,7 +185,7 @@ def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> C
     if again and (suits := with_parameters(run, run.new_guide(), beside(run.read_tensors(NAME) or {})).suits):
         model = suits(model)
     net = (_reader_counts(run, net) if finder else None) or net
-    observer = Observer(model, run.record["threads"])
+    observer = RenderedFeatures(model, run.record["threads"])
     return lambda part: observer.part(part, net, draws_per_structure)
 
 
@@ -192,9 +195,9 @@ def _objective(
     observe: Observe,
     net: FeatureNet,
     guide: Guide,
-    pool: RenderPool | None,
+    pool: RenderCache | None,
 ) -> ScoreFunction:
-    held = Held(model, {*run.unread, *(model.stuff if run.readings else ())}, run.preset.num_scenes)
+    held = PriorCountPenalty(model, {*run.unread, *(model.stuff if run.readings else ())}, run.preset.num_scenes)
     observe = held.beside(observe if pool is None else pool.around(observe))
     return score_function(run.preset, model, observe, held.added_to(run.divergence(inner(net))), guide)
 
@@ -230,14 +233,14 @@ def _trainer(
     batches: int,
     rate: float,
     seed: int,
-    pool: RenderPool | None,
+    pool: RenderCache | None,
 ) -> Trainer:
     preset = run.preset
     scenes, images = preset.num_scenes, preset.num_real
     return Trainer(model, guide, objective, real, batches, scenes, images, rate, preset.cosine, seed, pool)
 
 
-def _run(trainer: Trainer, keep: Keeper, stage: str, progress: Progress, crew: Crew | None) -> None:
+def _run(trainer: Trainer, keep: Checkpointer, stage: str, progress: Progress, crew: ActorPool | None) -> None:
     def each(trainer: Training, diagnostics: dict[str, float]) -> None:
         keep({"stage": stage, **diagnostics})
         progress(stage, trainer.done, trainer.total, f"cost {diagnostics['cost']:.3f}")

@@ -22,7 +22,7 @@ from .reading import has_boxes, label_files
 LEAST = 3  # images, of which one can be left out and two are left to choose by
 
 
-class FewLabels(NamedTuple):
+class PartialLabels(NamedTuple):
     """Labels of K of a target's images.
 
     Attributes:
@@ -41,7 +41,7 @@ class FewLabels(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_few(path: Path, model: SceneModel, target: Images, least: int = LEAST) -> FewLabels:
+def read_partial_labels(path: Path, model: SceneModel, target: Images, least: int = LEAST) -> PartialLabels:
     """The labels of some of a target's images: with boxes, see ``read_annotations``, else a CSV of counts.
 
     Args:
@@ -78,13 +78,13 @@ def read_few(path: Path, model: SceneModel, target: Images, least: int = LEAST) 
     never = [name for name, some in zip(read.classes, counts.any(0).tolist(), strict=True) if not some]
     if never:
         notes += (f"No labelled image has any {', nor any '.join(never)}, which cannot be calibrated by them.",)
-    return FewLabels(torch.tensor(read.rows), counts, read.classes, boxes, (*read.notes, *notes))
+    return PartialLabels(torch.tensor(read.rows), counts, read.classes, boxes, (*read.notes, *notes))
 
 
 class PartlyLabelled:
     """A target's images of which some are labelled: what a feature network looks at before it is used."""
 
-    def __init__(self, images: Images, few: FewLabels | None):
+    def __init__(self, images: Images, few: PartialLabels | None):
         self.images, self.few, self.fingerprint = images, few, images.fingerprint
 
     def some(self, most: int) -> Tensor:

@@ -20,7 +20,7 @@ from probscene.sampling import sample
 from probscene.threads import threads
 
 from ..chunks import chunk_randomness
-from ..evaluation.diagnose import Judged, judge
+from ..evaluation.diagnose import FitDiagnostics, diagnose
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.labels import read_labels
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
@@ -74,7 +74,7 @@ def report(
         out: ``report.html`` in the run folder where None.
         labels: of the run's target, see ``read_labels``.
         num: structures sampled a source.
-        judged_by: scenes rendered for the verdict, none where 0; see ``judge``.
+        judged_by: scenes rendered for the verdict, none where 0; see ``diagnose``.
         visible: see ``evaluate``.
         some_labels: labels need not cover all images.
 
@@ -96,7 +96,7 @@ def report(
         absent = str(error)
     truth = None if labels is None or images is None else read_labels(labels, run.model, images, some_labels)
     evaluation = evaluate(run, images, truth, show, num, visible=visible)
-    judged = judge(run, images, show, judged_by, evaluation) if images and judged_by != 0 else None
+    judged = diagnose(run, images, show, judged_by, evaluation) if images and judged_by != 0 else None
     return write(run, evaluation, images, out, absent, judged)
 
 
@@ -106,7 +106,7 @@ def write(
     images: Images | None,
     out: Path | None = None,
     absent: str = "",
-    judged: Judged | None = None,
+    judged: FitDiagnostics | None = None,
 ) -> Path:
     """``report`` from what is known already; ``absent`` says why there are no target images."""
     out = Path(out) if out is not None else run.path / "report.html"
@@ -140,7 +140,7 @@ def write(
     return out
 
 
-def _trust(judged: Judged | None, images: Images | None) -> str:
+def _trust(judged: FitDiagnostics | None, images: Images | None) -> str:
     if judged is None or images is None:
         return "<p>There is no verdict: no scenes were rendered to compare with target images.</p>"
     if judged.trust is None:

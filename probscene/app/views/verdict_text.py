@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.table import Table
 
 from probscene.inference.statistics.trust import Trust
-from probscene.inference.statistics.two_sample import Apart
+from probscene.inference.statistics.two_sample import EnergyTest
 from probscene.inference.statistics.verdict import Gap
 
 from ..evaluation.components import ABSENT
-from ..evaluation.diagnose import Judged
+from ..evaluation.diagnose import FitDiagnostics
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE
 
 HEAD = ("", "this fit", "the floor")
@@ -26,7 +26,7 @@ OVERALL = (
 )
 
 
-def show(judged: Judged, console: Console) -> None:
+def show(judged: FitDiagnostics, console: Console) -> None:
     """Print the verdict, why, what to do, its parts, what the labels say, and the figures of structure."""
     record = judged.record()
     show_parts(record, console)
@@ -48,7 +48,7 @@ def show(judged: Judged, console: Console) -> None:
 
 
 def show_parts(record: dict[str, Any], console: Console) -> None:
-    """Print the verdict and its parts, of what ``Judged.record`` gives, as it was kept."""
+    """Print the verdict and its parts, of what ``FitDiagnostics.record`` gives, as it was kept."""
     if record["verdict"] is None:
         console.print(f"No verdict. {record['because']}", soft_wrap=True)
         console.print()
@@ -70,7 +70,7 @@ def show_parts(record: dict[str, Any], console: Console) -> None:
         console.print(text, soft_wrap=True)
 
 
-def section(judged: Judged, real: str, generated: str) -> str:
+def section(judged: FitDiagnostics, real: str, generated: str) -> str:
     """HTML for the report; ``real`` and ``generated`` are its pictures."""
     record = judged.record()
     if judged.trust is None or record["verdict"] is None:
@@ -170,7 +170,7 @@ def rows(found: Trust) -> list[tuple[str, ...]]:
     return out
 
 
-def _sentences(judged: Judged) -> list[str]:
+def _sentences(judged: FitDiagnostics) -> list[str]:
     """What else is known: which classes can be read, what labels say, what the model is too narrow for."""
     found = [judged.usable] if judged.usable else []
     if judged.agreement is not None and judged.trust is not None:
@@ -189,7 +189,7 @@ def _table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
     return f'<div class="chart"><table><tr>{first}</tr>{rest}</table></div>'
 
 
-def _apart(found: Apart, unit: float | None = None) -> tuple[str, str]:
+def _apart(found: EnergyTest, unit: float | None = None) -> tuple[str, str]:
     unit = unit or found.floor or 1.0
     return f"{found.distance / unit:.2f} floors", f"{found.low / unit:.2f} to {found.high / unit:.2f}"
 

@@ -24,7 +24,7 @@ SHARED = "Nodes have to see the run's folder, its files and --out by the same pa
 
 
 @dataclass(eq=False)
-class _Member:
+class Worker:
     """An actor.
 
     Attributes:
@@ -46,14 +46,14 @@ class _Member:
     late: bool = False
 
 
-class Crew:
+class ActorPool:
     """Actors of one kind on all nodes of a cluster; see ``Cluster.crew``."""
 
     def __init__(self, cluster: "Cluster", prepare: Callable, arguments: tuple, threads: int):
         self.cluster, self.ray, self.threads = cluster, cluster.ray, threads
         self._preparation = prepare, arguments, threads
         self._remote = self.ray.remote(Actor)
-        self._members: list[_Member] = []
+        self._members: list[Worker] = []
         self._names: dict[str, str] = {}  # of nodes that actors were started on
         self._silent: set[str] = set()  # nodes of which was said that they do not answer
         self._looked, self._longest, self._runs = -LOOK, 0.0, 0
@@ -70,7 +70,7 @@ class Crew:
         todo, finished, deaths = deque(range(len(tasks))), set(), Counter()
         begun = time.monotonic()
 
-        def again(member: _Member) -> None:
+        def again(member: Worker) -> None:
             """Let others do what a member was asked for."""
             task = member.asked
             if isinstance(task, int) and member.run == self._runs and task not in finished and task not in todo:
@@ -122,7 +122,7 @@ class Crew:
             self.ray.kill(member.handle, no_restart=True)
         self._members.clear()
 
-    def _lost(self, most: int) -> list[_Member]:
+    def _lost(self, most: int) -> list[Worker]:
         """Start actors where there are cores for more, so that ``most`` are at work; those that have gone with their
         nodes."""
         if time.monotonic() - self._looked < LOOK:
@@ -156,14 +156,14 @@ class Crew:
 
         there = NodeAffinitySchedulingStrategy(node, soft=False)
         handle = self._remote.options(num_cpus=self.threads, scheduling_strategy=there).remote()
-        member = _Member(handle, node)
+        member = Worker(handle, node)
         self._ask(member, "versions", handle.versions.remote())
         self._members.append(member)
 
-    def _ask(self, member: _Member, what: str | int, answer: Any) -> None:
+    def _ask(self, member: Worker, what: str | int, answer: Any) -> None:
         member.asked, member.answer, member.run, member.since = what, answer, self._runs, time.monotonic()
 
-    def _value(self, member: _Member) -> tuple[Any] | None:
+    def _value(self, member: Worker) -> tuple[Any] | None:
         """What a member has answered; None where it has died, which is then no member any more.
 
         Raises:
@@ -191,7 +191,7 @@ class Crew:
             raise type(value)(f"{where}{value}{shared}") if isinstance(value, ProbsceneError) else value
         return (value,)
 
-    def _check_versions(self, member: _Member, there: dict[str, str]) -> None:
+    def _check_versions(self, member: Worker, there: dict[str, str]) -> None:
         here = versions()
         if other := [name for name in here if here[name] != there.get(name)]:
             raise ProbsceneError(
@@ -208,7 +208,7 @@ class Crew:
                 "(ray start --num-cpus) run fewer actors."
             )
 
-    def _overdue(self) -> list[_Member]:
+    def _overdue(self) -> list[Worker]:
         """Members whose tasks are late, each named once a task."""
         limit, now = max(LATE, SLOWER * self._longest), time.monotonic()
         found = []

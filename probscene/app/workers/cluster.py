@@ -19,7 +19,7 @@ from typing import Any, Self
 from probscene.errors import MachineError, ProbsceneError
 from probscene.threads import cores
 
-from .actor_pool import Crew, first_line
+from .actor_pool import ActorPool, first_line
 
 AUTO = "auto"
 CONNECT = 10.0  # seconds
@@ -77,14 +77,14 @@ class Cluster:
     def __exit__(self, *_: object) -> None:
         self.ray.shutdown()
 
-    def crew(self, prepare: Callable[..., Callable[[Any], Any]], arguments: tuple, threads: int = 1) -> Crew:
+    def crew(self, prepare: Callable[..., Callable[[Any], Any]], arguments: tuple, threads: int = 1) -> ActorPool:
         """Actors that do tasks by ``prepare(*arguments)``.
 
         Args:
             prepare: a module's function, called once an actor.
             threads: of torch in each, and cores that it takes.
         """
-        return Crew(self, prepare, arguments, threads)
+        return ActorPool(self, prepare, arguments, threads)
 
 
 def connected(address: str | None, say: Callable[[str], None]) -> AbstractContextManager[Cluster | None]:

@@ -35,7 +35,7 @@ def record_of(word: u64):
 
 
 @ti.func
-def nearness(word: u64):
+def residual_ratio(word: u64):
     """1/z in a word of the visibility buffer."""
     return ti.bit_cast(ti.cast(word >> 32, u32), f32)
 

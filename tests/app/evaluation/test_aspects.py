@@ -19,8 +19,15 @@ from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation import source_features as looked
 from probscene.app.evaluation.advice import of_structure, remedy
-from probscene.app.evaluation.components import KINDS, Aspect, Aspects, called, doubtful_sites, unread_sites
-from probscene.app.evaluation.diagnose import judge
+from probscene.app.evaluation.components import (
+    KINDS,
+    VerdictComponent,
+    VerdictComponents,
+    called,
+    doubtful_sites,
+    unread_sites,
+)
+from probscene.app.evaluation.diagnose import diagnose
 from probscene.app.fitting.overrides import override
 from probscene.app.fitting.preset import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, TILTING
 from probscene.app.fitting.presets import preset
@@ -31,7 +38,7 @@ from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.features import pretrained
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.statistics.residual import Word, worst
+from probscene.inference.statistics.residual import Grade, worst
 from probscene.inference.statistics.verdict import Verdict
 from probscene.model import SceneModel, scene_model
 from probscene.structure import StructurePrior, counts, weights
@@ -103,8 +110,8 @@ def words(found) -> dict[str, str | None]:
 
 
 def test_a_sample_of_the_target_is_good_in_every_part(fitted):
-    found = judge(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
-    assert set(words(found).values()) == {Word.GOOD} and found.aspects.verdict == "good"
+    found = diagnose(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
+    assert set(words(found).values()) == {Grade.GOOD} and found.aspects.verdict == "good"
     record = json.loads(json.dumps(found.record(), allow_nan=False))
     assert record["verdict"] == record["overall"] == "good" and list(record["parts"]) == list(KINDS)
     for name in ("layout", "looks"):
@@ -117,11 +124,11 @@ def test_a_sample_of_the_target_is_good_in_every_part(fitted):
 
 @pytest.mark.parametrize("learnt", [None, dots(24.0)])
 def test_layout_and_looks_of_the_prior_are_not_good_however_good_the_structure(fitted, learnt):
-    found = judge(guided(fitted, learnt=learnt), fitted.images, quiet, 300)
+    found = diagnose(guided(fitted, learnt=learnt), fitted.images, quiet, 300)
     found_words = words(found)
-    assert found_words.pop("looks") in (Word.NO_BETTER, None)  # dots are small, and images few
-    assert found_words.pop("structure") in (Word.GOOD, Word.BETTER)  # dots that lie in a line are counted otherwise
-    assert found_words == {"layout": Word.NO_BETTER}
+    assert found_words.pop("looks") in (Grade.NO_BETTER, None)  # dots are small, and images few
+    assert found_words.pop("structure") in (Grade.GOOD, Grade.BETTER)  # dots that lie in a line are counted otherwise
+    assert found_words == {"layout": Grade.NO_BETTER}
     record = found.record()
     assert record["overall"] == "no better than the prior" and record["verdict"] != "good"
     assert "--learn structure,parameters" in record["parts"]["layout"]["remedy"]
@@ -129,26 +136,26 @@ def test_layout_and_looks_of_the_prior_are_not_good_however_good_the_structure(f
 
 
 def test_halfway_is_better_than_the_prior(fitted):
-    found = judge(guided(fitted, learnt=dots(11.0)), fitted.images, quiet, 300)
-    assert words(found)["layout"] is Word.BETTER and found.aspects.overall is not Word.GOOD
+    found = diagnose(guided(fitted, learnt=dots(11.0)), fitted.images, quiet, 300)
+    assert words(found)["layout"] is Grade.BETTER and found.aspects.overall is not Grade.GOOD
 
 
 def test_a_class_whose_layout_is_the_priors_is_named(fitted):
-    found = judge(guided(fitted, learnt=dots(0.0, 24.0)), fitted.images, quiet, 300)
+    found = diagnose(guided(fitted, learnt=dots(0.0, 24.0)), fitted.images, quiet, 300)
     layout = {name: each["layout"] for name, each in found.aspects.classes.items()}
-    assert layout == {"red": Word.GOOD, "blue": Word.NO_BETTER} and words(found)["layout"] is not Word.GOOD
+    assert layout == {"red": Grade.GOOD, "blue": Grade.NO_BETTER} and words(found)["layout"] is not Grade.GOOD
     assert "Layout by class: good for red; no better than the prior for blue." in printed(found)
 
 
 def test_what_looks_unlike_the_target_is_no_better_than_the_prior(fitted):
-    found = judge(guided(fitted, learnt=dots(0.0, bright=0.3)), fitted.images, quiet, 300)
-    assert words(found)["looks"] is not Word.GOOD and "scene.photo(...)" in found.aspects.parts["looks"].remedy
+    found = diagnose(guided(fitted, learnt=dots(0.0, bright=0.3)), fitted.images, quiet, 300)
+    assert words(found)["looks"] is not Grade.GOOD and "scene.photo(...)" in found.aspects.parts["looks"].remedy
 
 
 def test_features_that_do_not_say_where_objects_are(fitted, monkeypatch):
     monkeypatch.delattr(CountNet, "cells")
-    found = judge(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
-    assert words(found) == {"structure": Word.GOOD, "layout": None, "looks": Word.GOOD}
+    found = diagnose(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
+    assert words(found) == {"structure": Grade.GOOD, "layout": None, "looks": Grade.GOOD}
     assert "do not say where objects are" in printed(found) and found.aspects.verdict == "not judged"
     assert found.record()["overall"] == "not judged"
 
@@ -161,7 +168,7 @@ def test_sites_that_could_not_be_read_are_named(fitted):
     record = {"kept": "learnt", "sites": [site | {"name": "dot.off"}, unread | {"name": "dot.x"}]}
     (run.path / "parameters.json").write_text(json.dumps(record))
     try:
-        found = judge(run, fitted.images, quiet, 300)
+        found = diagnose(run, fitted.images, quiet, 300)
     finally:
         (run.path / "parameters.json").unlink()
     assert "Sites that keep the prior: dot.x, as it cannot be read in renders." in printed(found)
@@ -177,7 +184,7 @@ def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, l
     chosen = override(preset("quick"), [f"parameter_method={method}"])
     run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]}, preset=chosen)
     figures = SimpleNamespace(left=None, high=None)
-    said = remedy(run, "looks", Word.NO_BETTER, figures, "More photographs would tell.")
+    said = remedy(run, "looks", Grade.NO_BETTER, figures, "More photographs would tell.")
     named = re.findall(r"--set (\w+)\.(\w+)=(\d+)", said)
     assert said.count("--set") == len(named) and learnt <= bool(named)
     assert all(int(value) == 2 * getattr(getattr(chosen, part), field) for part, field, value in named)
@@ -200,23 +207,27 @@ def printed(found) -> str:
     return out.getvalue()
 
 
-def aspects_of(*found) -> Aspects:
+def aspects_of(*found) -> VerdictComponents:
     parts = zip(KINDS, found, strict=True)
-    return Aspects({k: Aspect(w, f"{k}.", verdict="still apart" if w and k == "structure" and w != "good" else str(w))
-                    for k, w in parts}, {}, {})  # fmt: skip
+
+    def component(kind, word):
+        verdict = "still apart" if word and kind == "structure" and word != "good" else str(word)
+        return VerdictComponent(word, f"{kind}.", verdict=verdict)
+
+    return VerdictComponents({kind: component(kind, word) for kind, word in parts}, {}, {})
 
 
-@given(st.sampled_from(Word), st.sampled_from([*Word, None]), st.sampled_from([*Word, None]), st.booleans())
+@given(st.sampled_from(Grade), st.sampled_from([*Grade, None]), st.sampled_from([*Grade, None]), st.booleans())
 def test_the_whole_is_never_better_than_its_worst_part(structure, layout, looks, doubt):
     found = structure, layout, looks
     whole = replace(aspects_of(*found), doubtful=("dot.x",) if doubt else ())
-    good = not doubt and set(found) == {Word.GOOD}
-    assert good is (whole.verdict == "good") is (whole.overall is Word.GOOD) is (whole.head.word is Word.GOOD)
-    if not doubt or set(found) != {Word.GOOD}:
+    good = not doubt and set(found) == {Grade.GOOD}
+    assert good is (whole.verdict == "good") is (whole.overall is Grade.GOOD) is (whole.head.word is Grade.GOOD)
+    if not doubt or set(found) != {Grade.GOOD}:
         assert whole.overall is worst(found)
     elif doubt:
         assert whole.verdict == "not judged" and "dot.x kept the prior" in whole.head.because
-    if structure is Word.GOOD:
+    if structure is Grade.GOOD:
         assert (whole.verdict == "not judged") is (whole.overall is None)
     assert json.loads(json.dumps(whole.record()))["sites_in_doubt"] == list(whole.doubtful)
 
@@ -253,11 +264,11 @@ def test_sites_that_were_to_be_learnt_by_features_that_read_none_are_in_doubt(le
     assert set(doubtful_sites(run)) == (set() if learn == STRUCTURE else {"dot.x", "dot.off"})
 
 
-@given(st.sampled_from([*Word, None]), st.sampled_from(Verdict))
+@given(st.sampled_from([*Grade, None]), st.sampled_from(Verdict))
 def test_structure_is_good_only_by_its_verdict(word, verdict):
-    assert (called(word, verdict) is Word.GOOD) is (verdict is Verdict.GOOD)
+    assert (called(word, verdict) is Grade.GOOD) is (verdict is Verdict.GOOD)
     if verdict in (Verdict.NOT_FITTED, Verdict.ANOTHER_DOMAIN):
-        assert called(word, verdict) is Word.NO_BETTER
+        assert called(word, verdict) is Grade.NO_BETTER
 
 
 def test_each_image_is_the_one_that_generate_writes(fitted, tmp_path):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation import diagnose as verdict
-from probscene.app.evaluation.diagnose import judge
+from probscene.app.evaluation.diagnose import diagnose
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.label_agreement import DISAGREE, agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
@@ -24,7 +24,7 @@ from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features import pretrained
-from probscene.inference.statistics.residual import Word, worst
+from probscene.inference.statistics.residual import Grade, worst
 from probscene.inference.statistics.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
 
@@ -107,7 +107,7 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
     policy, folder, expected = CASES[case]
     target = getattr(drawn, folder)
     told = []
-    found = judge(guided(seeing, policy), target, lambda *said: told.append(said), SCENES)
+    found = diagnose(guided(seeing, policy), target, lambda *said: told.append(said), SCENES)
     assert found.trust.verdict == expected, found.trust.because
     assert told[-1][0] == "judging" and told[-1][1] == told[-1][2]
     assert len(found.real_unmatched) == len(found.generated_unmatched) == verdict.SHOWN
@@ -124,7 +124,7 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
 
 def test_the_same_run_has_the_same_verdict(seeing, drawn):
     run = RunFolder.at(seeing)
-    one, other = (judge(run, drawn.target, quiet, 100) for _ in range(2))
+    one, other = (diagnose(run, drawn.target, quiet, 100) for _ in range(2))
     assert one.record() == other.record()
     assert all(np.array_equal(a, b) for a, b in zip(one.generated_unmatched, other.generated_unmatched, strict=True))
 
@@ -137,7 +137,7 @@ def test_labels_say_whether_the_verdict_was_right(some, close, seeing, drawn, tm
     labels = read_labels(tmp_path / "c.csv", model, drawn.target, some)
     assert len(labels.structures) == (60 if some else IMAGES)
     run = guided(seeing, lambda m: m.target(0).prior if close else m.prior)
-    found = judge(run, drawn.target, quiet, SCENES, evaluate(run, drawn.target, labels, quiet, 2000))
+    found = diagnose(run, drawn.target, quiet, SCENES, evaluate(run, drawn.target, labels, quiet, 2000))
     assert found.agreement.close == close and found.agreement.agrees(found.trust.verdict)
     record = json.loads(json.dumps(found.record(), allow_nan=False))["labels"]
     assert record["agree"] and record["because"].startswith("The labels agree")
@@ -158,7 +158,7 @@ def test_labels_disagree_where_the_network_counts_wrongly():
     assert wrong.worst != "number of objects"  # that is always six
 
 
-@given(st.sampled_from(Word), st.sampled_from(Word), st.sampled_from(Word), st.booleans())
+@given(st.sampled_from(Grade), st.sampled_from(Grade), st.sampled_from(Grade), st.booleans())
 def test_what_the_labels_disagree_with_is_nowhere_good(structure, layout, counts, close):
     """And what they do not disagree with stays as it is."""
     rng = np.random.default_rng(0)
@@ -176,8 +176,8 @@ def test_what_the_labels_disagree_with_is_nowhere_good(structure, layout, counts
     if not close:
         assert found.wrong == ("number of objects", "a")
         words = said["overall"], said["verdict"], said["parts"]["structure"]["word"], said["classes"]["a"]["counts"]
-        assert "good" not in words and (said["verdict"] == DISAGREE) is (structure is Word.GOOD)
-        assert said["overall"] == str(worst([overall, Word.BETTER]))
+        assert "good" not in words and (said["verdict"] == DISAGREE) is (structure is Grade.GOOD)
+        assert said["overall"] == str(worst([overall, Grade.BETTER]))
 
 
 def test_labels_of_one_distribution_rarely_disagree():
@@ -234,13 +234,13 @@ def test_too_few_images_have_no_verdict_and_are_still_compared(call, seeing, dra
 def test_images_that_are_all_the_same_have_no_verdict(seeing, drawn, tmp_path):
     for i in range(40):
         (tmp_path / f"{i}.png").write_bytes(drawn.target.paths[0].read_bytes())
-    found = judge(RunFolder.at(seeing), ImageFolder(tmp_path, (64, 64), 3), quiet, 64)
+    found = diagnose(RunFolder.at(seeing), ImageFolder(tmp_path, (64, 64), 3), quiet, 64)
     assert found.trust is None and "identical" in found.absent
 
 
 def test_wrong_numbers_and_no_labels_at_all(call, seeing, drawn, tmp_path):
     with pytest.raises(ProbsceneError, match="at least 40 scenes to judge by, got 39"):
-        judge(RunFolder.at(seeing), drawn.target, quiet, 39)
+        diagnose(RunFolder.at(seeing), drawn.target, quiet, 39)
     (tmp_path / "c.csv").write_text("image,red,blue\n")
     with pytest.raises(DataError, match="expected labels of images .* got none"):
         read_labels(tmp_path / "c.csv", load_model(RunFolder.at(seeing).record["model"]), drawn.target, some=True)

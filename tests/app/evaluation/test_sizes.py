@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.components import KINDS, Aspect, Aspects
+from probscene.app.evaluation.components import KINDS, VerdictComponent, VerdictComponents
 from probscene.app.evaluation.sizes import SCENES, Boxed, _medians, compared, given_boxes, sizes, with_sizes
 from probscene.dataset import ImageFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
-from probscene.inference.statistics.residual import RESAMPLES, Word
+from probscene.inference.statistics.residual import RESAMPLES, Grade
 from probscene.model import SceneModel, scene_model
 from probscene.structure import StructurePrior, counts, weights
 
@@ -34,13 +34,13 @@ def side(number: int, scale: float = 1.0, seed: int = 0):
 @pytest.mark.parametrize(
     ("number", "prior", "learnt", "word", "worse"),
     [
-        (600, 1.5, 1.0, Word.GOOD, False),
-        (600, 1.0, 1.0, Word.GOOD, False),  # sizes that are right are right, whoever made them so
-        (600, 1.0, 1.2, Word.NO_BETTER, True),
-        (600, 0.96, 1.15, Word.NO_BETTER, True),
-        (600, 1.2, 1.2, Word.NO_BETTER, False),
-        (600, 1.5, 1.2, Word.BETTER, False),
-        (600, 0.6, 1.2, Word.BETTER, False),
+        (600, 1.5, 1.0, Grade.GOOD, False),
+        (600, 1.0, 1.0, Grade.GOOD, False),  # sizes that are right are right, whoever made them so
+        (600, 1.0, 1.2, Grade.NO_BETTER, True),
+        (600, 0.96, 1.15, Grade.NO_BETTER, True),
+        (600, 1.2, 1.2, Grade.NO_BETTER, False),
+        (600, 1.5, 1.2, Grade.BETTER, False),
+        (600, 0.6, 1.2, Grade.BETTER, False),
         (12, 1.05, 1.1, None, False),
     ],
 )
@@ -61,15 +61,15 @@ def test_medians_are_those_of_the_boxes_and_a_resample_has_whole_images(rows):
         assert (found == found[0]).all()
 
 
-@given(st.sampled_from([*Word, None]), st.booleans())
+@given(st.sampled_from([*Grade, None]), st.booleans())
 def test_looks_are_no_better_than_the_priors_where_sizes_are_worse(looks, worse):
     size = compared(side(600), side(600), side(600, 1.3 if worse else 1.0))
-    words = {"structure": Word.GOOD, "layout": Word.GOOD, "looks": looks}
-    before = Aspects({k: Aspect(words[k], f"{k}.", verdict=str(words[k])) for k in KINDS}, {}, {})
+    words = {"structure": Grade.GOOD, "layout": Grade.GOOD, "looks": looks}
+    before = VerdictComponents({k: VerdictComponent(words[k], f"{k}.", verdict=str(words[k])) for k in KINDS}, {}, {})
     found = with_sizes(before, {"red": size})
-    assert with_sizes(before, {}) is before and found.parts["sizes"].word is (Word.NO_BETTER if worse else Word.GOOD)
-    assert found.parts["looks"].word is (Word.NO_BETTER if worse and looks is not None else looks)
-    assert found.overall is Word.NO_BETTER or not worse
+    assert with_sizes(before, {}) is before and found.parts["sizes"].word is (Grade.NO_BETTER if worse else Grade.GOOD)
+    assert found.parts["looks"].word is (Grade.NO_BETTER if worse and looks is not None else looks)
+    assert found.overall is Grade.NO_BETTER or not worse
     assert "infer={'learn': False}" in found.parts["sizes"].remedy or not worse
 
 
@@ -98,8 +98,8 @@ def test_boxes_of_labels_are_held_beside_those_of_scenes(tmp_path):
     run = SimpleNamespace(model=model, guide=guide, record={"labels": labels}, visible_shares=dict)
     boxes, told = given_boxes(run, target), []
     found = sizes(run, boxes, told.append)
-    assert found["red"].word is Word.NO_BETTER and found["red"].worse and sum(told) == 2 * SCENES
-    assert found["blue"].word is Word.GOOD and found["blue"].given == found["blue"].prior == found["blue"].learnt
+    assert found["red"].word is Grade.NO_BETTER and found["red"].worse and sum(told) == 2 * SCENES
+    assert found["blue"].word is Grade.GOOD and found["blue"].given == found["blue"].prior == found["blue"].learnt
     assert found["red"].boxes == sum(int((each[:, 0] == 0).sum()) for each in boxes.boxes)
     assert given_boxes(SimpleNamespace(model=model, record={}), target) is None
     labels["path"] = str(tmp_path / "gone.json")

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import Labels
 from probscene.app.evaluation.list_advice import called, more_room
-from probscene.app.evaluation.saturated_lists import piled, read_lengths, sentences
+from probscene.app.evaluation.saturated_lists import read_lengths, saturated_lists, sentences
 from probscene.app.evaluation.sources import Source
 from probscene.app.evaluation.structure_counts import StructureCounts
-from probscene.app.evaluation.unreachable_counts import FEWER, MORE, TOGETHER, inexpressible
+from probscene.app.evaluation.unreachable_counts import FEWER, MORE, TOGETHER, unreachable_counts
 from probscene.app.fitting.run import RunFolder
 from probscene.dataset import ImageFolder
 from probscene.enumeration import enumerate_derivations
@@ -47,7 +47,7 @@ def learnt(**lists):
 
 def test_a_list_at_its_end_is_named_with_the_length_that_the_network_sees():
     seen = Source.of(np.array([[2, 1, n] for n in (2, 2, 3, 4, 6, 9)]))
-    (found,) = piled(blood(), learnt(Platelets=counts(0, 1, 9)), seen)
+    (found,) = saturated_lists(blood(), learnt(Platelets=counts(0, 1, 9)), seen)
     assert (found.name, found.longest, found.past) == ("Platelets", 2, False)
     assert found.learnt == pytest.approx(0.9, abs=0.03) and found.declared == pytest.approx(1 / 3)
     assert found.seen == pytest.approx(4 / 6) and found.length == 10
@@ -57,30 +57,32 @@ def test_a_list_at_its_end_is_named_with_the_length_that_the_network_sees():
 
 
 def test_without_counts_of_it_a_first_try_is_proposed():
-    (found,) = piled(blood(), learnt(Platelets=counts(0, 1, 9)), None)
+    (found,) = saturated_lists(blood(), learnt(Platelets=counts(0, 1, 9)), None)
     assert found.seen is None and found.length == 4 and "as a first try" in str(found)
 
 
 def test_an_end_that_is_the_targets_own_is_not_named():
     seen = Source.of(np.array([[2, 1, 2]] * 30))
-    assert piled(blood(), learnt(Platelets=counts(0, 1, 9)), seen) == ()
-    assert piled(blood(), PRIOR, None) == ()  # nothing was learnt
+    assert saturated_lists(blood(), learnt(Platelets=counts(0, 1, 9)), seen) == ()
+    assert saturated_lists(blood(), PRIOR, None) == ()  # nothing was learnt
     longer = Source.of(np.array([[2, 1, 7]] * 10 + [[2, 1, 1]] * 20))
-    (found,) = piled(blood(), PRIOR, longer)  # nor could it be
+    (found,) = saturated_lists(blood(), PRIOR, longer)  # nor could it be
     assert found.name == "Platelets" and found.length == 8
 
 
 def test_a_prior_whose_lists_are_mostly_at_their_end_is_no_finding():
     prior = StructurePrior(BLOOD, Platelets=counts(1, 9), Reds=counts(1, 1), Whites=counts(1, 1))
     assert (
-        piled(blood(prior), StructurePrior(BLOOD, Platelets=counts(0, 1), Reds=counts(1, 1), Whites=counts(1, 1)), None)
+        saturated_lists(
+            blood(prior), StructurePrior(BLOOD, Platelets=counts(0, 1), Reds=counts(1, 1), Whites=counts(1, 1)), None
+        )
         == ()
     )
 
 
 def test_lists_beyond_the_prior_within_pretraining_are_named():
     more = StructurePrior(BLOOD, Reds=counts(0, 0, 1, 1), Whites=counts(1, 1), Platelets=counts(3, 3, 3, *[0.25] * 4))
-    (found,) = piled(blood(pretraining=more), learnt(Platelets=counts(0, 0, 1, 1, 1)), None)
+    (found,) = saturated_lists(blood(pretraining=more), learnt(Platelets=counts(0, 0, 1, 1, 1)), None)
     assert found.past and (found.longest, found.length) == (2, 4)
     assert "longer than 2, the prior's longest" in str(found)
     assert sentences([found]) == [f"Note: {found}"]
@@ -91,7 +93,7 @@ def test_lists_beyond_the_prior_within_pretraining_are_named():
 
 def test_a_list_without_an_end_and_a_policy_that_is_no_table_are_left_alone():
     prior = StructurePrior(BLOOD, Reds=weights(3, 1), Whites=weights(1, 3), Platelets=weights(1, 1))
-    assert piled(blood(prior), prior, None) == ()
+    assert saturated_lists(blood(prior), prior, None) == ()
 
 
 NESTED = Grammar(
@@ -110,7 +112,7 @@ def test_lists_below_a_group_are_read_from_its_counts_by_rank():
     assert read_lengths(model, first, read).tolist() == [3, 3] and read_lengths(model, rest, read).tolist() == [3]
     assert read_lengths(blood(RANKED), first, read) is None
     guide = StructurePrior(NESTED, Plates=counts(1, 1, 1), Mugs=ranked(counts(0, 1), counts(1, 1, 1, 1)))
-    (found,) = piled(model, guide, read)
+    (found,) = saturated_lists(model, guide, read)
     assert (found.rank, found.longest, found.length) == (0, 1, 4)
     assert "Mugs=ranked(...) with counts(...) up to 4 at rank 1" in str(found)
 
@@ -118,7 +120,7 @@ def test_lists_below_a_group_are_read_from_its_counts_by_rank():
 def test_images_beyond_the_walls_are_named_with_what_would_allow_them():
     numbers = np.array([[2, 1, 0], [3, 2, 2], [3, 0, 5], [2, 1, 9], [1, 1, 1], [2, 3, 0]])
     names = [f"{i}.png" for i in range(6)]
-    found = {(x.what, x.side): x for x in inexpressible(blood(), Source.of(numbers), CLASSES, True, names)}
+    found = {(x.what, x.side): x for x in unreachable_counts(blood(), Source.of(numbers), CLASSES, True, names)}
     assert {key: (x.limit, x.rows) for key, x in found.items()} == {
         ("red", FEWER): (2, (4,)), ("wbc", MORE): (2, (5,)), ("wbc", FEWER): (1, (2,)), ("platelet", MORE): (2, (2, 3)),
     }  # fmt: skip
@@ -134,15 +136,15 @@ def test_images_beyond_the_walls_are_named_with_what_would_allow_them():
 
 def test_a_scene_may_have_more_than_can_be_seen():
     numbers = Source.of(np.array([[0, 0, 0], [9, 1, 1]]))
-    (found,) = inexpressible(blood(), numbers, CLASSES, True, visible=True)
+    (found,) = unreachable_counts(blood(), numbers, CLASSES, True, visible=True)
     assert (found.what, found.side, found.rows) == ("red", MORE, (1,))
 
 
 def test_few_images_by_a_networks_counts_are_passed_over():
     numbers = np.array([[2, 1, 1]] * 200)
     numbers[0] = 2, 1, 7
-    assert inexpressible(blood(), Source.of(numbers), CLASSES, False) == ()
-    assert len(inexpressible(blood(), Source.of(numbers), CLASSES, True)) == 1
+    assert unreachable_counts(blood(), Source.of(numbers), CLASSES, False) == ()
+    assert len(unreachable_counts(blood(), Source.of(numbers), CLASSES, True)) == 1
 
 
 def test_t_max_weights_and_the_grammar_are_named_where_they_are_the_wall():
@@ -152,7 +154,7 @@ def test_t_max_weights_and_the_grammar_are_named_where_they_are_the_wall():
     model = blood(prior, max_steps=6)
 
     def remedy(*numbers, **more):
-        found = inexpressible(model, Source.of(np.array([numbers])), CLASSES, True, **more)
+        found = unreachable_counts(model, Source.of(np.array([numbers])), CLASSES, True, **more)
         return [(x.what, x.side, x.remedy) for x in found]
 
     assert remedy(7, 0, 0)[0] == ("red", MORE, "max_steps=10")
@@ -166,7 +168,7 @@ def test_numbers_that_cannot_go_together():
     grammar = Grammar("Scene -> Reds | wbc Platelets\nReds -> red Reds | ε\nPlatelets -> platelet Platelets | ε")
     model = blood(StructurePrior(grammar, Reds=counts(1, 1, 1), Platelets=counts(1, 1)))
     numbers = Source.of(np.array([[2, 0, 0], [0, 1, 1], [1, 1, 0], [0, 0, 1]]))
-    (found,) = inexpressible(model, numbers, CLASSES, True)
+    (found,) = unreachable_counts(model, numbers, CLASSES, True)
     assert (found.side, found.rows) == (TOGETHER, (2, 3)) and "0 red, 0 wbc, 1 platelet" in found.what
     assert "independently" in found.remedy
 
@@ -181,7 +183,7 @@ def test_who_is_out_of_reach_is_who_no_derivation_counts(most, data):
     every = enumerate_derivations(BLOOD, 16)
     known = {tuple(row) for row in every.counts(3)[prior.log_prob(every) > -torch.inf].tolist()}
     numbers = np.array(data.draw(st.lists(st.tuples(*[st.integers(0, 8)] * 3), min_size=1, max_size=12)))
-    rows = {row for found in inexpressible(model, Source.of(numbers), CLASSES, True) for row in found.rows}
+    rows = {row for found in unreachable_counts(model, Source.of(numbers), CLASSES, True) for row in found.rows}
     assert rows == {i for i, row in enumerate(numbers.tolist()) if tuple(row) not in known}
 
 
@@ -201,13 +203,13 @@ def test_an_evaluation_says_both(fitted, target, discs):
     images = ImageFolder(target.images, (64, 64), 3)
     found = evaluate(run, images, truth, lambda *_: None, num=50)
     over = int((target.counts.sum(1) > 1).sum())
-    rows = {row for each in found.inexpressible for row in each.rows}
-    assert len(rows) == over and found.inexpressible[0].names[0].endswith(".png")
+    rows = {row for each in found.unreachable_counts for row in each.rows}
+    assert len(rows) == over and found.unreachable_counts[0].names[0].endswith(".png")
     record = json.loads(json.dumps(found.record()))["walls"]
-    assert [x["sentence"] for x in record["images"]] == [str(x) for x in found.inexpressible]
+    assert [x["sentence"] for x in record["images"]] == [str(x) for x in found.unreachable_counts]
     assert f"{over} images have numbers of objects" in found.walls and len(found.warnings) == len(
-        found.inexpressible
-    ) + len(found.piled)
+        found.unreachable_counts
+    ) + len(found.saturated_lists)
 
 
 LIT = '''

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from probscene.app.fitting import site_selection as judged
+from probscene.app.fitting import site_selection as select_sites
 
 
 def rows(mean, number):
@@ -33,8 +33,8 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
             }
 
     images = dict.fromkeys(("learnt", "prior", "target"), torch.zeros(0))
-    assert judged.passed(Learning(), Learning().site_rows(images), careful=True) == {"y", "z", "w"}
-    assert judged.passed(Learning(), Learning().site_rows(images), careful=False) == {"w"}
+    assert select_sites.passed(Learning(), Learning().site_rows(images), careful=True) == {"y", "z", "w"}
+    assert select_sites.passed(Learning(), Learning().site_rows(images), careful=False) == {"w"}
 
 
 class Renders:
@@ -69,25 +69,27 @@ class Renders:
 def test_unclear_sites_are_learnt_where_renders_without_them_are_farther():
     """``u`` and ``v`` are as the target has them; ``w`` is not, nor ``lost``, which would be nearer."""
     learning = Renders({"u": 1.0, "v": 1.0, "w": -1.0, "lost": 1.0}, {})
-    kept, because = judged.of_unclear(learning, torch.zeros(400), frozenset("k"))
+    kept, because = select_sites.of_unclear(learning, torch.zeros(400), frozenset("k"))
     assert kept == {"w", "lost"}
     assert because == {"lost": "in renders that look like the target 10% of its variance can be read"}
     assert all("k" in each for each in learning.asked) and len(learning.asked) == 5
     nothing = Renders({"w": -1.0, "lost": 1.0}, {})
-    assert judged.of_unclear(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"} and len(nothing.asked) == 2
+    assert (
+        select_sites.of_unclear(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"} and len(nothing.asked) == 2
+    )
 
 
 def test_an_unclear_site_of_scenes_that_hardly_moves_keeps_its_prior():
     """As ``u`` does, and as ``v`` does not; ``w`` moves as little, but is of objects."""
     learning = Renders({"u": 0.9, "v": 1.1, "w": 0.9}, {}, of_scenes=("v", "u"))
-    kept, because = judged.of_unclear(learning, torch.zeros(400), frozenset())
+    kept, because = select_sites.of_unclear(learning, torch.zeros(400), frozenset())
     assert kept == {"u"} and because["u"] == "it would be 0.09 of u from its prior, no farther than it may be misread"
 
 
 def test_what_is_learnt_wrongly_is_not_in_the_way_of_the_others():
     """What is read of ``u`` is moved by ``w``, which is learnt wrongly: with it ``u`` comes hardly nearer."""
     learning = Renders({"u": 1.0, "w": -1.0}, {"w": 0.4})
-    assert judged.of_unclear(learning, torch.zeros(400), frozenset())[0] == {"w"}
+    assert select_sites.of_unclear(learning, torch.zeros(400), frozenset())[0] == {"w"}
     assert learning.asked[-1] == {"w"}
 
 
@@ -104,7 +106,7 @@ def test_of_many_sites_none_is_learnt_by_chance():
             return nothing | {"x": {name: rows(float(name == "prior"), 120) for name in images}}
 
     images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert judged.passed(Learning(), Learning().site_rows(images), careful=True) == {f"n{i}" for i in range(40)}
+    assert select_sites.passed(Learning(), Learning().site_rows(images), careful=True) == {f"n{i}" for i in range(40)}
 
 
 @pytest.mark.parametrize(
@@ -149,13 +151,13 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
         drawn.append((model, number))
         return torch.randn(number, 4) + {"prior": 1.0, "learnt": learnt}[model]
 
-    monkeypatch.setattr(judged, "_renders", renders)
-    monkeypatch.setattr(judged, "_embed", lambda: lambda images: images.double().numpy())
+    monkeypatch.setattr(select_sites, "_renders", renders)
+    monkeypatch.setattr(select_sites, "_embed", lambda: lambda images: images.double().numpy())
     preset = SimpleNamespace(parameters=SimpleNamespace(sure=sure))
     run = SimpleNamespace(record={"seed": 0}, preset=preset, model="prior")
     torch.manual_seed(0)
     target = torch.randn(150, 4)
-    settle = judged.settling(run, None, lambda many: target[: 150 if many else 140])
+    settle = select_sites.settling(run, None, lambda many: target[: 150 if many else 140])
     learning, found = Learning(), []
     first = learning.guide.net.weight.data
     for last in (False, False, True):
@@ -179,9 +181,9 @@ def test_what_a_guide_looks_like_is_drawn_once_until_its_weights_change(monkeypa
         drawn.append(model)
         return torch.rand(number, 2)
 
-    monkeypatch.setattr(judged, "_renders", renders)
-    monkeypatch.setattr(judged, "_embed", lambda: lambda images: images.double().numpy())
-    held = judged.held_out(SimpleNamespace(record={"seed": 0}, model=None), None, torch.zeros(5, 2))
+    monkeypatch.setattr(select_sites, "_renders", renders)
+    monkeypatch.setattr(select_sites, "_embed", lambda: lambda images: images.double().numpy())
+    held = select_sites.held_out(SimpleNamespace(record={"seed": 0}, model=None), None, torch.zeros(5, 2))
     guide = SimpleNamespace(net=torch.nn.Linear(2, 2), passed=frozenset())
     guide.suited = lambda model: (float(guide.net.weight.data.sum()), guide.passed)
     sets = [frozenset(), frozenset("a"), frozenset(), frozenset("a")]

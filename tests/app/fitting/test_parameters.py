@@ -13,14 +13,14 @@ from pyro.util import get_rng_state, set_rng_state
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.fitting import parameter_stage as parameters
-from probscene.app.fitting import site_selection as judged
+from probscene.app.fitting import site_selection as select_sites
 from probscene.app.fitting import store as storage
 from probscene.app.fitting import structure_stage as structure
 from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.parameters import learning, reader, skill
-from probscene.inference.statistics.bootstrap_test import Farther
+from probscene.inference.statistics.bootstrap_test import BootstrapTest
 from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
 from probscene.structure import StructurePrior, counts
@@ -34,9 +34,9 @@ def anything_is_read(patch):
     """Also what a reader of six steps says; and it is kept."""
     patch.setattr(skill, "READABLE", -1e9)
     patch.setattr(reader, "LEAST_MASS", (1e-3,))
-    patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
-    patch.setattr(judged, "passed", lambda *_: frozenset())
-    patch.setattr(judged, "of_unclear", lambda *_: (frozenset(), {}))
+    patch.setattr(select_sites, "farther", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "passed", lambda *_: frozenset())
+    patch.setattr(select_sites, "of_unclear", lambda *_: (frozenset(), {}))
     for renders in ("TRIED", "ASSEMBLED", "MISSED"):
         patch.setattr(learning, renders, 40)
 
@@ -254,7 +254,7 @@ def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
         return site_rows(learning, images)
 
     monkeypatch.setattr(parameters.ParameterLearning, "site_rows", noted)
-    monkeypatch.setattr(judged, "passed", lambda *_: frozenset())
+    monkeypatch.setattr(select_sites, "passed", lambda *_: frozenset())
     settings = (*discs.settings, *LEARN, "--set", f"parameters.sure={str(sure).lower()}")
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *settings)
     assert done.code == 0, done.err
@@ -266,8 +266,8 @@ def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
 def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
-    monkeypatch.setattr(judged, "farther", lambda *_: Farther(1.0, 1.0, 0.0))
-    monkeypatch.setattr(judged, "passed", lambda *_: frozenset(passed))
+    monkeypatch.setattr(select_sites, "farther", lambda *_: BootstrapTest(1.0, 1.0, 0.0))
+    monkeypatch.setattr(select_sites, "passed", lambda *_: frozenset(passed))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
     assert done.code == 0, done.err
@@ -284,7 +284,7 @@ def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, tar
 
 def test_a_site_that_cannot_be_read_where_the_target_is_keeps_the_prior(call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
-    monkeypatch.setattr(judged, "of_unclear", lambda *_: (frozenset("x"), {"x": "it is dark there"}))
+    monkeypatch.setattr(select_sites, "of_unclear", lambda *_: (frozenset("x"), {"x": "it is dark there"}))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)
     assert done.code == 0, done.err

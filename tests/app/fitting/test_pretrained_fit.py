@@ -8,7 +8,7 @@ import safetensors.torch
 import torch
 from torchvision.models import inception_v3
 
-from probscene.app.evaluation.diagnose import judge
+from probscene.app.evaluation.diagnose import diagnose
 from probscene.app.fitting.presets import QUICK, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import own_net
@@ -82,9 +82,9 @@ def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
     done = call("evaluate", run.path, *words)
     assert done.code == 0, done.err
     found = json.loads((tmp_path / "e.json").read_text())
-    judged = judge(run, ImageFolder(target.images, run.model.canvas, run.model.channels), lambda *_: None, 40).trust
+    trust = diagnose(run, ImageFolder(target.images, run.model.canvas, run.model.channels), lambda *_: None, 40).trust
     structure = found["trust"]["parts"]["structure"]
-    assert judged.pretrained and structure["remedy"] == judged.remedy  # not to take what it has
+    assert trust.pretrained and structure["remedy"] == trust.remedy  # not to take what it has
     assert "estimate" not in found["sources"] and "truth" in found["sources"]  # a direction is no count
     assert call("report", run.path, "--num", 200, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
 
@@ -158,7 +158,7 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(count
     run, said = counting
     assert "Looking at images" in said and "Readings" in said and "epochs" in said
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
-    seen = net.embed_photographs(torch.stack([images.load(i) for i in range(9)]))
+    seen = net.embed_real(torch.stack([images.load(i) for i in range(9)]))
     assert net.names == run.model.classes
     assert torch.allclose(seen, run.read_tensors("real")["features"][:9], atol=1e-3)
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]

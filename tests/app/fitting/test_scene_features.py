@@ -56,12 +56,12 @@ def test_other_structures_and_layouts_do_not_look_unlike_and_photographs_do(name
     target = model.target(0)
     drawn = torch.cat(list(seen.images_of(target, target.prior, seen.ASKED, seed=2)))
     same = ImageArray(drawn.permute(0, 2, 3, 1).numpy(), model.canvas, model.channels)
-    assert seen.unlike(model, same) < seen.UNLIKE
+    assert seen.domain_shift(model, same) < seen.DOMAIN_SHIFT_SHARE
     side, rng = 200, np.random.default_rng(0)
     photograph = cv2.imread(get_sample_data("grace_hopper.jpg", asfileobj=False))[..., ::-1]
     corners = rng.integers(0, np.subtract(photograph.shape[:2], side), (12, 2))
     parts = np.stack([photograph[y : y + side, x : x + side] for y, x in corners])
-    assert seen.unlike(model, ImageArray(parts, model.canvas, model.channels)) > seen.UNLIKE
+    assert seen.domain_shift(model, ImageArray(parts, model.canvas, model.channels)) > seen.DOMAIN_SHIFT_SHARE
 
 
 def test_networks_by_their_words(run, tmp_path):

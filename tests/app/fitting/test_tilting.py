@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from probscene.app.fitting import site_selection as judged
+from probscene.app.fitting import site_selection as select_sites
 from probscene.app.fitting import store as storage
 from probscene.app.fitting.preset import Preset
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.tilting import learning
-from probscene.inference.statistics.bootstrap_test import Farther
+from probscene.inference.statistics.bootstrap_test import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"rounds": 3, "first": 50, "scenes": 20, "steps": 4, "images": 20}
@@ -36,7 +36,7 @@ def lit(tmp_path_factory, discs) -> Path:
 
 
 def it_is_kept(patch):
-    patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "farther", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(learning, "CHANCE", 1.1)  # of so few scenes, whatever they say
 
 

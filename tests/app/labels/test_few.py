@@ -15,7 +15,7 @@ from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.labels.annotations import Annotation
 from probscene.app.labels.boxes import on_canvas
 from probscene.app.labels.counts import write_cells
-from probscene.app.labels.partial_labels import LEAST, PartlyLabelled, labels_record, read_few
+from probscene.app.labels.partial_labels import LEAST, PartlyLabelled, labels_record, read_partial_labels
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.decoding import fitted, window
@@ -75,7 +75,7 @@ def test_counts_are_those_of_the_boxes(tmp_path_factory, each):
         (f"image {i}", [(c, 4 * k, 5, 3, 6) for k, c in enumerate(x)]) for i, x in enumerate(each) if x is not None
     ]
     path = coco(tmp_path_factory.mktemp("few") / "few.json", listed[::-1])
-    few = read_few(path, CELLS, pictures(len(each)))
+    few = read_partial_labels(path, CELLS, pictures(len(each)))
     assert few.classes == ("rbc", "platelet")
     assert few.rows.tolist() == [i for i, found in enumerate(each) if found is not None]
     known = [found for found in each if found is not None]
@@ -101,7 +101,7 @@ def test_a_sheet_may_be_filled_in_partly(tmp_path_factory, each, delimiter, with
     rng.shuffle(rows)
     write_cells(path, rows, classes)
     path.write_text(path.read_text().replace(",", delimiter) + delimiter * 3 + "\n")
-    few = read_few(path, CELLS, pictures(len(each)))
+    few = read_partial_labels(path, CELLS, pictures(len(each)))
     left = [c for c in range(3) if c != without]
     assert few.classes == tuple(classes[c] for c in left) and few.boxes is None
     assert few.rows.tolist() == [i for i, found in enumerate(each) if found is not None]
@@ -141,7 +141,7 @@ def test_faults_of_coco(fault, tmp_path):
     else:
         coco(path, **given)
     with pytest.raises(DataError) as error:
-        read_few(path, CELLS, pictures(5))
+        read_partial_labels(path, CELLS, pictures(5))
     assert all(part in str(error.value) for part in [*parts, "few.json"]), error.value
     assert str(error.value).startswith("expected ") and "\n" not in str(error.value)
 
@@ -159,24 +159,24 @@ def test_faults_of_a_sheet(fault, tmp_path):
     path = tmp_path / "few.csv"
     path.write_text("\n".join(["image,rbc,wbc,platelet", first, *(f"image {i},1,1,1" for i in range(1, 5))]))
     with pytest.raises(DataError) as error:
-        read_few(path, CELLS, pictures(5))
+        read_partial_labels(path, CELLS, pictures(5))
     assert all(part in str(error.value) for part in [*parts, "few.csv"]), error.value
 
 
 def test_what_is_of_no_class_is_left_out_with_a_note(tmp_path):
     listed = [(name, [*found, (2, 1, 1, 5, 5)]) for name, found in GOOD]
-    few = read_few(coco(tmp_path / "few.json", listed, ("platelet", "rbc", "dust")), CELLS, pictures(4))
+    few = read_partial_labels(coco(tmp_path / "few.json", listed, ("platelet", "rbc", "dust")), CELLS, pictures(4))
     assert few.classes == ("rbc", "platelet") and few.counts.tolist() == [[1, 1]] * 3
     assert any("no such class: dust" in note for note in few.notes)
     (tmp_path / "few.csv").write_text("image,rbc,dust\n" + "".join(f"image {i},1,2\n" for i in range(3)))
-    few = read_few(tmp_path / "few.csv", CELLS, pictures(4))
+    few = read_partial_labels(tmp_path / "few.csv", CELLS, pictures(4))
     assert few.classes == ("rbc",) and any("dust" in note for note in few.notes)
 
 
 def test_what_sticks_out_is_clipped_and_what_is_cut_away_is_left_out(tmp_path):
     """Of 48 x 64 a canvas of 24 x 24 sees the middle 48 columns."""
     listed = [*GOOD[:2], ("image 2", [(1, -9, -3, 30, 8), (1, 0, 20, 14, 8), (1, 40, 40, 20, 20)])]
-    few = read_few(coco(tmp_path / "few.json", listed), CELLS, pictures(4, canvas=(24, 24)))
+    few = read_partial_labels(coco(tmp_path / "few.json", listed), CELLS, pictures(4, canvas=(24, 24)))
     assert few.boxes[2].tolist() == [[0, 0, 0, 6.5, 2.5], [0, 16, 20, 24, 24]]
     assert "1 objects that lie where images are cut are not counted." in few.notes
 
@@ -187,7 +187,7 @@ def test_a_crowd_has_no_count(tmp_path):
     whole = json.loads(path.read_text())
     whole["annotations"][1]["iscrowd"] = 1
     path.write_text(json.dumps(whole))
-    few = read_few(path, CELLS, pictures(4))
+    few = read_partial_labels(path, CELLS, pictures(4))
     assert few.rows.tolist() == [0, 2, 3] and any("crowd" in note and "image 1" in note for note in few.notes)
     assert len(read_labels(path, CELLS, pictures(4)).structures) == 3  # no --some-labels needed
 
@@ -195,10 +195,10 @@ def test_a_crowd_has_no_count(tmp_path):
 def test_structures_are_no_few_labels_and_one_image_is_too_few(tmp_path):
     (tmp_path / "few.jsonl").write_text("")
     with pytest.raises(DataError, match="whole structures"):
-        read_few(tmp_path / "few.jsonl", CELLS, pictures(4))
+        read_partial_labels(tmp_path / "few.jsonl", CELLS, pictures(4))
     (tmp_path / "few.csv").write_text("image,rbc\nimage 0,1\n")
     with pytest.raises(DataError, match="at least 3 images .* got 1; add images"):
-        read_few(tmp_path / "few.csv", CELLS, pictures(1))
+        read_partial_labels(tmp_path / "few.csv", CELLS, pictures(1))
 
 
 def test_two_files_of_one_name_cannot_be_told_apart(tmp_path):
@@ -206,7 +206,7 @@ def test_two_files_of_one_name_cannot_be_told_apart(tmp_path):
     target = pictures(4)
     target.paths[1] = Path("other/image 0")
     with pytest.raises(DataError, match="2 files"):
-        read_few(tmp_path / "few.csv", CELLS, target)
+        read_partial_labels(tmp_path / "few.csv", CELLS, target)
 
 
 def test_a_generated_dataset_is_read_back(tmp_path, discs):
@@ -215,7 +215,7 @@ def test_a_generated_dataset_is_read_back(tmp_path, discs):
     names, counts = counts_of_dataset(model, tmp_path / "set")
     target = ImageFolder(tmp_path / "set" / "images", model.canvas, model.channels)
     (path,) = (tmp_path / "set").glob("*.json")
-    few = read_few(path, model, target)
+    few = read_partial_labels(path, model, target)
     assert (few.counts.numpy() <= counts).all() and few.counts.sum() > 0.8 * counts.sum()  # discs hide discs
     assert few.classes == model.classes and few.rows.tolist() == list(range(6))
     labelled = PartlyLabelled(target, few).labelled
@@ -240,7 +240,7 @@ def test_boxes_and_counts_of_blood_agree(data_dir):
     """But for a red cell of two images, which is in one file alone."""
     blood = data_dir / "blood"
     target = ImageFolder(blood / "images", (120, 160), 3)
-    boxes, counts = (read_few(blood / name, CELLS, target) for name in ("annotations.json", "counts.csv"))
+    boxes, counts = (read_partial_labels(blood / name, CELLS, target) for name in ("annotations.json", "counts.csv"))
     assert (boxes.counts - counts.counts).abs().sum(0).tolist() == [2, 0, 0]
     assert torch.equal(boxes.rows, counts.rows) and len(counts.rows) == 292
     found = torch.cat(boxes.boxes)

@@ -16,7 +16,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import read_labels
 from probscene.app.labels.boxes import read_boxes
 from probscene.app.labels.coco import around
-from probscene.app.labels.partial_labels import labels_record, read_few
+from probscene.app.labels.partial_labels import labels_record, read_partial_labels
 from probscene.app.loading import load_model
 from probscene.app.trial.sets import read_set
 from probscene.dataset import ImageFolder
@@ -173,7 +173,7 @@ def test_generated_labels_of_yolo_are_read_back(given, tmp_path, discs):
     generate_scenes(model, model.prior, 6, tmp_path / "out", format="yolo")
     generate_scenes(model, model.prior, 6, tmp_path / "coco", format="coco")
     images = ImageFolder(tmp_path / "out" / "images", model.canvas, model.channels)
-    one, other = (read_few(tmp_path / path, model, images) for path in (given, "coco/annotations.json"))
+    one, other = (read_partial_labels(tmp_path / path, model, images) for path in (given, "coco/annotations.json"))
     assert one.counts.tolist() == other.counts.tolist() and one.classes == other.classes == model.classes
     for a, b in zip(one.boxes, other.boxes, strict=True):
         assert np.allclose(a, b, atol=1e-3)
@@ -292,7 +292,7 @@ def test_every_command_reads_cocos_spellings(spelling, tmp_path):
     path.write_text(json.dumps(whole))
     seen = ImageFolder(folder, (HEIGHT, WIDTH), 3)
     counts = [[1, 0], [0, 0], [1, 1]]
-    few, labels, found = read_few(path, CELLS, seen), read_labels(path, CELLS, seen), read_set(tmp_path)
+    few, labels, found = read_partial_labels(path, CELLS, seen), read_labels(path, CELLS, seen), read_set(tmp_path)
     assert few.counts.tolist() == labels.structures.counts.tolist() == counts
     assert [np.bincount(example.classes, minlength=2).tolist() for example in found.examples] == counts
     for one, example in zip(few.boxes, found.examples, strict=True):
@@ -332,7 +332,7 @@ def test_every_command_refuses_a_fault_in_the_same_words(fault, tmp_path):
     path.write_text(json.dumps(whole))
     said = []
     for read in (
-        lambda: read_few(path, CELLS, seen),
+        lambda: read_partial_labels(path, CELLS, seen),
         lambda: read_labels(path, CELLS, seen),
         lambda: read_set(tmp_path),
     ):

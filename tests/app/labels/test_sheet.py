@@ -19,7 +19,7 @@ from PIL import Image
 
 from probscene.app.evaluation.estimate import class_counts
 from probscene.app.labels.counts import read_table
-from probscene.app.labels.partial_labels import read_few
+from probscene.app.labels.partial_labels import read_partial_labels
 from probscene.app.labels.selection import PRESENT, SURE, propose
 from probscene.app.labels.sheet import page, write_sheet
 from probscene.dataset import ImageFolder
@@ -164,9 +164,9 @@ def test_the_spreadsheets_file_is_read_as_it_is_filled_in(folder, tmp_path):
     sheet = write_sheet(tmp_path / "out", target, [0, 1, 3], MODEL.classes, MODEL.name, {"e.png": ["2", "0"]})
     text = sheet.table.read_text()
     with pytest.raises(DataError, match="at least 3 images"):
-        read_few(sheet.table, MODEL, target)
+        read_partial_labels(sheet.table, MODEL, target)
     sheet.table.write_text(text.replace('"a,1.png",,', '"a,1.png",3,1').replace("d.png,,", "d.png,0,7"))
-    few = read_few(sheet.table, MODEL, target)
+    few = read_partial_labels(sheet.table, MODEL, target)
     assert few.rows.tolist() == [0, 3, 4] and few.counts.tolist() == [[3, 1], [0, 7], [2, 0]]
 
 

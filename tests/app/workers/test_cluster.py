@@ -132,7 +132,7 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_pa
 def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_path, monkeypatch):
     words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "num_scenes=150"]
     assert call(*words, "--out", tmp_path / "alone").code == 0
-    parts, run = [], crews.Crew.run
+    parts, run = [], crews.ActorPool.run
 
     def disturbed(crew, tasks, done):
         def each(result):
@@ -146,7 +146,7 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
         return run(crew, tasks, each)
 
     monkeypatch.setattr(crews, "LATE", 2.0)
-    monkeypatch.setattr(crews.Crew, "run", disturbed)
+    monkeypatch.setattr(crews.ActorPool, "run", disturbed)
     result = call(*words, "--out", tmp_path / "out", "--cluster", simulated.address)
     assert result.code == 0, result.err
     assert len(parts) == 4 * 3

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene import load_model
-from probscene.app.fitting.rendered_features import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import enter
 from probscene.inference.features.counting.batches import FEWEST, FULL, CountBatches, CountSchedule, cells
@@ -134,7 +134,7 @@ def test_fits_of_all_seeds_look_at_one_resolution(dots):
 def test_a_schedule_says_whether_a_network_sees_more_than_the_prior_has(dots, beyond):
     more = StructurePrior(dots.grammar, Things=lengths(0, 0, 0, 0, 0, 1))
     choice = CountFeatures(CountSchedule(beyond_prior=beyond))
-    renders = Observer(replace(dots, pretraining=more), threads=1)
+    renders = RenderedFeatures(replace(dots, pretraining=more), threads=1)
     number = (choice.training(choice.build(dots), renders, None, 0).batches.draw(32).label >= 0).sum(1)
     assert (number == 5).all() if beyond else (number <= 4).all()
 

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fitting.rendered_features import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.derivation import Derivation, group_of
 from probscene.derive import derive
 from probscene.drawing import Sprites
@@ -112,7 +112,7 @@ def test_votes_of_objects_say_where_the_middle_is(axis, seed):
 
 def test_a_network_counts_by_group_along_either_axis(shelves):
     """Boxes with discs, side by side: the true counts of nearly every image after a minute."""
-    view = Observer(shelves, threads=1)
+    view = RenderedFeatures(shelves, threads=1)
     torch.manual_seed(0)
     net = CountNet(shelves.classes, 3, shelves.canvas, (8, 16, 24), groups=shelves.groups)
     assert net.names == ("shelf", "disc 1", "disc 2", "disc 3")

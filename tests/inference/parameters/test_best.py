@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from probscene.inference.parameters.checkpoint_selection import Best, HeldOut, useless
+from probscene.inference.parameters.checkpoint_selection import CheckpointSelector, HeldOutSet, uninformative_sites
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.sites import find_sites, quantiles_of
 from probscene.sampling import sample, seed_everything
@@ -35,15 +35,15 @@ def looks(guide):
 
 def held(bright, turn):
     rng = np.random.default_rng(0)
-    return HeldOut(looks, np.stack([rng.uniform(*bright, 150), rng.uniform(*turn, 150)], 1))
+    return HeldOutSet(looks, np.stack([rng.uniform(*bright, 150), rng.uniform(*turn, 150)], 1))
 
 
 def test_a_site_that_brings_scenes_no_nearer_is_named(trays):
     guide = guide_of(trays, (2.0, 2.0))
-    assert useless(guide, held((0.6, 1.0), (0.0, 0.4))) == {"floor.turn"}
-    assert useless(guide, held((0.0, 0.4), (0.6, 1.0))) == {"scene.bright"}
-    assert useless(guide, held((0.6, 1.0), (0.6, 1.0))) == frozenset()
-    assert useless(guide, held((0.0, 0.4), (0.0, 0.4))) == set(NAMES)
+    assert uninformative_sites(guide, held((0.6, 1.0), (0.0, 0.4))) == {"floor.turn"}
+    assert uninformative_sites(guide, held((0.0, 0.4), (0.6, 1.0))) == {"scene.bright"}
+    assert uninformative_sites(guide, held((0.6, 1.0), (0.6, 1.0))) == frozenset()
+    assert uninformative_sites(guide, held((0.0, 0.4), (0.0, 0.4))) == set(NAMES)
     assert not guide.passed
 
 
@@ -59,7 +59,7 @@ def test_a_site_that_is_passed_draws_the_prior_s_numbers(trays):
 
 
 def test_training_that_made_it_surely_worse_is_undone(trays):
-    guide, best = guide_of(trays, (1.0, 1.0)), Best(held((0.6, 1.0), (0.6, 1.0)))
+    guide, best = guide_of(trays, (1.0, 1.0)), CheckpointSelector(held((0.6, 1.0), (0.6, 1.0)))
     best.after(guide)
     move(guide, (2.0, 2.0))
     best.after(guide)  # better
@@ -67,7 +67,7 @@ def test_training_that_made_it_surely_worse_is_undone(trays):
     move(guide, (-2.0, -2.0))
     best.after(guide)  # worse
     assert float(guide.net.scene_out[0].bias[6].detach()) == 2.0
-    resumed = Best(best.held)
+    resumed = CheckpointSelector(best.held)
     resumed.restore(best.state())
     move(guide, (-2.0, -2.0))
     resumed.after(guide)
@@ -82,7 +82,7 @@ def test_sites_that_would_keep_their_prior_do_not_decide_about_others(trays):
     def bias(guide):
         return float(guide.net.scene_out[0].bias[6].detach())
 
-    guide, best = guide_of(trays, first), Best(judges)
+    guide, best = guide_of(trays, first), CheckpointSelector(judges)
     best.after(guide, turn)
     move(guide, second)
     best.after(guide, turn)
@@ -90,12 +90,12 @@ def test_sites_that_would_keep_their_prior_do_not_decide_about_others(trays):
     move(guide, (-3.0, 4.0))
     best.after(guide, turn)
     assert bias(guide) == second[0]
-    resumed = Best(judges)
+    resumed = CheckpointSelector(judges)
     resumed.restore(best.state())
     move(guide, (2.5, -1.0))
     resumed.after(guide, turn)
     assert bias(guide) == 2.5
-    all_sites = Best(judges)
+    all_sites = CheckpointSelector(judges)
     all_sites.after(move(guide, (0.0, 0.0)) or guide)
     move(guide, second)
     all_sites.after(guide)

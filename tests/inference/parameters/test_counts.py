@@ -3,7 +3,7 @@
 import torch
 
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.parameters.backbone import RenderEye
+from probscene.inference.parameters.backbone import RenderBackbone
 from probscene.inference.parameters.reader import Reader
 from probscene.inference.parameters.reader_counts import ReaderCounts, of_counts
 
@@ -13,7 +13,7 @@ CLASSES = ("red", "blue", "green")
 def reader_of(net):
     """One that finds something in noise, however little of it."""
     torch.manual_seed(1)
-    reader = Reader(RenderEye(net), len(CLASSES), 4, 2).eval()
+    reader = Reader(RenderBackbone(net), len(CLASSES), 4, 2).eval()
     torch.nn.init.normal_(reader.what.weight, std=30.0)
     reader.least.fill_(0.3)
     return reader

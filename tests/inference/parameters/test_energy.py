@@ -208,9 +208,9 @@ def test_few_renders_are_farther_from_the_target_than_many_of_the_same_distribut
         few = torch.zeros(1000).double()
         few[rng.choice(1000, 20, replace=False)] = 1 / 20
         each.append(float(rows.distance(few)))
-    farther = (1 / 20 - 1 / 1000) * float(rows.own.sum()) / (1000 * 999)
+    expected = (1 / 20 - 1 / 1000) * float(rows.own.sum()) / (1000 * 999)
     many = float(rows.distance(torch.full((1000,), 1e-3).double()))
-    assert np.mean(each) - many == pytest.approx(farther, abs=4 * np.std(each) / 1000**0.5)
+    assert np.mean(each) - many == pytest.approx(expected, abs=4 * np.std(each) / 1000**0.5)
 
 
 def test_what_is_read_with_little_skill_is_learnt_by_weights():

@@ -7,7 +7,7 @@ import torch
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.features.photographs.heads import PretrainedCountNet
 from probscene.inference.features.presence import PresenceNet
-from probscene.inference.parameters.backbone import WIDTH, Eye, RenderEye, cell_colours
+from probscene.inference.parameters.backbone import WIDTH, Backbone, RenderBackbone, cell_colours
 from probscene.inference.parameters.reader import Reader
 from probscene.inference.parameters.reader_training import ReaderTraining
 
@@ -16,7 +16,7 @@ CLASSES = ("red", "blue")
 
 def eye_of(kind, canvas):
     net = CountNet(CLASSES, 3, canvas, width=(4, 8, 8)) if kind == "renders" else PretrainedCountNet(CLASSES, canvas)
-    eye = Eye.of(net)
+    eye = Backbone.of(net)
     assert eye is not None
     return eye.eval()
 
@@ -48,7 +48,7 @@ def test_what_is_found_does_not_depend_on_the_other_images(kind):
 def test_grey_images_are_seen_by_the_layers_themselves(training):
     torch.manual_seed(0)
     net = CountNet(CLASSES, 1, (96, 128), width=(4, 8, 8))
-    eye = RenderEye(net).train(training)
+    eye = RenderBackbone(net).train(training)
     x = eye.enter(torch.randint(0, 256, (3, 1, 96, 128), dtype=torch.uint8))
     fine = eye.fine(x)
     coarse = torch.nn.functional.interpolate(eye.down(eye.coarse(fine)), scale_factor=2)
@@ -74,9 +74,9 @@ def test_the_reader_is_shown_fewer_renders_that_are_larger(size, images):
         raise LookupError(num)
 
     with pytest.raises(LookupError, match=f"^{images}$"):
-        ReaderTraining(Reader(RenderEye(counts), 2, 1, 1), draw, images=12).loss()
+        ReaderTraining(Reader(RenderBackbone(counts), 2, 1, 1), draw, images=12).loss()
 
 
 def test_features_without_places_give_no_eye():
-    assert Eye.of(PresenceNet(CLASSES)) is None
-    assert isinstance(Eye.of(CountNet(CLASSES, 3, (64, 64))), RenderEye)
+    assert Backbone.of(PresenceNet(CLASSES)) is None
+    assert isinstance(Backbone.of(CountNet(CLASSES, 3, (64, 64))), RenderBackbone)

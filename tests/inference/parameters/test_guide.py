@@ -13,7 +13,7 @@ from probscene.inference.parameters import sibling_encoder as module
 from probscene.inference.parameters.graph import Graph, Seen
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.likelihood import Values, log_density
-from probscene.inference.parameters.sibling_encoder import Mates
+from probscene.inference.parameters.sibling_encoder import SiblingEncoder
 from probscene.inference.parameters.sites import Site, find_sites, of_scenes, quantiles_of, site_name
 from probscene.sampling import run_program, sample, seed_everything
 
@@ -199,7 +199,7 @@ def test_a_site_is_told_by_its_name_alone(trays):
 
 def test_ties_of_many_scenes_are_those_of_each(monkeypatch):
     torch.manual_seed(0)
-    mates = Mates(3, 8)
+    mates = SiblingEncoder(3, 8)
     own = torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
     together = Graph.of(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).together
     whole = mates.ties(together, own)
@@ -210,7 +210,7 @@ def test_ties_of_many_scenes_are_those_of_each(monkeypatch):
 
 def test_ties_of_later_sites_are_added_to_those_before():
     torch.manual_seed(0)
-    mates, own = Mates(3, 8), torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
+    mates, own = SiblingEncoder(3, 8), torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
     together = Graph.of(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).together
     before = mates.ties(together, own.where(torch.arange(3) < 1, torch.nan))
     for one, other in zip(mates.ties(together, own), mates.ties(together, own, before, 1), strict=True):

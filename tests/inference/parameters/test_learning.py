@@ -11,9 +11,9 @@ from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.parameters import missed_objects as missing
 from probscene.inference.parameters import reader
-from probscene.inference.parameters.backbone import RenderEye
-from probscene.inference.parameters.calibration import TriedReader
-from probscene.inference.parameters.checkpoint_selection import HeldOut
+from probscene.inference.parameters.backbone import RenderBackbone
+from probscene.inference.parameters.calibration import CalibratedReader
+from probscene.inference.parameters.checkpoint_selection import HeldOutSet
 from probscene.inference.parameters.graph import Graph
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
@@ -156,7 +156,7 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=2, rounds=0, energy_steps=0, reader_images=2)
     empty = torch.zeros(30, 3, 64, 64, dtype=torch.uint8)
-    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: empty, schedule)
+    learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, lambda: empty, schedule)
     learning.run()
     assert learning.tried.skill is not None
     learning.tried.skill = learning.tried.skill._replace(share=torch.ones_like(learning.tried.skill.share))
@@ -171,7 +171,7 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=1, rounds=0, energy_steps=0, reader_images=2)
     counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.zeros(30, 3, 64, 64).byte()
-    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule)
+    learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, lambda: images, schedule)
     learning.run()
     learning.phase = learning.phases.index(SCENES)
     with torch.no_grad():
@@ -198,14 +198,14 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
 
 def test_unclear_sites_of_scenes_are_read_anew_by_a_network_that_is_told_them_alone(trays, monkeypatch):
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
-    monkeypatch.setattr(TriedReader, "unclear", frozenset(["scene.bright"]))
+    monkeypatch.setattr(CalibratedReader, "unclear", frozenset(["scene.bright"]))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(
         reader_steps=1, scene_renders=200, steps=1, rounds=0, round_steps=1, energy_steps=0, weighted_scenes=4,
         reader_images=2,
     )  # fmt: skip
     counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.randint(256, (30, 3, 64, 64))
-    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, images.byte, schedule)
+    learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, images.byte, schedule)
     learning.run()
     anew = torch.tensor([site.name == "scene.bright" for site in learning.scene_sites])
     found, entered = (see(images.byte()) for see in (learning.tried.reader.find, learning.tried.reader.eye.enter))
@@ -219,8 +219,8 @@ def test_unclear_sites_of_scenes_are_read_anew_by_a_network_that_is_told_them_al
 def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatch):
     """Sites that would keep their prior have it there, and so have those that are learnt at the end."""
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
-    monkeypatch.setattr(TriedReader, "unclear", frozenset(["scene.bright", "ball.away"]))
-    monkeypatch.setattr(TriedReader, "noisy", property(lambda tried: torch.ones(len(tried.good_sites)).bool()))
+    monkeypatch.setattr(CalibratedReader, "unclear", frozenset(["scene.bright", "ball.away"]))
+    monkeypatch.setattr(CalibratedReader, "noisy", property(lambda tried: torch.ones(len(tried.good_sites)).bool()))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(
         reader_steps=1, scene_renders=4, steps=1, rounds=1, round_reader_steps=1, round_scene_renders=2,
@@ -234,8 +234,8 @@ def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatc
         return torch.rand(30, 2).double().numpy()
 
     learning = ParameterLearning(
-        trays, trays.prior, RenderEye(counts), label, lambda: images, schedule,
-        held=HeldOut(look, torch.rand(30, 2).double().numpy()), settle=lambda _, last: next(would_keep),
+        trays, trays.prior, RenderBackbone(counts), label, lambda: images, schedule,
+        held=HeldOutSet(look, torch.rand(30, 2).double().numpy()), settle=lambda _, last: next(would_keep),
     )  # fmt: skip
     learning.run()
     assert looked == [{"scene.bright"}, {"scene.bright", "floor.turn"}, {"scene.bright"}]
@@ -261,7 +261,9 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
     def begun():
         torch.manual_seed(0)
         counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
-        return ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule, settle=settle)
+        return ParameterLearning(
+            trays, trays.prior, RenderBackbone(counts), label, lambda: images, schedule, settle=settle
+        )
 
     asked, kept, suited = [], [], ParameterGuide.suited
 

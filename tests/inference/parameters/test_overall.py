@@ -2,9 +2,9 @@
 
 import torch
 
-from probscene.inference.parameters.global_head import Overall, looks
+from probscene.inference.parameters.global_head import GlobalHead, looks
 from probscene.inference.parameters.reader import HARMONICS, cut_mean, normal
-from probscene.inference.parameters.reader_training import OverallTraining
+from probscene.inference.parameters.reader_training import GlobalHeadTraining
 
 RENDERS = 600
 
@@ -25,10 +25,10 @@ def with_gaps(number: int) -> tuple[torch.Tensor, torch.Tensor]:
     return images, u
 
 
-def trained(draw, seed: int = 0) -> Overall:
+def trained(draw, seed: int = 0) -> GlobalHead:
     torch.manual_seed(0)
-    net = Overall(2, 2 + HARMONICS)
-    OverallTraining(net, draw, RENDERS, seed=seed).run()
+    net = GlobalHead(2, 2 + HARMONICS)
+    GlobalHeadTraining(net, draw, RENDERS, seed=seed).run()
     return net
 
 
@@ -54,17 +54,17 @@ def test_no_more_renders_are_drawn_than_asked_for():
 
 def test_what_was_interrupted_ends_the_same():
     whole = trained(views).state_dict()
-    states, again = [], Overall(2, 2 + HARMONICS)
+    states, again = [], GlobalHead(2, 2 + HARMONICS)
     torch.manual_seed(0)
-    net = Overall(2, 2 + HARMONICS)
-    training = OverallTraining(net, views, RENDERS)
+    net = GlobalHead(2, 2 + HARMONICS)
+    training = GlobalHeadTraining(net, views, RENDERS)
 
     def stop(some, _):
         if some.done == 130:
             states.append({key: value.clone() for key, value in some.state().items()})
 
     training.run(stop)
-    other = OverallTraining(again, views, RENDERS)
+    other = GlobalHeadTraining(again, views, RENDERS)
     other.restore(states[0])
     assert other.done == 130
     other.run()

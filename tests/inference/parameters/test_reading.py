@@ -16,11 +16,11 @@ from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import STRIDE as CELL
 from probscene.inference.features.counting.batches import cells
 from probscene.inference.parameters.graph import Graph, Seen
-from probscene.inference.parameters.reader import Found, blocks, circles, cut_draw, cut_mean
-from probscene.inference.parameters.scene_graph_builder import along_the_widest, assembly
+from probscene.inference.parameters.reader import Detections, blocks, circles, cut_draw, cut_mean
+from probscene.inference.parameters.scene_graph_builder import assembly, order_by_variance
 from probscene.inference.parameters.sites import Site, find_sites
 from probscene.inference.parameters.skill import CIRCLE, LINE, TWICE, Skill
-from probscene.inference.parameters.supervised_renders import ValuedRenders, joined
+from probscene.inference.parameters.supervised_renders import SupervisedRenders, joined
 from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
@@ -156,7 +156,7 @@ def test_graphs_are_those_that_were_drawn(trays):
     label = torch.tensor([trays.classes.index(trays.grammar.kinds[k]) for k in seen.kind[n, m].tolist()])
     parent = seen.parent[n, m]
     shuffled = torch.randperm(len(n))
-    found = Found(
+    found = Detections(
         n[shuffled],
         torch.ones(len(n)),
         label[shuffled],
@@ -166,7 +166,7 @@ def test_graphs_are_those_that_were_drawn(trays):
         torch.zeros(60, 0, 6),
     )
     u = torch.rand(len(n), 2)
-    kind, found_parent, mean, _ = along_the_widest(made, found).values(found, 60, u[shuffled], u[shuffled])
+    kind, found_parent, mean, _ = order_by_variance(made, found).values(found, 60, u[shuffled], u[shuffled])
     assert torch.equal(kind, seen.kind[:, : kind.shape[1]]) and torch.equal(found_parent, seen.parent)
     assert torch.equal(mean[n, m], u)
 
@@ -183,8 +183,10 @@ def test_siblings_of_groups_that_cannot_be_seen_come_in_any_order():
         n, m = (seen.kind >= 0).nonzero(as_tuple=True)
         label = (seen.kind[n, m] == grammar.kind("sun")).long()
         nothing = torch.zeros(len(n), 0, 6)
-        found = Found(n, torch.ones(len(n)), label, place[n, m], torch.zeros(len(n), 2), nothing, torch.zeros(20, 0, 6))
-        made = along_the_widest(made, found)
+        found = Detections(
+            n, torch.ones(len(n)), label, place[n, m], torch.zeros(len(n), 2), nothing, torch.zeros(20, 0, 6)
+        )
+        made = order_by_variance(made, found)
         orders = []
         for seed in (0, 1):
             torch.manual_seed(seed)
@@ -201,7 +203,7 @@ def test_batches_are_joined_as_they_are(model):
     render = SpriteRenderer(model.canvas)
     sites = {site.name: site for site in find_sites(model)}
     label = partial(_labels, render, classes)
-    renders = ValuedRenders(
+    renders = SupervisedRenders(
         model, label, (sites["tray.x"], sites["ball.away"]), (sites["scene.bright"], sites["floor.turn"])
     )
     seed_everything(0)
@@ -223,7 +225,7 @@ def test_batches_are_joined_as_they_are(model):
 def test_a_site_that_a_call_leaves_out_is_named(trays):
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     with pytest.raises(ModelError, match=r"site 'tray\.gone' in every call of the program of model 'trays'"):
-        ValuedRenders(trays, label, (Site("tray.gone", ("tray",)),), ()).draw(3, trays.prior)
+        SupervisedRenders(trays, label, (Site("tray.gone", ("tray",)),), ()).draw(3, trays.prior)
 
 
 def _labels(render, classes, scenes):

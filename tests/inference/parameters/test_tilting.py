@@ -12,7 +12,7 @@ from scipy.stats import chi2, kstest
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.parameters.sites import within
-from probscene.inference.parameters.tilting.image_statistics import plain
+from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import (
     TiltingLearning,
     beside_structure,
@@ -82,7 +82,7 @@ def test_what_is_plainly_said_is_so(seed, noise, light, tint):
     rng = np.random.default_rng(seed)
     wall = np.stack([np.full((60, 80), light + tint), np.full((60, 80), light), np.full((60, 80), light)])
     image = (wall + noise * rng.normal(size=(1, 60, 80))).clip(0, 255).round().astype(np.uint8)
-    said = plain(torch.from_numpy(image)[None])[0].numpy()
+    said = image_statistics(torch.from_numpy(image)[None])[0].numpy()
     assert said[:3] == pytest.approx(image.mean((1, 2)) / 255, abs=1e-5)
     assert said[3:6] == pytest.approx(image.std((1, 2)) / 255, abs=1e-5)
     assert said[6:14].mean() == pytest.approx(image.mean() / 255, abs=0.01)
@@ -94,7 +94,7 @@ def test_what_is_plainly_said_is_so(seed, noise, light, tint):
     if 2 < noise and 70 < light < 170 - tint:  # nothing is cut off
         assert said[16] == pytest.approx(10 * noise / 255, rel=0.1)
     grey_image = torch.from_numpy(image[:1])[None]
-    assert torch.equal(plain(grey_image), plain(grey_image.expand(-1, 3, -1, -1)))
+    assert torch.equal(image_statistics(grey_image), image_statistics(grey_image.expand(-1, 3, -1, -1)))
 
 
 @given(seeds, st.integers(2, 80))

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene.inference.features.base import Examples
-from probscene.inference.parameters.calibration import NEAR_ENOUGH, TriedReader
-from probscene.inference.parameters.reader import LEAST_MASS, Found, blocks
-from probscene.inference.parameters.reader_training import MIN_VISIBLE, Valued
+from probscene.inference.parameters.calibration import NEAR_ENOUGH, CalibratedReader
+from probscene.inference.parameters.reader import LEAST_MASS, Detections, blocks
+from probscene.inference.parameters.reader_training import MIN_VISIBLE, SupervisedBatch
 from probscene.inference.parameters.sites import Site
 from probscene.inference.parameters.skill import Skill
 
@@ -38,13 +38,13 @@ def test_the_least_mass_makes_the_fewest_mistakes_up_to_chance(seed, number):
     seen = torch.from_numpy(rng.uniform(0, 1, (N, M))).float()
     nothing = torch.zeros(N, M, 0)
     drawn = Examples(*(torch.zeros(N),) * len(Examples._fields))._replace(label=label, centre=centre, visible=seen)
-    valued = Valued(drawn, label, label, label, nothing, torch.zeros(N, 0))
+    valued = SupervisedBatch(drawn, label, label, label, nothing, torch.zeros(N, 0))
     image = torch.from_numpy(np.sort(rng.integers(0, N, number)))
     place = torch.from_numpy(rng.uniform(0, 60, (number, 2))).float()
     mass = torch.from_numpy(rng.uniform(0.2, 1, number))
-    found = Found(image, mass, image, place, place, torch.zeros(number, 0, 6), torch.zeros(N, 0, 6))
+    found = Detections(image, mass, image, place, place, torch.zeros(number, 0, 6), torch.zeros(N, 0, 6))
     reader = SimpleNamespace(find_all=lambda images: found, leasts=LEAST_MASS, least=torch.tensor(0.0))
-    TriedReader.settle(SimpleNamespace(reader=reader), valued)
+    CalibratedReader.settle(SimpleNamespace(reader=reader), valued)
 
     def mistakes(least: float) -> int:
         hit, spare = set(), 0
@@ -69,7 +69,7 @@ def test_the_least_mass_makes_the_fewest_mistakes_up_to_chance(seed, number):
 def test_sites_that_are_read_with_an_error_are_refined(smeared):
     """Of nodes and of scenes; not what is read sharply, cannot be read or was not read often enough."""
     of_nodes = tuple(Site(name, ("cell",)) for name in ("sharp", "poor", "never", "turn"))
-    tried = TriedReader(smeared, SimpleNamespace(), of_nodes, (Site("sun", ()), Site("cloud", ())))
+    tried = CalibratedReader(smeared, SimpleNamespace(), of_nodes, (Site("sun", ()), Site("cloud", ())))
     tried.skill = Skill(torch.zeros(6, dtype=torch.int64), torch.tensor([0.95, 0.1, 0.5, 0.6, 0.5, 0.95]))
     tried.readings_of = torch.tensor([100, 100, 3, 100, 100, 100])
     assert tried.good.tolist() == [True, False, False, True, True, True]
@@ -80,7 +80,7 @@ def test_a_sun_behind_clouds_is_lost(smeared):
     """Its brightness is read with some skill in renders of any weather, and not at all where it is always cloudy."""
     sun, cloud = Site("sun", ()), Site("cloud", ())
     of_all = torch.zeros(0, dtype=torch.int64)
-    nothing = Found(of_all, torch.zeros(0), of_all, *torch.zeros(2, 0, 2), torch.zeros(0, 0, 6), torch.zeros(0))
+    nothing = Detections(of_all, torch.zeros(0), of_all, *torch.zeros(2, 0, 2), torch.zeros(0, 0, 6), torch.zeros(0))
 
     def find(images):
         """What shines through, as if it were the sun, and the clouds."""
@@ -95,10 +95,10 @@ def test_a_sun_behind_clouds_is_lost(smeared):
         none = torch.full((2000, 1), -1)
         seen = Examples(*(torch.zeros(2000, 1),) * len(Examples._fields))
         seen = seen._replace(image=image, label=none, centre=torch.zeros(2000, 1, 2))
-        return Valued(seen, none, none, none, torch.zeros(2000, 1, 0), u)
+        return SupervisedBatch(seen, none, none, none, torch.zeros(2000, 1, 0), u)
 
     reader = SimpleNamespace(find=find, find_all=find, leasts=LEAST_MASS, least=torch.tensor(0.0))
-    tried = TriedReader(smeared, reader, (), (sun, cloud))
+    tried = CalibratedReader(smeared, reader, (), (sun, cloud))
     any_weather = drawn(torch.rand(2000, generator=torch.Generator().manual_seed(0)), 1)
     tried.on(any_weather, any_weather.drawn.image)
     assert tried.good_sites == {sun, cloud} and tried.unclear == {"sun"}

@@ -9,7 +9,7 @@ rays.
 import numpy as np
 import torch
 
-from probscene.batch import RenderBatch, Space
+from probscene.batch import RenderBatch, SceneGeometry
 from probscene.world import World
 
 from .photo import photographed
@@ -62,7 +62,7 @@ class MeshReference:
         visible, truncated = torch.from_numpy(visible[..., 0]), torch.from_numpy(truncated[..., 0])
         labels = [torch.from_numpy(x) for x in (depth, semantic, space_box, lens, box, amodal, pixels, instance, image)]
         depth, semantic, space_box, lens, box, amodal, pixels, instance, image = labels
-        space = Space(depth, semantic, names, truncated, space_box, lens)
+        space = SceneGeometry(depth, semantic, names, truncated, space_box, lens)
         return RenderBatch(image.permute(0, 3, 1, 2), instance, kind, box, amodal, pixels, visible, space)
 
     def _image(self, scene: "_Scene", u, v) -> np.ndarray:

