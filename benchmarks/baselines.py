@@ -1,7 +1,7 @@
 """The baselines at their best: each guide and objective gets the same search over its settings, beside the default.
 
     python benchmarks/baselines.py [--fits lstm pcfg grammar-vae mmd witness js] [--draws 24] [--seeds 0]
-        [--set variance=20 num_scenes=50]
+        [--set divergence.variance=20 num_scenes=50]
 
 Structures of Aerial 2D, with true counts of roads and of cars by road instead of images: what is compared is how a
 distribution is learnt, and not how images are read. The search draws step size, steps a batch, baseline and number of
@@ -83,7 +83,7 @@ def drawn(fit: str, num: int) -> list[Settings]:
 
 
 def changed(settings: Settings, words: list[str]) -> Settings:
-    """Settings with other values, such as ``variance=20``."""
+    """Settings with other values, such as ``divergence.variance=20``."""
     values = dict(word.split("=") for word in words)
     return replace(settings, **{key: type(getattr(settings, key))(value) for key, value in values.items()})
 

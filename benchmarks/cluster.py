@@ -32,7 +32,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.workers.actor_pool import ActorPool
 from probscene.app.workers.cluster import Cluster
 
-SHORT = {"count.steps": 60, "batches": 8, "num_scenes": 300, "pretrain_derivations": 500, "learn": "structure"}
+SHORT = {"features.schedule.steps": 60, "structure.batches": 8, "structure.num_scenes": 300, "pretrain.derivations": 500, "learn": "structure"}
 
 
 class CPU:

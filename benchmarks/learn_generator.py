@@ -76,7 +76,7 @@ def main():
         folder = args.out / f"target-{args.example}-{seed}"
         generate_scenes(truth, truth.prior, args.images, folder, seed=1000 + seed, format="images")
         base = preset(args.preset) if args.features is None else preset(args.preset).with_features(args.features)
-        chosen = override(base, [f"learn={STRUCTURE}", *args.settings])
+        chosen = override(base, [f"parameters=none", *args.settings])
         path = args.out / f"run-{args.example}-{args.preset}-{seed}"
         run = fit(file, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
         expected = structures(model, truth.prior, STRUCTURES, 99)

@@ -94,7 +94,7 @@ def main():
     images = torch.stack([real.load(i) for i in range(IMAGES)])
     number, share = distributions(args.target)
     structure = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
-    settings = ["parameter_method=meta-sim", *(f"meta_sim.{setting}" for setting in args.set)]
+    settings = ["parameters=meta-sim", *(f"parameters.{setting}" for setting in args.set)]
     schedule = override(QUICK, settings).meta_sim
     look = EfficientNetLite(schedule.feature_size)
     seen = RenderedFeatures(MODEL, 1).observe(look)

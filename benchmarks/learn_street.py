@@ -63,9 +63,9 @@ from matplotlib.ticker import MaxNLocator
 DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
 PARAMETERS = "parameters"
 SETTINGS = {
-    STRUCTURE: [f"learn={STRUCTURE}"],
-    BOTH: [f"learn={BOTH}"],
-    PARAMETERS: [f"learn={BOTH}", "batches=0", "batches_again=0", "on_prior=true"],
+    STRUCTURE: [f"parameters=none"],
+    BOTH: [f"parameters=any"],
+    PARAMETERS: [f"parameters=any", "structure.batches=0", "refine.batches=0", "pretrain.on_prior=true"],
 }
 GRID, GRID_WIDTH = (4, 2), 420  # rows and columns of a source's images; pixels of one
 MARKED, SCENES = 0.01, 2000  # of a frame; of which objects are counted

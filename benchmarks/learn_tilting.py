@@ -88,7 +88,7 @@ def learn(
     model: SceneModel, observer: RenderedFeatures, photographs: Tensor, seed: int, settings: list[str]
 ) -> TiltingLearning:
     """Parameters, learnt from photographs."""
-    given = [f"parameter_method={TILTING}", *(f"tilting.{setting}" for setting in settings)]
+    given = [f"parameters={TILTING}", *(f"parameters.{setting}" for setting in settings)]
     schedule = override(preset("quick"), given).tilting
     seen_by = EfficientNetLite(schedule.feature_size).embed, image_statistics
     real = tuple(embed(photographs) for embed in seen_by)

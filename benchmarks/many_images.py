@@ -30,7 +30,7 @@ from pycocotools.coco import COCO
 import probscene as ps
 from probscene.app.files import write_json
 
-SHORT = {"count.steps": 60, "batches": 2, "num_scenes": 100, "pretrain_derivations": 500, "learn": "structure"}
+SHORT = {"features.schedule.steps": 60, "structure.batches": 2, "structure.num_scenes": 100, "pretrain.derivations": 500, "learn": "structure"}
 MEGA = 2**20
 
 

@@ -2,7 +2,7 @@
 
     import probscene as ps
 
-    fit = ps.fit(model, "photos/", preset="quick")
+    fit = ps.fit(model, "photos/", "quick")
     fit.generate(10_000, "dataset/", format="coco")
 
 This face holds what a person writes; a name is imported when it is first used. Each is defined in one module, which is
@@ -24,10 +24,13 @@ __version__ = "0.2.0"
 _HOME = {
     "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
     "api.fit": ("fit",),
+    "fitting.begin": ("ModelFile", "TargetImages"),
+    "fitting.config": ("FitConfig",),
+    "fitting.pipeline": ("Execution",),
+    "fitting.presets": ("preset",),
     "api.label": ("label",),
     "api.run": ("Run",),
     "datasets.scene_dataset": ("SceneDataset",),
-    "fitting.preset": ("Preset",),
     "loading": ("load_model",),
 }
 _MODULES = {
@@ -62,7 +65,7 @@ _MODULES = {
     "probscene.request": ("Objects", "Request"),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
     "probscene.scene": ("SceneGraph",),
-    "probscene.structure": ("StructurePrior", "counts", "ranked", "weights"),
+    "probscene.structure": ("StructurePrior", "TargetImages", "counts", "ranked", "weights"),
     "probscene.world": ("Camera", "Ground", "Light", "Meshes", "World"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
@@ -73,7 +76,10 @@ if TYPE_CHECKING:
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
     from probscene.app.datasets.scene_dataset import SceneDataset
-    from probscene.app.fitting.preset import Preset
+    from probscene.app.fitting.begin import ModelFile, TargetImages
+    from probscene.app.fitting.config import FitConfig
+    from probscene.app.fitting.pipeline import Execution
+    from probscene.app.fitting.presets import preset
     from probscene.app.loading import load_model
     from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
     from probscene.inference.features.base import FeatureNet, Features
@@ -116,14 +122,15 @@ if TYPE_CHECKING:
     from .world import Camera, Ground, Light, Meshes, World
 
 __all__ = [
-    "Camera", "Command", "DataError", "Derivation", "Divergence", "Drawing", "FeatureNet", "Features",
-    "GeneratorError", "Grammar", "GrammarError", "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray",
-    "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes",
-    "ModelError", "Objects", "PCFG", "ParameterGuide", "Photo", "Policy", "Preset", "ProbsceneError", "RenderBatch",
-    "Renderer", "Request", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph", "SceneModel", "Scenes",
-    "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive", "enumerate_derivations",
-    "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",
-    "sample", "scene_model", "seed_everything", "trial", "weights",
+    "Camera", "Command", "DataError", "Derivation", "Divergence", "Drawing", "Execution", "FeatureNet", "Features",
+    "FitConfig", "GeneratorError", "Grammar", "GrammarError", "GrammarVAE", "Ground", "Groups", "Guide",
+    "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide", "Light", "MMD", "MachineError",
+    "Mesh", "Meshes", "ModelError", "ModelFile", "Objects", "PCFG", "ParameterGuide", "Photo", "Policy",
+    "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError", "SamplingError", "SceneDataset",
+    "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "TargetImages", "World",
+    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
+    "load_model", "preset", "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything",
+    "trial", "weights",
 ]  # fmt: skip
 
 

@@ -186,8 +186,9 @@ class Features(Protocol):
         others."""
         return ""
 
-    def settings(self, preset: Any) -> dict[str, Any]:
-        """Other values of the preset's fields that suit these features, such as fewer scenes for a slow network."""
+    def settings(self, config: Any) -> dict[str, Any]:
+        """Values of a fit's configuration that suit these features, by their paths, such as ``{"structure.num_scenes":
+        150}`` for a slow network; what the user sets comes after. ``config`` is the ``FitConfig`` without them."""
         return {}
 
 
@@ -284,16 +285,16 @@ def embed_all(
     return features
 
 
-def slow_settings(preset: Any) -> dict[str, Any]:
+def slow_settings(config: Any) -> dict[str, Any]:
     """What suits a network that takes about 20 ms an image on one core where a preset's own takes 1: fewer scenes, each
     drawn once, and at so noisy a gradient half the step. Marginals, far sharper than the joint density, say of
     photographs only that they are none. Features come in units of their bandwidth, and the kernel takes them so."""
     return {
-        "batches": 40,
-        "num_scenes": 150,
-        "draws_per_structure": 1,
-        "learning_rate": min(preset.learning_rate, 5e-3),
-        "marginal_variance": None,
-        "stabilised": False,
-        "variance": None if preset.variance is None else 1.0,
+        "structure.batches": 40,
+        "structure.num_scenes": 150,
+        "structure.draws_per_structure": 1,
+        "structure.learning_rate": min(config.structure.learning_rate, 5e-3),
+        "divergence.marginal_variance": None,
+        "divergence.stabilised": False,
+        "divergence.variance": None if getattr(config.divergence, "variance", 1.0) is None else 1.0,
     }

@@ -66,9 +66,9 @@ class ProjectedFeatures(Features):
             return None
         return ProjectionTraining(net, renders, self.pairs, self.directions, self.scenes, batch_seed(seed, 1))
 
-    def settings(self, preset: Any) -> dict[str, Any]:
+    def settings(self, config: Any) -> dict[str, Any]:
         """Those of a slow network; none where its features are taken as they are, as the paper's preset does."""
-        return slow_settings(preset) if self.directions else {}
+        return slow_settings(config) if self.directions else {}
 
 
 class ProjectionTraining:

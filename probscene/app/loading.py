@@ -178,6 +178,19 @@ def split_reference(reference: str) -> tuple[str, tuple[str, ...]]:
     return str(reference), ()
 
 
+def with_scenarios(reference: str, names: str | None) -> str:
+    """A reference that names scenarios, such as ``"a,b"``; as it is where None.
+
+    Raises:
+        ProbsceneError: it names some already.
+    """
+    if names is None:
+        return reference
+    if split_reference(reference)[1]:
+        raise ProbsceneError(f"expected scenarios once, got {reference} and {names}; leave out --scenarios.")
+    return f"{reference}:{names}"
+
+
 def lasting_reference(reference: str) -> str:
     """A reference that means the same from every folder."""
     base, scenarios = split_reference(reference)

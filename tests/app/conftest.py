@@ -17,14 +17,14 @@ from probscene.app.loading import load_model
 
 DISCS = Path(__file__).with_name("discs.py")
 SHORT = {
-    "count.steps": 48,
-    "count.images": 4,
-    "count.crops": 4,
-    "width": "4,8,8",
-    "pretrain_derivations": 100,
-    "pretrain_epochs": 2,
-    "batches": 4,
-    "num_scenes": 30,
+    "features.schedule.steps": 48,
+    "features.schedule.images": 4,
+    "features.schedule.crops": 4,
+    "features.width": "4,8,8",
+    "pretrain.derivations": 100,
+    "pretrain.epochs": 2,
+    "structure.batches": 4,
+    "structure.num_scenes": 30,
     "parameters.reader_steps": 6,
     "parameters.reader_images": 4,
     "parameters.steps": 4,

@@ -78,8 +78,8 @@ def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, d
         "--learn",
         "structure",
     ]
-    words += ["--set", "batches=1"]
-    result = call(*words, "--skip-bad", "--set", "count.steps=16")
+    words += ["--set", "structure.batches=1"]
+    result = call(*words, "--skip-bad", "--set", "features.schedule.steps=16")
     assert result.code == 0, result.err
     assert result.err.count("000003.png") == 1 and result.err.count("resized to 64x64") == 1
     lines = [line for line in result.err.splitlines() if not line.startswith(("Note: ", "Warning: "))]
@@ -102,7 +102,11 @@ def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp
 
 @pytest.mark.parametrize(
     ("setting", "where"),
-    [("count.learning_rate=1e38", "at step"), ("pretrain_rate=1e37", "epoch "), ("learning_rate=1e37", "At batch ")],
+    [
+        ("features.schedule.learning_rate=1e38", "at step"),
+        ("pretrain.learning_rate=1e37", "epoch "),
+        ("structure.learning_rate=1e37", "At batch "),
+    ],
 )
 def test_what_is_no_longer_finite_stops_with_the_step_and_a_remedy(call, discs, target, tmp_path, setting, where):
     out = tmp_path / "run"

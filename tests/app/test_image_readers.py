@@ -13,9 +13,9 @@ import torch
 from PIL import Image
 
 from probscene.app.arguments import range_given
-from probscene.app.fitting import session
+from probscene.app.fitting.begin import FitRequest, ModelFile, TargetImages, begin, resume
 from probscene.app.fitting.pipeline import open_target
-from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.sheet import write_sheet
 from probscene.app.progress import Display
@@ -217,18 +217,18 @@ def test_a_run_keeps_its_range(discs, tmp_path):
     (tmp_path / "images").mkdir()
     for i in range(40):
         Image.fromarray(rng.integers(0, 4000, (64, 64), np.uint16)).save(tmp_path / "images" / f"{i}.png")
-    run, images = session.begin(
-        str(discs.file), tmp_path / "images", tmp_path / "run", Preset(), 0, False, 1, show, value_range=(0, 4095)
-    )
+    target = TargetImages(tmp_path / "images", value_range=(0, 4095))
+    request = FitRequest(ModelFile(str(discs.file)), target, QUICK, threads=1)
+    run, images, *_ = begin(request, tmp_path / "run", show)
     assert run.record["value_range"] == [0, 4095] and images.value_range == (0, 4095)
     assert ImageFolder(tmp_path / "images", (64, 64), 3).fingerprint == images.fingerprint
     again = RunFolder.at(tmp_path / "run")
     for file in (tmp_path / "images").iterdir():  # what is found later makes no difference
         Image.fromarray(np.full((64, 64), 100, np.uint16)).save(file)
     assert int(open_target(again, lambda *_: None).load(0).max()) == 100 >> 4
-    session.resume(tmp_path / "run", show, value_range=(0, 4095))
+    resume(FitRequest(target=TargetImages(None, value_range=(0, 4095))), tmp_path / "run", show)
     with pytest.raises(RunError, match=r"value_range that the run.*\[0.0, 4095.0\].*got \[0.0, 255.0\]"):
-        session.resume(tmp_path / "run", show, value_range=(0, 255))
+        resume(FitRequest(target=TargetImages(None, value_range=(0, 255))), tmp_path / "run", show)
 
 
 def test_a_trial_reads_all_its_sets_over_one_range(folder, tmp_path, monkeypatch):
@@ -252,7 +252,8 @@ def test_a_trial_reads_all_its_sets_over_one_range(folder, tmp_path, monkeypatch
 
 
 def test_a_run_on_images_of_8_bits_has_no_range(target, discs, tmp_path):
-    run, _ = session.begin(str(discs.file), target.images, tmp_path / "run", Preset(), 0, False, 1, Display())
+    request = FitRequest(ModelFile(str(discs.file)), TargetImages(target.images), QUICK, threads=1)
+    run = begin(request, tmp_path / "run", Display()).run
     assert "value_range" not in run.record
 
 

@@ -8,21 +8,23 @@ from typer.testing import CliRunner
 
 import probscene as ps
 from probscene.app.cli import app
+from probscene.app.fitting.config import configuration
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLETOP = EXAMPLES / "tabletop.py"
 SHORT = {
-    "count.steps": 16,
-    "count.images": 4,
-    "count.crops": 4,
-    "width": "4,8,8",
-    "pretrain_derivations": 100,
-    "pretrain_epochs": 1,
-    "prior_if_worse": "false",
-    "learn": "structure",
-    "batches": 2,
-    "num_scenes": 20,
+    "features.schedule.steps": 16,
+    "features.schedule.images": 4,
+    "features.schedule.crops": 4,
+    "features.width": "4,8,8",
+    "pretrain.derivations": 100,
+    "pretrain.epochs": 1,
+    "fallback_to_prior": "false",
+    "parameters": "none",
+    "structure.batches": 2,
+    "structure.num_scenes": 20,
 }
+EXECUTION = ps.Execution(threads=1, cache=False, progress=False)
 FILES = ("features.safetensors", "real.safetensors", "guide.safetensors", "log.jsonl")
 
 
@@ -64,7 +66,7 @@ def tables(tmp_path_factory) -> Path:
 def both_ways(tmp_path_factory, tables):
     """Fits of a model by the command line and from Python: ``command`` and ``python``, which have the same bytes.
 
-    ``both_ways(words, options)`` takes the command's further words and the further arguments of ``ps.fit``.
+    ``both_ways(words, options)`` takes the command's further words and the further arguments of ``configuration``.
     """
 
     def fitted(words, options, model=TABLETOP, target=tables):
@@ -72,10 +74,8 @@ def both_ways(tmp_path_factory, tables):
         short = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
         common = ["--preset", "quick", "--threads", 1, "--seed", 3, "--no-cache", *short]
         probscene("fit", model, "--target", target, "--out", folder / "command", *common, *words)
-        fit = ps.fit(
-            model, target, "quick", 3, settings=SHORT, threads=1, cache=False, progress=False,
-            out=folder / "python", **options,
-        )  # fmt: skip
+        config = configuration(ps.preset("quick"), **options, settings=SHORT)
+        fit = ps.fit(model, target, config, seed=3, out=folder / "python", execution=EXECUTION)
         for name in FILES:
             assert (folder / "command" / name).read_bytes() == (fit.path / name).read_bytes(), name
         return SimpleNamespace(command=folder / "command", python=fit)
@@ -98,16 +98,16 @@ def goes_on(tmp_path, tables, monkeypatch):
             if line is not None and line["stage"] == stage:
                 raise Interrupted
 
-        options = {"preset": "quick", "settings": SHORT, "threads": 1, "cache": False, "progress": False, **options}
-        whole = ps.fit(TABLETOP, tables, out=tmp_path / "whole", **options)
+        config = configuration(ps.preset("quick"), **options, settings=SHORT)
+        whole = ps.fit(TABLETOP, tables, config, out=tmp_path / "whole", execution=EXECUTION)
         kept = checkpoints.Checkpointer.__call__
         with monkeypatch.context() as patch:
             patch.setattr(checkpoints, "SAVE_EVERY", -1.0)
             patch.setattr(checkpoints.Checkpointer, "__call__", stop)
             with pytest.raises(Interrupted):
-                ps.fit(TABLETOP, tables, out=tmp_path / "parts", **options)
+                ps.fit(TABLETOP, tables, config, out=tmp_path / "parts", execution=EXECUTION)
         assert list((tmp_path / "parts").glob("*-checkpoint.safetensors"))
-        again = ps.fit(TABLETOP, tables, out=tmp_path / "parts", resume=True, **options)
+        again = ps.fit(TABLETOP, tables, config, out=tmp_path / "parts", resume=True, execution=EXECUTION)
         for name in FILES:
             assert (whole.path / name).read_bytes() == (again.path / name).read_bytes(), name
 

@@ -40,7 +40,7 @@ def test_the_long_form_is_fitted(both_ways, few_steps):
     lines = (ways.command / "log.jsonl").read_text().splitlines()
     assert sum('"features"' in line for line in lines) == 4
     run = ps.Run.open(ways.command)
-    assert run.record["preset"]["features"] == f"{few_steps}:TinyCounts" and run.features.resolution == 0.5
+    assert run.record["config"]["features"] == f"{few_steps}:TinyCounts" and run.features.resolution == 0.5
     again = ps.Run.open(ways.python.path, features=OWN.TinyCounts(steps=4))
     images = torch.randint(0, 256, (2, 3, 256, 256), dtype=torch.uint8)
     assert torch.equal(run.network().embed(images), again.network().embed(images))

@@ -1,7 +1,5 @@
 """The objective: what a batch, its baseline and its costs are, and that a guide learns by it."""
 
-from dataclasses import replace
-
 import pyro
 import pytest
 import torch
@@ -59,10 +57,11 @@ def test_each_objective_descends_toward_the_target(small, objective):
 def test_each_objective_learns_from_samples(small, objective):
     torch.manual_seed(0)
     guide = LSTMGuide(small.grammar, 4, hidden=16)
-    preset = replace(QUICK, variance=0.2, marginal_variance=None).with_objective(objective)
-    loss = ScoreFunction(small.observe, preset.divergence(), preset.baseline, updates=preset.updates)
+    config = QUICK.set("divergence.variance=0.2", "divergence.marginal_variance=none").with_divergence(objective)
+    training = config.structure
+    loss = ScoreFunction(small.observe, config.make_divergence(), training.baseline, updates=training.updates)
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
-    Trainer(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=preset.learning_rate).run()
+    Trainer(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=training.learning_rate).run()
     with torch.no_grad():
         assert 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item() < 0.12
 
@@ -140,6 +139,12 @@ def test_a_guide_that_is_none_is_told_what_is_missing(small):
 
 
 def test_bad_arguments_are_named(small):
-    for arguments in ({"baseline": "median"}, {"updates": 0}, {"decay": 0.0}, {"clip": -1.0}, {"reject_threshold": -1}):
+    for arguments in (
+        {"baseline": "median"},
+        {"updates": 0},
+        {"decay": 0.0},
+        {"clip": -1.0},
+        {"reject_threshold": -1},
+    ):
         with pytest.raises(ProbsceneError, match="expected"):
             ScoreFunction(small.observe, small.cost, **arguments)

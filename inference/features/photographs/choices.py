@@ -76,19 +76,19 @@ class PretrainedCountFeatures(Features):
         """The images that heads and rules are suited to."""
         return cast("PretrainedCountNet", net).taught_by_fingerprint
 
-    def settings(self, preset: Any) -> dict[str, Any]:
+    def settings(self, config: Any) -> dict[str, Any]:
         """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
         each structure is drawn once. Photographs' counts are noisy, and few: the prior of a preset that has such a
         weight holds them more. They come in units of their bandwidth, which the kernel takes as they are. Parameters
         are not learnt by what a reader reads in photographs, of which it has seen none."""
+        weight = config.structure.prior_kl_weight
         return {
-            "parameter_method": "tilting",
-            "pairs": 1000,
-            "batches": 40,
-            "num_scenes": 250,
-            "draws_per_structure": 1,
-            "variance": None if preset.variance is None else 1.0,
-            "marginal_variance": 0.1,
-            "stabilised": False,
-            "prior_kl_weight": max(preset.prior_kl_weight, 0.1) if preset.prior_kl_weight else 0.0,
+            "parameters": "tilting",
+            "structure.batches": 40,
+            "structure.num_scenes": 250,
+            "structure.draws_per_structure": 1,
+            "structure.prior_kl_weight": max(weight, 0.1) if weight else 0.0,
+            "divergence.variance": None if getattr(config.divergence, "variance", 1.0) is None else 1.0,
+            "divergence.marginal_variance": 0.1,
+            "divergence.stabilised": False,
         }

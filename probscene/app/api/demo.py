@@ -23,11 +23,10 @@ from ..datasets.generate import generate, generate_scenes
 from ..evaluation.diagnose import diagnose
 from ..evaluation.evaluate import evaluate
 from ..evaluation.labels import counts_of_dataset, read_labels
-from ..evaluation.list_warnings import tell
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
 from ..files import make_folder, write_json
-from ..fitting import session
-from ..fitting.preset import Preset
+from ..fitting.config import FitConfig
+from ..fitting.pipeline import Execution
 from ..fitting.presets import QUICK
 from ..fitting.run import RunFolder
 from ..fitting.store import timing
@@ -38,6 +37,7 @@ from ..progress import Display
 from ..targets import open_images
 from ..views import report, tables, verdict_text
 from ..views.preview import scenes
+from .fit import carried_out, fit_request
 
 SAMPLES = 16  # images a grid
 
@@ -46,12 +46,10 @@ def demo(
     out: Path,
     seed: int = 0,
     model: str = "multi_mnist",
-    preset: Preset = QUICK,
+    config: FitConfig = QUICK,
     images: int = 3000,
     num: int = 500,
-    threads: int | None = None,
-    cache: Path | None = None,
-    use_cache: bool = True,
+    execution: Execution | None = None,
 ) -> None:
     """Draw a target, fit, generate, evaluate, report; prints how near it came and where to look.
 
@@ -59,22 +57,20 @@ def demo(
         seed: of the target's distribution as well as of the fit.
         images: of the target.
         num: of the dataset.
-        threads: of the fit; all cores where None.
-        cache, use_cache: see ``fit.fit``.
+        execution: of the fit.
 
     Raises:
         ProbsceneError: a model without a target, or a folder that holds something else.
     """
-    loaded = load_model(model)
+    loaded, execution = load_model(model), execution or Execution()
     if loaded.target is None:
         raise ModelError(f"expected a model with a target to learn from, got {model!r}, which has none.")
     out = make_folder(out)
     with Display() as show:
         target = _draw(loaded.target(seed), images, out, seed, show)
-        run, opened = _begun(model, target, out / "run", preset, seed, threads, show)
-        if not run.is_finished:
-            session.carry_out(run, opened, show, cache, use_cache)
-            tell(run, show)
+        request = fit_request(model, target, config, seed, None, execution.threads)
+        done = carried_out(request, out / "run", show, (out / "run" / "run.json").exists(), execution)
+        run, opened = done.run, done.images
         generate(run, num, out / "dataset", seed, progress=show.stage("generating"))
         if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
             _judge(run, opened or open_images(target, loaded, False, show), out, show)
@@ -102,14 +98,6 @@ def _draw(truth: SceneModel, images: int, out: Path, seed: int, show: Display) -
     if not (out / "truth.csv").exists():
         write_counts(out / "truth.csv", *counts_of_dataset(truth, folder), truth.classes)
     return folder / "images"
-
-
-def _begun(
-    model: str, target: Path, out: Path, preset: Preset, seed: int, threads: int | None, show: Display
-) -> tuple[RunFolder, Images | None]:
-    if (out / "run.json").exists():
-        return session.resume(out, show, model, target, preset, seed=seed, threads=threads)
-    return session.begin(model, target, out, preset, seed, False, threads, show)
 
 
 def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:

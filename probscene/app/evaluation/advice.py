@@ -6,7 +6,7 @@ from probscene.inference.statistics.residual import CLEARLY, Grade, ResidualRati
 from probscene.inference.statistics.trust import Trust
 from probscene.inference.statistics.verdict import Verdict
 
-from ..fitting.preset import BOTH, LIKELIHOOD, META_SIM, TILTING
+from ..fitting.config import BOTH, LIKELIHOOD, META_SIM, TILTING
 from ..fitting.run import RunFolder
 
 PHOTO = (
@@ -15,8 +15,8 @@ PHOTO = (
 )
 LONGER = {
     LIKELIHOOD: ("parameters.steps", "parameters.rounds"),
-    TILTING: ("tilting.rounds", "tilting.scenes"),
-    META_SIM: ("meta_sim.steps",),
+    TILTING: ("parameters.rounds", "parameters.scenes"),
+    META_SIM: ("parameters.steps",),
 }
 NONE = {
     TILTING: "Give the model sites of the whole scene that images show.",
@@ -30,9 +30,9 @@ UNSURE = 0.7  # of the distance is left, and it is not sure that it is less than
 def of_structure(run: RunFolder, found: Trust) -> str:
     """What to do about structure, in a few sentences."""
     if found.verdict is Verdict.NOT_FITTED:
-        return f"The guide still makes what the prior makes. {longer(run, ('batches',))}"
+        return f"The guide still makes what the prior makes. {longer(run, ('structure.batches',))}"
     if found.verdict is Verdict.APART:
-        return f"{longer(run, ('batches',))} Where a class is read wrongly that does not help: {label(run)}."
+        return f"{longer(run, ('structure.batches',))} Where a class is read wrongly that does not help: {label(run)}."
     return found.remedy
 
 
@@ -44,11 +44,9 @@ def label(run: RunFolder) -> str:
 
 
 def longer(run: RunFolder, names: tuple[str, ...]) -> str:
-    """To take twice as much of some settings of the preset."""
-    had = []
-    for name in names:
-        part, _, setting = name.rpartition(".")
-        had.append(getattr(getattr(run.preset, part) if part else run.preset, setting))
+    """To take twice as much of some settings, by their paths."""
+    settings = run.config.flat()
+    had = [settings[name] for name in names]
     words = " ".join(f"--set {name}={max(1, 2 * value)}" for name, value in zip(names, had, strict=True))
     return f"Fit again for longer, such as twice the {' and '.join(map(str, had))} of this fit: {words}."
 
@@ -73,7 +71,7 @@ def _learn(run: RunFolder) -> str:
     record = run.parameters
     method = record.get("method", LIKELIHOOD)
     if not record:
-        if run.preset.learn != BOTH:
+        if run.config.parameters is None:
             return f"Learn parameters, too: fit again with --learn {BOTH}."
         return f"These features read no parameters: fit again with --features count, or --parameters {TILTING}."
     if not any(site["learnt"] for site in record["sites"]):

@@ -82,8 +82,8 @@ class Comparison(Evaluation):
             "runs": {
                 name: {
                     "path": str(run.path),
-                    "guide": run.record["guide"],
-                    "objective": run.record["preset"]["objective"],
+                    "guide": run.config.guide_record(),
+                    "objective": run.config.divergence_name,
                     "seed": run.record["seed"],
                     "guide_sha256": run.guide_hash(),
                 }

@@ -19,7 +19,6 @@ from probscene.inference.statistics.trust import Trust
 from probscene.inference.statistics.verdict import Verdict
 
 from ..fitting.outcome import compared
-from ..fitting.preset import BOTH
 from ..fitting.run import RunFolder
 from .advice import of_structure, remedy
 from .estimate import class_counts, counted_classes
@@ -136,7 +135,7 @@ def aspects(
 
 def unread_sites(run: RunFolder) -> dict[str, str]:
     """Sites that keep the prior, and why; empty where no parameters were to be learnt."""
-    if not run.parameters and run.preset.learn == BOTH:
+    if not run.parameters and run.config.parameters is not None:
         return {site.name: f"{run.features.name} features read no parameters" for site in find_sites(run.model)}
     kept = run.parameters.get("kept") == PRIOR
     none = "scenes came no nearer to held-out images by what was learnt"

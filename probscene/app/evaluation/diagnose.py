@@ -118,7 +118,7 @@ def diagnose(
         return FitDiagnostics(
             None, f"expected at least {NEEDED} real images for a verdict, got {len(target)} in {target.path}."
         )
-    preset, model, net = run.preset, run.model, own_net(run)
+    training, model, net = run.config.structure, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)
     own = kept_features(run, target) is not None
     boxes = None if evaluation is None else evaluation.boxes
@@ -135,7 +135,7 @@ def diagnose(
 
     each(0)
     eyes = [_Eyes(net, each, keep) for keep in (True, False)]
-    draws = [1 if policy.suits else preset.draws_per_structure for policy in policies]
+    draws = [1 if policy.suits else training.draws_per_structure for policy in policies]
     scenes = [_features(run, *each_of, num, seed) for each_of in zip(policies, eyes, draws, strict=True)]
     real = _real(run, target, net, each)
     seen = looked.look(run, target, net, EfficientNetLite(), each, images, seed)

@@ -1,24 +1,26 @@
 """Ways of learning parameters by images as wholes, of which nothing is read. Axis letters: L images, C H W."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
+from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import TiltingLearning
+from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.training import batch_seed
 
 from .rendered_features import RenderedFeatures
-
-if TYPE_CHECKING:
-    from .run import RunFolder
+from .run import RunFolder
 
 ImageLevelTraining = MetaSimLearning | TiltingLearning
 
 
-def meta_sim_learning(run: "RunFolder", observer: RenderedFeatures, guide: Guide, images: Tensor) -> MetaSimLearning:
+def meta_sim_learning(
+    run: RunFolder, observer: RenderedFeatures, guide: Guide, images: Tensor, schedule: MetaSimSchedule
+) -> MetaSimLearning:
     """Meta-Sim's training, by EfficientNet's pooled features.
 
     Args:
@@ -27,18 +29,19 @@ def meta_sim_learning(run: "RunFolder", observer: RenderedFeatures, guide: Guide
     """
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
-    schedule = run.preset.meta_sim
     look = EfficientNetLite(schedule.feature_size)
     seed = batch_seed(run.record["seed"], 5)
     return MetaSimLearning(run.model, guide, observer.observe(look), look.embed(images), schedule, seed)
 
 
-def tilting_learning(run: "RunFolder", observer: RenderedFeatures, guide: Guide, images: Tensor) -> TiltingLearning:
+def tilting_learning(
+    run: RunFolder, observer: RenderedFeatures, guide: Guide, images: Tensor, schedule: TiltingSchedule
+) -> TiltingLearning:
     """The training that tilts, by the same features and what can plainly be said; arguments as of
     ``meta_sim_learning``."""
     from probscene.inference.features.pretrained import EfficientNetLite
 
-    schedule, seed = run.preset.tilting, batch_seed(run.record["seed"], 5)
+    seed = batch_seed(run.record["seed"], 5)
     looks = EfficientNetLite(schedule.feature_size).embed, image_statistics
     real = tuple(look(images) for look in looks)
     return TiltingLearning(run.model, guide, observer.labelled, looks, real, schedule, seed)

@@ -23,7 +23,7 @@ from probscene.sampling import sample, seed_everything
 
 from ..labels.partial_labels import PartialLabels
 from ..progress import Progress
-from .parameter_stage import NAME, beside
+from .learnt_parameters import NAME, beside
 from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import PRIOR_KEPT, RunFolder
 
@@ -46,7 +46,13 @@ def give_up(run: RunFolder) -> str:
 
 
 def conclude(
-    run: RunFolder, observer: RenderedFeatures, net: FeatureNet, real: Tensor, guide: Guide, progress: Progress
+    run: RunFolder,
+    observer: RenderedFeatures,
+    net: FeatureNet,
+    real: Tensor,
+    guide: Guide,
+    labels: PartialLabels | None,
+    progress: Progress,
 ) -> str:
     """Keep the guide or the prior; sentences where it is the prior, where a class that cannot be read has another
     number than in the prior, and where the labels' histogram is better than what was learnt, else nothing.
@@ -54,18 +60,19 @@ def conclude(
     Args:
         net: what it learnt by.
         real: ``(L, D)``.
+        labels: of some of the images.
     """
-    if not run.preset.prior_if_worse:
+    if not run.config.fallback_to_prior:
         run.write_tensors("guide", guide.state_dict() | beside(run.read_tensors(NAME) or {}))
         return ""
     which = compared(net)
     which = slice(None) if which is None else which
     found, numbers = [], []
-    number = min(SCENES, 2 * run.preset.num_scenes)
+    number = min(SCENES, 2 * run.config.structure.num_scenes)
     policies: tuple[Policy, ...] = (guide.eval(), run.model.prior)
     for i, policy in enumerate(policies):
         seed_everything(batch_seed(run.record["seed"], 4, i))
-        draws = 1 if policy.suits else run.preset.draws_per_structure
+        draws = 1 if policy.suits else run.config.structure.draws_per_structure
         observe, parts, counts = observer.observe(net, draws), [], []
         for first in range(0, number, RENDERED_AT_ONCE):
             scenes = sample(run.model, policy, min(RENDERED_AT_ONCE, number - first), density=False)
@@ -80,7 +87,7 @@ def conclude(
         unread = run.unread
         kinds = {kind: i for i, kind in enumerate(run.model.grammar.kinds) if kind in unread}
         changed = moved(numbers[0], numbers[1], kinds)
-        worse = {} if run.few is None else worse_than_labels(run.few, _class_counts(net, found[0], which))
+        worse = {} if labels is None else worse_than_labels(labels, _class_counts(net, found[0], which))
         more = {"moved": changed, "worse_than_labels": worse}
         run.write_outcome(record | {name: what for name, what in more.items() if what})
         run.write_tensors("guide", guide.state_dict() | beside(run.read_tensors(NAME) or {}))

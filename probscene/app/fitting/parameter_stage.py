@@ -6,7 +6,7 @@ that one digest is of both. Axis letters: L images, C H W.
 
 from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,35 +15,32 @@ from probscene.dataset import Images
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.backbone import Backbone, RenderBackbone
-from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
-from probscene.inference.parameters.meta_sim.transform import ParameterTransform
+from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.reader_counts import of_counts
-from probscene.inference.parameters.sites import Site
+from probscene.inference.parameters.schedule import ParameterSchedule
+from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.training import Training, batch_seed
-from probscene.policy import Policy
 from probscene.sampling import seed_everything
 from probscene.scenarios import JointGrammar
 
 from ..progress import Progress
+from .config import LIKELIHOOD
 from .image_level import ImageLevelTraining, meta_sim_learning, sites_record, tilting_learning
+from .learnt_parameters import NAME, beside, with_parameters
 from .plugins import inner
-from .preset import LIKELIHOOD, META_SIM
 from .rendered_features import RenderedFeatures
+from .run import RunFolder
 from .site_selection import held_out, select_sites, settling
 from .store import Checkpointer
 
-if TYPE_CHECKING:
-    from .run import RunFolder
-
-NAME = "parameters"  # of the file with the record, and before the names of tensors beside a guide's
 READER = "reader"  # of the file with what finds objects, until structure was learnt again
 HELD = 5  # one image of the target in so many is not learnt from, and judges
 JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and where these are too few to tell which sites are learnt
 
 
 def learn_parameters(
-    run: "RunFolder",
+    run: RunFolder,
     observer: RenderedFeatures,
     net: FeatureNet,
     guide: Guide,
@@ -63,8 +60,9 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     seed_everything(batch_seed(run.record["seed"], 5))
-    eye, method = Backbone.of(inner(net)), run.preset.parameter_method
-    by_reading, joint = method == LIKELIHOOD, method == META_SIM and isinstance(run.model.grammar, JointGrammar)
+    eye, schedule = Backbone.of(inner(net)), run.config.parameters
+    by_reading = isinstance(schedule, ParameterSchedule)
+    joint = isinstance(schedule, MetaSimSchedule) and isinstance(run.model.grammar, JointGrammar)
     if joint or (by_reading and eye is None):
         who = "models of several scenarios are" if joint else f"{run.features.name} features are"
         say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
@@ -73,22 +71,23 @@ def learn_parameters(
     if kept is None:
         target = images()
         held = torch.arange(len(target)) % HELD == HELD - 1
-        if by_reading and eye is not None:
+        if isinstance(schedule, ParameterSchedule) and eye is not None:
             learning = ParameterLearning(
                 run.model,
                 guide,
                 eye,
                 observer.labelled,
-                cache(lambda: _some(target, ~held, run.preset.parameters.images)),
-                run.preset.parameters,
+                cache(lambda: _some(target, ~held, schedule.images)),
+                schedule,
                 batch_seed(run.record["seed"], 5),
                 held_out(run, guide, _some(target, held, JUDGED)),
-                settling(run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED)),
+                settling(run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED), schedule.sure),
             )
-        elif method == META_SIM:
-            learning = meta_sim_learning(run, observer, guide, _some(target, ~held, run.preset.meta_sim.images))
+        elif isinstance(schedule, MetaSimSchedule):
+            learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
         else:
-            learning = tilting_learning(run, observer, guide, _some(target, ~held, run.preset.tilting.images))
+            assert isinstance(schedule, TiltingSchedule)
+            learning = tilting_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
         keep = Checkpointer(run, NAME, learning)
 
         def each(training: Training, line: dict[str, float]) -> None:
@@ -105,44 +104,7 @@ def learn_parameters(
         run.write_tensors(NAME, kept)
         (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
     say(_said(run.parameters))
-    with_parameters(run, guide, beside(kept))
-
-
-def beside(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors of learnt parameters under the names that they have beside a guide's."""
-    return {f"{NAME}.{key}": value for key, value in tensors.items()}
-
-
-def apart(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """A guide's own tensors, and those of parameters beside them."""
-    own = {key: value for key, value in tensors.items() if not key.startswith(f"{NAME}.")}
-    return own, {key: value for key, value in tensors.items() if key not in own}
-
-
-def with_parameters(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> Policy:
-    """A policy whose scenes have the run's learnt parameters, in place; as it is where none are kept."""
-    if tensors and run.parameters.get("kept") == "learnt":
-        policy.suits = learnt_by(run, policy, tensors).suited
-    return policy
-
-
-def learnt_by(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> ParameterGuide | ParameterTransform:
-    """What a run has learnt of parameters, whether it is kept or not.
-
-    Args:
-        policy: of the structures.
-        tensors: see ``beside``.
-    """
-    record, schedule = run.parameters, run.preset.meta_sim
-    fitted = [site for site in record["sites"] if site.get("fitted", site["learnt"])]
-    sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in fitted)
-    if record.get("method") == META_SIM:
-        guide = ParameterTransform(run.model, sites, policy, schedule.hidden, schedule.rounds)
-    else:
-        guide = ParameterGuide(run.model, sites, policy)
-        guide.passed = frozenset(site["name"] for site in fitted if not site["learnt"])
-    guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
-    return guide.eval()
+    with_parameters(run.model, run.config, run.parameters, guide, beside(kept))
 
 
 def _some(images: Images, which: Tensor, most: int) -> Tensor:
@@ -153,14 +115,14 @@ def _some(images: Images, which: Tensor, most: int) -> Tensor:
 
 
 def _record(
-    run: "RunFolder",
+    run: RunFolder,
     guide: Guide,
     learning: ParameterLearning | ImageLevelTraining,
     held: Tensor,
     more: Callable[[], Tensor],
 ) -> dict[str, Any]:
     """For JSON, see ``select_sites``."""
-    method = {"method": run.preset.parameter_method}
+    method = {"method": run.config.parameter_method}
     if not isinstance(learning, ParameterLearning):
         return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held, more).distances}
     assert learning.tried.skill is not None

@@ -7,8 +7,10 @@ result. Labels play no part, but for a handful that a feature network may be giv
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,9 +24,9 @@ from probscene.policy import Policy
 from probscene.sampling import seed_everything
 from probscene.threads import threads
 
-from ..files import write_text
+from ..files import write_json, write_text
 from ..labels.partial_labels import PartialLabels, PartlyLabelled
-from ..progress import Progress
+from ..progress import Display, Progress
 from ..workers.cluster import Cluster
 from .cache import NetworkCache
 from .outcome import compared, conclude, give_up
@@ -33,39 +35,65 @@ from .plugins import inner
 from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import RunFolder
 from .scene_features import fingerprint
-from .store import Checkpointer, load_state, state_of
+from .store import OTHER, TIMING, Checkpointer, load_state, state_of, timing
 from .structure_stage import AGAIN, FIRST, learn_structure, learn_structure_again
 
-Say = Callable[[str], None]
-"""Told a sentence that a person should know."""
+STAGES = (
+    "reading", "likeness", "looking", "features", "readings", "target", "pretraining", "structure", "parameters",
+    "structure-again", "outcome",
+)  # fmt: skip
+"""Of ``progress.STAGES``, in their order."""
 
 
-def fit(
-    run: RunFolder,
-    progress: Progress,
-    target: Images | None = None,
-    cache_in: Path | None = None,
-    use_cache: bool = True,
-    say: Say | None = None,
-    labels: PartialLabels | None = None,
-    cluster: Cluster | None = None,
-) -> Policy:
-    """Finish a run: take the stages that it lacks.
+class Begun(NamedTuple):
+    """A run that can be carried out.
+
+    Attributes:
+        run: its folder.
+        images: of the target; None where the fit is finished, or where they are opened when they are asked for.
+        labels: of some of the images.
+        net: its feature network, untrained, where it was built already.
+    """
+
+    run: RunFolder
+    images: Images | None = None
+    labels: PartialLabels | None = None
+    net: FeatureNet | None = None
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How a fit is computed. Nothing of it but ``threads`` changes a result.
 
     Args:
-        target: the run's target images, where they are open already.
-        cache_in: the folder in which trained feature networks are kept; the user's cache where None.
-        use_cache: whether to look there at all.
-        say: is told where a network came from there.
-        labels: of some of the target's images, for features that take them.
-        cluster: of which all nodes render scenes and read them while structure is learnt. They have to see the run's
-            folder by the same path.
+        threads: of torch; as ``OMP_NUM_THREADS`` says, else all cores, where None. Another number rounds differently.
+        cluster: the address of a Ray cluster whose nodes render scenes and read them while structure is learnt, see
+            ``Cluster``. They have to see the run's folder by the same path.
+        cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
+        folder. progress: show it, on stderr.
+    """
+
+    threads: int | None = None
+    cluster: str | None = None
+    cache: Path | str | bool = True
+    progress: bool = True
+
+
+def carry_out(begun: Begun, show: Display, cache: Path | str | bool = True, cluster: Cluster | None = None) -> Policy:
+    """Finish a fit: take the stages that it lacks. ``timing.json`` in the run's folder then holds the seconds that each
+    stage has taken, over all sittings that were not killed, and as ``other`` those that no stage has: together they are
+    the whole.
+
+    Args:
+        cache: see ``Execution``.
+        cluster: of which all nodes render scenes and read them while structure is learnt.
 
     Raises:
         DataError: the target cannot be used: see ``check_target`` and ``check_features``.
         RunError: it is not the one that the run was begun with.
         ProbsceneError: something in the fit is no longer finite; the last checkpoint stays.
     """
+    run, before = begun.run, timing(begun.run)
     if run.is_finished:
         return run.guide
     if cluster is not None and run.objects:
@@ -73,49 +101,52 @@ def fit(
             f"expected no cluster for a fit with parts in memory alone ({', '.join(run.objects)}); put model and parts "
             "in files, which nodes can open."
         )
-    images = cache(lambda: open_target(run, progress) if target is None else target)
+    try:
+        return _take_stages(begun, show, cache, cluster)
+    finally:
+        now = {stage: show.seconds.get(stage, 0.0) for stage in STAGES}
+        now[OTHER] = show.elapsed - sum(show.seconds.values())
+        spent = {stage: before.get(stage, 0.0) + seconds for stage, seconds in now.items()}
+        write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
+
+
+def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, cluster: Cluster | None) -> Policy:
+    run = begun.run
+    images = cache(lambda: open_target(run, show) if begun.images is None else begun.images)
     observer = RenderedFeatures(run.model, run.record["threads"])
     with threads(run.record["threads"]):
-        net = _Network(run, observer, progress, images, labels)
-        net.finish(cache_in, use_cache, say or (lambda text: None))
+        net = _Network(begun, observer, show, images)
+        net.finish(cache_in)
         run.keep_network(net.net)
-        real = _real_features(run, net.net, progress, images)
+        real = _real_features(run, net.net, show, images)
     which = compared(net.net)
     with threads(1):  # the guide's tensors are tiny: a second thread only waits
         if which is not None and not which.any():
-            said = give_up(run)
+            message = give_up(run)
         else:
-            guide = learn_structure(run, observer, net.net, real, progress, cluster)
-            if "parameters" in run.preset.learn:
+            guide = learn_structure(run, observer, net.net, real, show, cluster)
+            if run.config.parameters is not None:
                 with threads(run.record["threads"]):
-                    learn_parameters(run, observer, net.net, guide, images, progress, say or (lambda text: None))
-                learn_structure_again(run, net.net, real, guide, images, progress, cluster)
-            said = conclude(run, observer, net.net, real[: len(images())], guide, progress)
+                    learn_parameters(run, observer, net.net, guide, images, show, show.say)
+                learn_structure_again(run, net.net, real, guide, images, show, cluster)
+            message = conclude(run, observer, net.net, real[: len(images())], guide, begun.labels, show)
     for name in (f"{FIRST}-checkpoint", f"{AGAIN}-checkpoint", READER):
         (run.path / f"{name}.safetensors").unlink(missing_ok=True)
-    if said and say is not None:
-        say(said)
+    if message:
+        show.say(message)
     return run.guide
 
 
 class _Network:
     """The run's feature network on its way to being trained."""
 
-    def __init__(
-        self,
-        run: RunFolder,
-        observer: RenderedFeatures,
-        progress: Progress,
-        target: Callable[[], Images],
-        labels: PartialLabels | None,
-    ):
-        self.run, self.observer, self.progress, self.target = run, observer, progress, target
-        self.photographs = cache(lambda: PartlyLabelled(target(), labels))
-        seed_everything(batch_seed(run.record["seed"], 0))
-        self.net = run.build_network() if run.built is None else run.built
-        run.built = None
+    def __init__(self, begun: Begun, observer: RenderedFeatures, show: Display, target: Callable[[], Images]):
+        self.run, self.observer, self.progress, self.say, self.target = begun.run, observer, show, show.say, target
+        self.photographs = cache(lambda: PartlyLabelled(target(), begun.labels))
+        seed_everything(batch_seed(self.run.record["seed"], 0))
+        self.net = self.run.build_network() if begun.net is None else begun.net
 
-    def finish(self, folder: Path | None, use_cache: bool, say: Say) -> None:
+    def finish(self, cache_in: Path | str | bool) -> None:
         """Load it from the run or from the cache, else train it."""
         run, net = self.run, self.net
         tensors = run.read_tensors("features")
@@ -125,32 +156,33 @@ class _Network:
             return
         training = run.features.training(inner(net), self.observer, self.photographs, run.record["seed"])
         if training is not None:
-            self._finish(training, folder, use_cache, say)
+            self._finish(training, cache_in)
         _ready(net)
         found = run.features.adapt(inner(net), self.photographs, partial(self.progress, "readings"))
         if found:
             run.write_readings(found)
             for name, line in found.get("classes", {}).items():
-                say(f"{name}: {line['because']}.")
+                self.say(f"{name}: {line['because']}.")
         run.write_tensors("features", state_of(net))
         (run.path / "features-checkpoint.safetensors").unlink(missing_ok=True)
 
-    def _finish(self, training: Training, folder: Path | None, use_cache: bool, say: Say) -> None:
+    def _finish(self, training: Training, cache_in: Path | str | bool) -> None:
         """Load what was trained before from the cache, else train."""
         run, net = self.run, self.net
         taught = run.features.target_fingerprint(inner(net))
-        kept = NetworkCache(run, inner(net), folder, taught) if use_cache else None
+        folder = None if isinstance(cache_in, bool) else Path(cache_in)
+        kept = NetworkCache(run, inner(net), folder, taught) if cache_in is not False else None
         cached = None if kept is None else kept.load()
         if cached is not None and kept is not None:
             write_text(run.path / "log.jsonl", "".join(f"{line}\n" for line in cached.lines))
             load_state(net, cached.tensors)
-            say(f"The feature network was trained before; it is in {kept.file}.")
+            self.say(f"The feature network was trained before; it is in {kept.file}.")
         else:
-            lines = self._train(training, say)
+            lines = self._train(training)
             if kept is not None:
                 kept.save(state_of(net), lines)
 
-    def _train(self, training: Training, say: Say) -> list[str]:
+    def _train(self, training: Training) -> list[str]:
         keep = Checkpointer(self.run, "features", training)
         self._check_taught()
 
@@ -168,7 +200,7 @@ class _Network:
         if summary:
             keep.lines.append(json.dumps(summary))
         if summary.get("accuracy", 1.0) < summary.get("demanded", 0.0):
-            say(f"The network is right in {summary['accuracy']:.0%}; the paper demands {summary['demanded']:.0%}.")
+            self.say(f"The network is right in {summary['accuracy']:.0%}; the paper demands {summary['demanded']:.0%}.")
         keep.finish()
         return keep.lines
 
@@ -187,14 +219,14 @@ def _ready(net: FeatureNet) -> None:
 
 
 def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: Callable[[], Images]) -> Tensor:
-    """Of every image, ``(L, D)``, then of the preset's further views, kept apart: a verdict is about L images."""
+    """Of every image, ``(L, D)``, then of its further crops, kept apart: a verdict is about L images."""
     images = target()
     cached = run.read_tensors("real")
     if cached is not None:
         if not torch.equal(fingerprint(images), cached["fingerprint"]):
             raise _others(images)
         return torch.cat([cached["features"], *([cached["views"]] if "views" in cached else [])])
-    views, done = run.preset.views, 0
+    views, done = run.config.num_crops, 0
 
     def each(number: int) -> None:
         nonlocal done

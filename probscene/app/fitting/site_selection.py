@@ -6,7 +6,7 @@ Axis letters: L images, C H W.
 import hashlib
 from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,9 +26,7 @@ from probscene.sampling import sample, seed_everything
 
 from .image_level import ImageLevelTraining
 from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
-
-if TYPE_CHECKING:
-    from .run import RunFolder
+from .run import RunFolder
 
 QUANTILES = np.linspace(0, 1, 21)
 LEAST_MOVED = 0.1  # of u; readings of little skill are off by as much in renders that merely resemble the target
@@ -55,7 +53,7 @@ class SiteSelection(NamedTuple):
 
 
 def select_sites(
-    run: "RunFolder",
+    run: RunFolder,
     guide: Guide,
     learning: ParameterLearning | ImageLevelTraining,
     held: Tensor,
@@ -115,7 +113,7 @@ def select_sites(
 
 
 def settling(
-    run: "RunFolder", guide: Guide, held: Callable[[bool], Tensor]
+    run: RunFolder, guide: Guide, held: Callable[[bool], Tensor], sure: bool
 ) -> Callable[[ParameterLearning, bool], frozenset[str]]:
     """What names sites that keep their prior, of those that are read well, as ``select_sites`` will have it: after each
     training of the guide, and for good before the others are learnt, which is done from renders that look like the
@@ -123,8 +121,9 @@ def settling(
 
     Args:
         held: images by which it is told, ``(L, C, H, W)`` uint8; with True many, for good and where one has to be sure.
+        sure: keep only sites that are surely nearer, see ``ParameterSchedule``.
     """
-    sure, look = run.preset.parameters.sure, _embed()
+    look = _embed()
     known: dict[bytes, frozenset[str]] = {}
 
     @cache
@@ -246,13 +245,13 @@ def _share(of: dict[str, tuple[Tensor, Tensor]], far: str, near: str) -> float:
     return apart.share if apart.one > apart.other else 0.0
 
 
-def _compared(run: "RunFolder", model: SceneModel, guide: Guide, number: int, name: str) -> Tensor:
+def _compared(run: RunFolder, model: SceneModel, guide: Guide, number: int, name: str) -> Tensor:
     """Renders with learnt parameters, or with the prior's."""
     seed_everything(batch_seed(run.record["seed"], 6, int(name == "prior")))
     return _renders(run, model, guide, number)
 
 
-def held_out(run: "RunFolder", guide: Guide, held: Tensor) -> HeldOutSet:
+def held_out(run: RunFolder, guide: Guide, held: Tensor) -> HeldOutSet:
     """What judges guides while they are trained, by the same images and features. It remembers the latest weights'."""
     embed = _embed()
     of, known = b"", dict[frozenset[str], Features]()
@@ -286,7 +285,7 @@ def _embed() -> Callable[[Tensor], Features]:
     return lambda images: embed(images).double().numpy()
 
 
-def _renders(run: "RunFolder", model: SceneModel, guide: Guide, number: int) -> Tensor:
+def _renders(run: RunFolder, model: SceneModel, guide: Guide, number: int) -> Tensor:
     observer = RenderedFeatures(model, run.record["threads"])
     sizes = [min(RENDERED_AT_ONCE, number - i) for i in range(0, number, RENDERED_AT_ONCE)]
     return torch.cat([observer.labelled(sample(model, guide, size, density=False)).image for size in sizes])

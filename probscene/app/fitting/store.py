@@ -35,7 +35,7 @@ from ..modules import file_digest
 from .plugins import IN_MEMORY, inner
 
 TIMING, OTHER = "timing.json", "other"  # OTHER: seconds of no stage
-FORMAT = 3  # of the run folder; another number is not read
+FORMAT, READABLE = 4, (3, 4)  # of the run folder, as it is written and as it can be read
 READINGS, OUTCOME, PARAMETERS = "readings.json", "outcome.json", "parameters.json"
 SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
 KEYS = {"model", "model_sha256", "assets"}  # that every run.json has
@@ -86,9 +86,11 @@ class Storage:
     def objects(self) -> dict[str, str]:
         """Which of model, features, divergence and guide were in memory alone, and what each was called: the folder
         cannot give them back."""
-        record, preset = self.record, self.record.get("preset", {})
-        words = {"model": record.get("model", ""), "features": preset.get("features", "")}
-        words |= {"divergence": preset.get("objective", ""), "guide": record.get("guide", {}).get("kind", "")}
+        record, config, preset = self.record, self.record.get("config", {}), self.record.get("preset", {})
+        parts = {"features": preset.get("features"), "divergence": preset.get("objective")}
+        parts["guide"] = record.get("guide", {}).get("kind")
+        parts = {"model": record.get("model"), **(config or parts)}
+        words = {name: word for name, word in parts.items() if isinstance(word, str)}
         return {name: word[len(IN_MEMORY) :] for name, word in words.items() if word.startswith(IN_MEMORY)}
 
     @property
@@ -210,11 +212,11 @@ def read_record(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         written = record["format"]
-        if written == FORMAT and not KEYS <= record.keys():
+        if written in READABLE and not KEYS <= record.keys():
             raise KeyError(*(KEYS - record.keys()))
     except (ValueError, KeyError, TypeError) as error:
         raise RunError(f"expected JSON of a run in {file}, got something else; fit again.") from error
-    if written != FORMAT:
+    if written not in READABLE:
         raise RunError(
             f"expected a run of format {FORMAT}, got format {written} in {path}: another version of probscene "
             f"({record.get('version', 'unknown')}) wrote it. Use that version, or fit again."

@@ -30,10 +30,11 @@ from probscene.sampling import sample, seed_everything
 from ..progress import Progress
 from ..workers.actor_pool import ActorPool
 from ..workers.cluster import Cluster
+from .config import ScoreFunctionTraining
+from .learnt_parameters import NAME, beside, with_parameters
 from .outcome import compared
-from .parameter_stage import NAME, READER, beside, with_parameters
+from .parameter_stage import READER
 from .plugins import inner
-from .preset import Preset
 from .rendered_features import RENDERED_AT_ONCE, Chunk, Observe, RenderedFeatures
 from .run import RunFolder
 from .store import Checkpointer
@@ -60,30 +61,31 @@ def learn_structure(
     Raises:
         ProbsceneError: a cost or a parameter is no longer finite.
     """
-    preset, seed = run.preset, run.record["seed"]
+    training, seed = run.config.structure, run.record["seed"]
     seed_everything(batch_seed(seed, 2))
     guide, known = run.new_guide(), run.read_tensors(BEFORE)
     if known is not None:
         guide.load_state_dict(known)
         return guide
-    pool, crew = _pool(run, run.model), _crew(run, cluster, preset.draws_per_structure)
-    observe = observer.resample_and_embed(net, preset.draws_per_structure, crew)
+    pool, crew = _pool(run, run.model), _crew(run, cluster, training.draws_per_structure)
+    observe = observer.resample_and_embed(net, training.draws_per_structure, crew)
     objective = _objective(run, run.model, observe, net, guide, pool)
-    rate, seeds = preset.learning_rate, batch_seed(seed, 3)
-    trainer = _trainer(run, run.model, guide, objective, real, preset.batches, rate, seeds, pool)
+    rate, seeds = training.learning_rate, batch_seed(seed, 3)
+    trainer = _trainer(run, run.model, guide, objective, real, training.batches, rate, seeds, pool)
     keep = Checkpointer(run, FIRST, trainer)
     if trainer.done == 0:
-        epochs = preset.pretrain_epochs
+        pretraining = run.config.pretrain
+        epochs = pretraining.epochs
         pretrain(
             guide,
             run.model.pretraining_policy,
-            preset.pretrain_derivations,
+            pretraining.derivations,
             epochs,
-            learning_rate=preset.pretrain_rate,
+            learning_rate=pretraining.learning_rate,
             progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
         )
     _run(trainer, keep, "structure", progress, crew)
-    if "parameters" in preset.learn:
+    if run.config.parameters is not None:
         run.write_tensors(BEFORE, guide.state_dict())
     return guide
 
@@ -109,8 +111,8 @@ def learn_structure_again(
     Raises:
         ProbsceneError: a cost or a parameter is no longer finite.
     """
-    preset, seed = run.preset, run.record["seed"]
-    if guide.suits is None or not preset.batches_again:
+    config, seed = run.config, run.record["seed"]
+    if guide.suits is None or config.refine is None or not config.refine.batches:
         return
     seed_everything(batch_seed(seed, 8))
     model = guide.suits(run.model)
@@ -123,8 +125,8 @@ def learn_structure_again(
         net, real = finder, embed_all(finder, images().batches(RENDERED_AT_ONCE))
     pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True, finder=finder is not None)
     objective = _objective(run, model, observer.resample_and_embed(net, 1, crew), net, guide, pool)
-    rate, seeds = SLOWER * preset.learning_rate, batch_seed(seed, 7)
-    trainer = _trainer(run, model, guide, objective, real, preset.batches_again, rate, seeds, pool)
+    rate, seeds = SLOWER * config.structure.learning_rate, batch_seed(seed, 7)
+    trainer = _trainer(run, model, guide, objective, real, config.refine.batches, rate, seeds, pool)
     seen = _seen(run, observer, net, guide)
     _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
     which = compared(net)
@@ -138,7 +140,7 @@ def _seen(run: RunFolder, observer: RenderedFeatures, net: FeatureNet, guide: Gu
     """Features of scenes of the guide, as many as a batch has."""
     seed_everything(batch_seed(run.record["seed"], 9))
     with torch.no_grad():
-        return observer.observe(net)(sample(run.model, guide, run.preset.num_scenes))
+        return observer.observe(net)(sample(run.model, guide, run.config.structure.num_scenes))
 
 
 def _finder(run: RunFolder, net: FeatureNet, observer: RenderedFeatures, guide: Guide) -> ReaderCounts | None:
@@ -149,7 +151,7 @@ def _finder(run: RunFolder, net: FeatureNet, observer: RenderedFeatures, guide: 
     seed_everything(batch_seed(run.record["seed"], 10))
     kinds = [run.model.grammar.kind(name) for name in run.model.classes]
     with torch.no_grad():
-        scenes = sample(run.model, guide, run.preset.num_scenes)
+        scenes = sample(run.model, guide, run.config.structure.num_scenes)
         drawn = scenes.derivation.counts(len(run.model.grammar.kinds))[:, kinds]
         of_finder, of_network = (_wrong(observer.observe(one)(scenes)[:, : len(kinds)], drawn) for one in (finder, net))
     return finder if of_finder < of_network else None
@@ -167,7 +169,7 @@ def _reader_counts(run: RunFolder, net: FeatureNet) -> ReaderCounts | None:
 
 
 def _pool(run: RunFolder, model: SceneModel) -> RenderCache | None:
-    return RenderCache(model, run.preset.reuse) if run.preset.reuse else None
+    return RenderCache(model, size) if (size := run.config.structure.render_cache) else None
 
 
 def _crew(
@@ -182,8 +184,10 @@ def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> C
     run = RunFolder.at(path)
     model, net = run.model, run.network()
     assert net is not None
-    if again and (suits := with_parameters(run, run.new_guide(), beside(run.read_tensors(NAME) or {})).suits):
-        model = suits(model)
+    if again:
+        tensors = beside(run.read_tensors(NAME) or {})
+        suits = with_parameters(model, run.config, run.parameters, run.new_guide(), tensors).suits
+        model = model if suits is None else suits(model)
     net = (_reader_counts(run, net) if finder else None) or net
     observer = RenderedFeatures(model, run.record["threads"])
     return lambda part: observer.part(part, net, draws_per_structure)
@@ -197,15 +201,16 @@ def _objective(
     guide: Guide,
     pool: RenderCache | None,
 ) -> ScoreFunction:
-    held = PriorCountPenalty(model, {*run.unread, *(model.stuff if run.readings else ())}, run.preset.num_scenes)
+    kinds = {*run.unread, *(model.stuff if run.readings else ())}
+    held = PriorCountPenalty(model, kinds, run.config.structure.num_scenes)
     observe = held.beside(observe if pool is None else pool.around(observe))
-    return score_function(run.preset, model, observe, held.added_to(run.divergence(inner(net))), guide)
+    return score_function(run.config.structure, model, observe, held.added_to(run.divergence(inner(net))), guide)
 
 
 def score_function(
-    preset: Preset, model: SceneModel, observe: Observe, divergence: Divergence, guide: Guide
+    training: ScoreFunctionTraining, model: SceneModel, observe: Observe, divergence: Divergence, guide: Guide
 ) -> ScoreFunction:
-    """The loss by which a guide of the model learns, with the preset's settings.
+    """The loss by which a guide of the model learns, with the configured settings.
 
     Args:
         observe: features ``(N, D)`` of a batch of scenes.
@@ -214,13 +219,13 @@ def score_function(
     return ScoreFunction(
         observe,
         divergence,
-        baseline=preset.baseline,
-        updates=preset.updates,
-        scale=preset.scale,
+        baseline=training.baseline,
+        updates=training.updates,
+        scale=training.scale,
         strata=guide.strata,
-        incompletion_weight=preset.incompletion_weight,
+        incompletion_weight=training.incompletion_weight,
         prior=model.pretraining_policy,
-        prior_kl_weight=preset.prior_kl_weight,
+        prior_kl_weight=training.prior_kl_weight,
     )
 
 
@@ -235,9 +240,9 @@ def _trainer(
     seed: int,
     pool: RenderCache | None,
 ) -> Trainer:
-    preset = run.preset
-    scenes, images = preset.num_scenes, preset.num_real
-    return Trainer(model, guide, objective, real, batches, scenes, images, rate, preset.cosine, seed, pool)
+    training = run.config.structure
+    scenes, images = training.num_scenes, training.num_real
+    return Trainer(model, guide, objective, real, batches, scenes, images, rate, training.cosine, seed, pool)
 
 
 def _run(trainer: Trainer, keep: Checkpointer, stage: str, progress: Progress, crew: ActorPool | None) -> None:

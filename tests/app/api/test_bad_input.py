@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import probscene as ps
-from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), np.uint8)
@@ -147,11 +146,11 @@ PARTS = {
     "a guide's object": ({"guide": 3}, r"a class of guides or a function.* got int"),
     "of one argument": ({"guide": lambda grammar: None}, r"the grammar and max_steps, got <lambda>\(grammar\)"),
     "unknown features": ({"features": "cuont"}, "features among count, .*FILE.py:NAME, got 'cuont'"),
-    "unknown divergence": ({"divergence": "kl"}, "an objective among kde, .*FILE.py:NAME, got 'kl'"),
+    "unknown divergence": ({"divergence": "kl"}, "a divergence among kde, .*FILE.py:NAME, got 'kl'"),
     "unknown guide": ({"guide": "gru"}, "a guide among lstm, .*FILE.py:NAME, got 'gru'"),
     "unknown preset": ({"preset": "fast"}, "a preset among quick, .* got 'fast'"),
     "unknown setting": ({"settings": {"batchs": 3}}, "a setting among .* got 'batchs'"),
-    "setting of another type": ({"settings": {"batches": 2.5}}, "batches=<int>, got '2.5'"),
+    "setting of another type": ({"settings": {"structure.batches": 2.5}}, "structure.batches=<int>, got '2.5'"),
     "negative seed": ({"seed": -1}, "a seed of 0 or more, got -1"),
     "no threads": ({"threads": 0}, "a positive number of threads, got 0"),
 }  # fmt: skip
@@ -160,7 +159,7 @@ PARTS = {
 @pytest.mark.parametrize("name", PARTS)
 def test_parts_that_are_wrong(quick, discs, name):
     options, message = PARTS[name]
-    short = {**discs.short, "count.steps": 2}
+    short = {**discs.short, "features.schedule.steps": 2}
     with pytest.raises(ps.ProbsceneError, match=f"^(At batch 1 of 4: )?expected .*{message}"):
         quick(discs.file, IMAGES, **{"settings": short, "features": "count", **options})
 
@@ -236,12 +235,12 @@ WORDS = {
     "no file": ("--guide", "nowhere.py:Guide", "expected a Python file, got '.*nowhere.py', which is not there"),
     "a file alone": ("--features", "FILE.py", "FILE.py:NAME, got '.*part.py'"),
     "a number as features": ("--features", "FILE.py:number", "got int; see probscene.Features"),
-    "a number as objective": ("--objective", "FILE.py:number", "expected a divergence, .* got int"),
+    "a number as divergence": ("--divergence", "FILE.py:number", "expected a divergence, .* got int"),
     "a number as guide": ("--guide", "FILE.py:number", "expected a class of guides .* got int"),
     "arguments": ("--features", "FILE.py:Needs", r"without arguments, got Needs\(size\)"),
     "features of a wrong shape": ("--features", "FILE.py:Wrong", r"Wrong\.embed .*\(40, 2\), got .*\(40, 1\)"),
-    "one cost": ("--objective", "FILE.py:mean", r"expected of mean one cost a generated scene"),
-    "an error in it": ("--objective", "FILE.py:broken", r"IndexError in .*part.py, line \d+: index 99 .*--debug"),
+    "one cost": ("--divergence", "FILE.py:mean", r"expected of mean one cost a generated scene"),
+    "an error in it": ("--divergence", "FILE.py:broken", r"IndexError in .*part.py, line \d+: index 99 .*--debug"),
     "logits": ("--guide", "FILE.py:Guide", r"expected of Guide\.step logits \(N, K\)"),
     "syntax": ("--guide", "broken.py:Guide", r"broken.py does not import: SyntaxError"),
 }
@@ -253,7 +252,7 @@ def test_the_command_line_says_it_in_one_line(call, discs, target, tmp_path, nam
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.py").write_text(FILE)
     (tmp_path / "broken.py").write_text("def f(:\n")
-    short = [*discs.settings, "--set", "count.steps=2", option, word.replace("FILE", "part")]
+    short = [*discs.settings, "--set", "features.schedule.steps=2", option, word.replace("FILE", "part")]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *short)
     (line,) = [line for line in done.err.splitlines() if line.startswith("probscene: ")]
     assert done.code == 2 and "Traceback" not in done.err
@@ -264,5 +263,5 @@ def test_the_command_line_says_it_in_one_line(call, discs, target, tmp_path, nam
 
 def test_a_file_named_by_a_setting_is_found_from_everywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    preset = override(QUICK, ["guide=part.py:Guide"])
-    assert preset.guide == f"{tmp_path.resolve() / 'part.py'}:Guide"
+    config = QUICK.set("guide=part.py:Guide")
+    assert config.guide == f"{tmp_path.resolve() / 'part.py'}:Guide"

@@ -157,8 +157,8 @@ def test_a_pretrained_network_is_built_once_a_fit(quick, discs, target, monkeypa
     built = []
     monkeypatch.setattr(pretrained, "pretrained", lambda choice: built.append(choice) or Means())
     monkeypatch.setattr(pretrained, "weights_file", lambda choice: None)
-    few = {key: value for key, value in discs.short.items() if not key.startswith(("count", "width", "parameters"))}
-    few |= {"pairs": 60, "directions": 2}
+    few = {key: value for key, value in discs.short.items() if not key.startswith(("features", "parameters"))}
+    few |= {"features.pairs": 60, "features.directions": 2}
     run = quick(discs.file, target.images, features="efficientnet", settings=few)
     run.evaluate(num=50, progress=False)
     run.sample(2)
@@ -179,14 +179,12 @@ def test_resuming_takes_what_the_run_was_begun_with(quick, discs, target, python
         quick(discs.file, target.images, out=python_run.path)
 
 
-def test_resuming_does_not_ask_for_settings_that_nothing_reads(quick, discs, target, python_run):
-    assert python_run.preset.parameter_method == "likelihood"
-    begun, out = python_run.preset, python_run.path
-    other = replace(begun, tilting=replace(begun.tilting, rounds=begun.tilting.rounds + 1))
-    again = quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
+def test_resuming_names_the_setting_that_differs(quick, discs, target, python_run):
+    out, begun = python_run.path, python_run.config
+    again = quick(discs.file, target.images, preset=begun, settings=(), out=out, resume=True)
     assert learnt(again) == learnt(python_run)
-    other = replace(begun, parameters=replace(begun.parameters, rounds=begun.parameters.rounds + 1))
-    with pytest.raises(ps.RunError, match="expected the parameters that the run"):
+    other = begun.set({"parameters.rounds": begun.parameters.rounds + 1})
+    with pytest.raises(ps.RunError, match="expected the parameters.rounds that the run"):
         quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
 
 

@@ -28,8 +28,8 @@ from probscene.app.evaluation.components import (
     unread_sites,
 )
 from probscene.app.evaluation.diagnose import diagnose
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import BOTH, LIKELIHOOD, META_SIM, STRUCTURE, TILTING
+from probscene.app.fitting.config import LIKELIHOOD, META_SIM, TILTING, FitConfig
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.views import verdict_text
@@ -84,10 +84,16 @@ def fitted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("line")
     generate_scenes(dots(), TRUTH, 240, folder / "target", format="images")
     images = ImageFolder(folder / "target" / "images", (64, 64), 3)
-    settings = {"count.steps": 200, "count.images": 8, "width": "8,16,32", "batches": 1, "num_scenes": 60}
-    settings |= {"pretrain_derivations": 100, "pretrain_epochs": 1}
-    more = {"learn": "structure", "features": "count", "threads": 1, "cache": False, "progress": False}
-    fit(dots(24.0), images.path, "quick", settings=settings, out=folder / "run", **more)
+    settings = {
+        "features.schedule.steps": 200,
+        "features.schedule.images": 8,
+        "features.width": "8,16,32",
+        "structure.batches": 1,
+        "structure.num_scenes": 60,
+    }
+    settings |= {"pretrain.derivations": 100, "pretrain.epochs": 1}
+    config = preset("quick").set("features=count", "parameters=none", settings)
+    fit(dots(24.0), images.path, config, out=folder / "run", execution=Execution(1, cache=False, progress=False))
     return SimpleNamespace(path=folder / "run", images=images)
 
 
@@ -181,22 +187,23 @@ def test_sites_that_could_not_be_read_are_named(fitted):
 def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, learnt):
     """Whatever it tells to be set is a setting of the way that was taken, and to be twice what it was."""
     site = {"name": "light", "kinds": [], "learnt": learnt, "skill": None, "because": ""}
-    chosen = override(preset("quick"), [f"parameter_method={method}"])
-    run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]}, preset=chosen)
+    chosen = preset("quick").set(f"parameters={method}")
+    run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]}, config=chosen)
     figures = SimpleNamespace(left=None, high=None)
     said = remedy(run, "looks", Grade.NO_BETTER, figures, "More photographs would tell.")
-    named = re.findall(r"--set (\w+)\.(\w+)=(\d+)", said)
+    named = re.findall(r"--set ([\w.]+)=(\d+)", said)
     assert said.count("--set") == len(named) and learnt <= bool(named)
-    assert all(int(value) == 2 * getattr(getattr(chosen, part), field) for part, field, value in named)
-    assert not {part for part, *_ in named} & set(chosen.unread())
+    assert all(int(value) == 2 * chosen.flat()[path] for path, value in named)
 
 
 @pytest.mark.parametrize("verdict", Verdict)
 @pytest.mark.parametrize("labelled", [True, False])
 def test_structure_that_is_read_wrongly_needs_labels_and_what_is_to_be_set_has_a_value(verdict, labelled):
-    run = SimpleNamespace(preset=preset("quick"), record={"labels": {}} if labelled else {})
+    run = SimpleNamespace(config=preset("quick"), record={"labels": {}} if labelled else {})
     said = of_structure(run, SimpleNamespace(verdict=verdict, remedy="Use it."))
-    assert "train" not in said and ("--set batches=120" in said) is (verdict in (Verdict.NOT_FITTED, Verdict.APART))
+    assert "train" not in said and ("--set structure.batches=120" in said) is (
+        verdict in (Verdict.NOT_FITTED, Verdict.APART)
+    )
     if verdict is Verdict.APART:
         assert ("label more images than this fit had" if labelled else "label ten images") in said
 
@@ -257,11 +264,10 @@ def test_a_site_is_in_doubt_where_it_keeps_a_prior_that_may_not_be_the_targets(o
     assert bool(unread_sites(run)) is (kept == "prior" or not of["learnt"])
 
 
-@pytest.mark.parametrize("learn", [STRUCTURE, BOTH])
-def test_sites_that_were_to_be_learnt_by_features_that_read_none_are_in_doubt(learn):
-    features, of = SimpleNamespace(name="presence"), SimpleNamespace(learn=learn)
-    run = SimpleNamespace(parameters={}, preset=of, features=features, model=dots(24.0))
-    assert set(doubtful_sites(run)) == (set() if learn == STRUCTURE else {"dot.x", "dot.off"})
+@pytest.mark.parametrize("config", [FitConfig(parameters=None), FitConfig()], ids=["structure", "both"])
+def test_sites_that_were_to_be_learnt_by_features_that_read_none_are_in_doubt(config):
+    run = SimpleNamespace(parameters={}, config=config, features=SimpleNamespace(name="presence"), model=dots(24.0))
+    assert set(doubtful_sites(run)) == (set() if config.parameters is None else {"dot.x", "dot.off"})
 
 
 @given(st.sampled_from([*Grade, None]), st.sampled_from(Verdict))

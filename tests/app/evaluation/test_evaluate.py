@@ -138,7 +138,7 @@ def test_what_was_read_of_each_image_is_held_against_its_labels(fitted, target):
     table = found_table(found)
     assert "Counts read in each labelled image" in table and f"{found.errors['red'].mean_absolute.value:.2f}" in table
     assert not evaluate(run, opened(target.images), None, quiet, num=20).errors
-    paper = RunFolder(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
+    paper = RunFolder(run.path, run.record | {"config": run.config.with_features("presence").to_record()})
     without = evaluate(paper, opened(target.images), labels(target.counts), quiet, num=20)
     assert without.errors == dict.fromkeys(CLASSES) and re.search(r"red +│ +- │ +- │ +- ", found_table(without))
 
@@ -191,7 +191,7 @@ def test_readings_are_compared_with_readings_so_that_the_networks_errors_cancel(
 
 def test_a_network_that_does_not_count_gives_no_estimate(fitted, target):
     run = RunFolder.at(fitted)
-    paper = RunFolder(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
+    paper = RunFolder(run.path, run.record | {"config": run.config.with_features("presence").to_record()})
     assert network_counts(paper, opened(target.images), quiet) is None
     assert list(evaluate(paper, None, None, quiet, num=20).sources) == ["prior", "learnt"]
 

@@ -77,7 +77,7 @@ def drawn(tmp_path_factory, discs):
 def seeing(call, drawn, discs, tmp_path_factory):
     """A run whose network has learnt to tell five discs from three; the one that all tests share has not."""
     out = tmp_path_factory.mktemp("seeing") / "run"
-    settings = [word.replace("count.steps=48", "count.steps=300") for word in discs.settings]
+    settings = [word.replace("features.schedule.steps=48", "features.schedule.steps=300") for word in discs.settings]
     done = call("fit", discs.file, "--target", drawn.target.path, "--out", out, *settings)
     assert done.code == 0 and "Verdict" not in done.out, done.err
     return out

@@ -153,11 +153,10 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
 
     monkeypatch.setattr(select_sites, "_renders", renders)
     monkeypatch.setattr(select_sites, "_embed", lambda: lambda images: images.double().numpy())
-    preset = SimpleNamespace(parameters=SimpleNamespace(sure=sure))
-    run = SimpleNamespace(record={"seed": 0}, preset=preset, model="prior")
+    run = SimpleNamespace(record={"seed": 0}, model="prior")
     torch.manual_seed(0)
     target = torch.randn(150, 4)
-    settle = select_sites.settling(run, None, lambda many: target[: 150 if many else 140])
+    settle = select_sites.settling(run, None, lambda many: target[: 150 if many else 140], sure)
     learning, found = Learning(), []
     first = learning.guide.net.weight.data
     for last in (False, False, True):

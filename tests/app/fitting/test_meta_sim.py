@@ -8,7 +8,6 @@ import torch
 
 from probscene.app.fitting import site_selection as select_sites
 from probscene.app.fitting import store as storage
-from probscene.app.fitting.preset import Preset
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
@@ -16,8 +15,8 @@ from probscene.inference.statistics.bootstrap_test import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"steps": 4, "scenes": 6, "values": 10, "rate": 0.05, "feature_size": 96, "images": 20, "hidden": 8}
-SETTINGS = [word for key, value in SCHEDULE.items() for word in ("--set", f"meta_sim.{key}={value}")]
-LEARN = ("--learn", "structure,parameters", "--parameters", "meta-sim", "--set", "batches_again=2", *SETTINGS)
+SETTINGS = [word for key, value in SCHEDULE.items() for word in ("--set", f"parameters.{key}={value}")]
+LEARN = ("--learn", "structure,parameters", "--parameters", "meta-sim", "--set", "refine.batches=2", *SETTINGS)
 
 
 def it_is_kept(patch):
@@ -38,10 +37,10 @@ def fitted(tmp_path_factory, call, discs, target) -> Path:
 
 def test_a_run_keeps_what_it_has_learnt(fitted):
     run = RunFolder.at(fitted)
-    assert run.preset.parameter_method == run.parameters["method"] == "meta-sim"
+    assert run.config.parameter_method == run.parameters["method"] == "meta-sim"
     assert [(site["name"], site["learnt"]) for site in run.parameters["sites"]] == [("x", True), ("y", True)]
     assert run.parameters["kept"] == "learnt" and run.guide.suits is not None
-    assert Preset.of(run.record["preset"]).meta_sim.steps == 4
+    assert run.config.parameters.steps == 4
     log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in log if line["stage"] == "parameters"] == [1, 2, 3, 4]
 

@@ -16,6 +16,8 @@ from probscene.app.fitting import parameter_stage as parameters
 from probscene.app.fitting import site_selection as select_sites
 from probscene.app.fitting import store as storage
 from probscene.app.fitting import structure_stage as structure
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
@@ -25,7 +27,7 @@ from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
 from probscene.structure import StructurePrior, counts
 
-LEARN = ("--learn", "structure,parameters", "--set", "batches_again=3")
+LEARN = ("--learn", "structure,parameters", "--set", "refine.batches=3")
 ROW = Grammar("Scene -> Dots\nDots -> dot Dots | ε")
 PRIOR = StructurePrior(ROW, Dots=counts(0, 1, 1, 1))
 
@@ -188,7 +190,7 @@ def test_structure_is_learnt_again_in_the_learnt_layout(both):
 
 def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_path):
     words = ("--target", target.images, "--out", tmp_path / "run", "--features", "presence")
-    short = ["--set", "presence_images=40", "--set", "presence_epochs=1"]
+    short = ["--set", "features.images=40", "--set", "features.epochs=1"]
     done = call("fit", discs.file, *words, *discs.without("count", "width"), *LEARN, *short)
     assert done.code == 0, done.err
     assert "keeps the prior: presence features are not read for it yet" in " ".join(done.err.split())
@@ -215,12 +217,19 @@ def dots(in_a_row: bool) -> SceneModel:
 def test_a_row_is_learnt_from_images_alone(tmp_path):
     truth = dots(True)
     generate_scenes(truth, truth.prior, 200, tmp_path / "target", format="images")
-    settings = {"count.steps": 150, "count.images": 8, "width": "8,16,32", "batches": 4, "num_scenes": 60}
-    settings |= {"pretrain_derivations": 300, "parameters.reader_steps": 250, "parameters.steps": 250}
+    settings = {
+        "features.schedule.steps": 150,
+        "features.schedule.images": 8,
+        "features.width": "8,16,32",
+        "structure.batches": 4,
+        "structure.num_scenes": 60,
+    }
+    settings |= {"pretrain.derivations": 300, "parameters.reader_steps": 250, "parameters.steps": 250}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 60, "parameters.round_steps": 100}
     settings |= {"parameters.energy_steps": 5, "parameters.energy_scenes": 40}
-    learn = {"learn": "structure,parameters", "features": "count", "threads": 1, "cache": False, "progress": False}
-    run = fit(dots(False), tmp_path / "target" / "images", "quick", settings=settings, out=tmp_path / "run", **learn)
+    config = preset("quick").set("features=count", settings)
+    execution = Execution(1, cache=False, progress=False)
+    run = fit(dots(False), tmp_path / "target" / "images", config, out=tmp_path / "run", execution=execution)
     record = run.parameters
     assert [site["name"] for site in record["sites"]] == ["dot.z", "dot.a", "dot.nothing"]
     assert [site["learnt"] for site in record["sites"]] == [True, True, False] and record["kept"] == "learnt"

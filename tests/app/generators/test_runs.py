@@ -18,7 +18,7 @@ from probscene.app.checking.generator_check import check_generator, cost
 from probscene.app.datasets.generate import generate, generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.datasets.scene_dataset import SceneDataset
-from probscene.app.fitting.overrides import override
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import PRESETS, images_drawn, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
@@ -164,9 +164,9 @@ def test_the_check_draws_again_in_another_order(model, call):
 def test_the_page_says_what_a_fit_has_drawn():
     page = (HERE.parents[2] / "docs" / "generators.md").read_text(encoding="utf-8")
     quick = preset("quick")
-    for chosen in (quick, override(quick, ["learn=structure"]), quick.with_features("count=efficientnet")):
-        features = chosen.make_features().images
-        structure = chosen.batches * chosen.num_scenes * chosen.draws_per_structure
+    for chosen in (quick, quick.set("parameters=none"), quick.for_photographs()):
+        features, training = chosen.make_features().images, chosen.structure
+        structure = training.batches * training.num_scenes * training.draws_per_structure
         row = re.search(rf"\| {features:,} \| {structure:,} \|([^|]*)\|([^|]*)\|", page[page.index(_called(chosen)) :])
         assert row is not None
         rest = sum(int(number.replace(",", "")) for number in row.groups() if number.strip())
@@ -174,9 +174,10 @@ def test_the_page_says_what_a_fit_has_drawn():
 
 
 def _called(chosen):
-    if chosen.learn == "structure":
+    if chosen.parameters is None:
         return "the same, `--learn structure`"
-    return "`--preset quick`" if chosen.features == "count" else "`--preset quick --features count=efficientnet`"
+    renders = chosen.make_features().name == "count"
+    return "`--preset quick`" if renders else "`--preset quick --features count=efficientnet`"
 
 
 def test_a_generator_may_say_that_it_is_not_reproducible(copied, model, tmp_path):
@@ -213,10 +214,17 @@ def test_telling_the_hours_leaves_the_workers_at_work(model):
 def test_a_fit_looks_at_what_the_generator_draws(copied, tmp_path):
     model = load_model(str(copied))
     generate_scenes(model, model.prior, 60, tmp_path / "target", format="images")
-    settings = {"count.steps": 20, "count.images": 8, "width": "8,16,32", "batches": 2, "num_scenes": 30}
-    settings |= {"pretrain_derivations": 200, "draws_per_structure": 1, "learn": "structure"}
-    more = {"features": "count", "threads": 1, "cache": False, "progress": False, "settings": settings}
-    run = fit(str(copied), tmp_path / "target" / "images", "quick", out=tmp_path / "run", **more)
+    settings = {
+        "features.schedule.steps": 20,
+        "features.schedule.images": 8,
+        "features.width": "8,16,32",
+        "structure.batches": 2,
+        "structure.num_scenes": 30,
+    }
+    settings |= {"pretrain.derivations": 200, "structure.draws_per_structure": 1}
+    config = preset("quick").set("features=count", "parameters=none", settings)
+    execution = Execution(1, cache=False, progress=False)
+    run = fit(str(copied), tmp_path / "target" / "images", config, out=tmp_path / "run", execution=execution)
     assert run.record["assets"].startswith("generator draw_boxes.py, ")
     run.generate(10, tmp_path / "out")
     assert len(list((tmp_path / "out" / "images").iterdir())) == 10
@@ -228,7 +236,13 @@ def test_a_fit_whose_generator_fails_says_so_and_leaves_nothing(copied, tmp_path
     fresh()
     fault("always")
     with pytest.raises((GeneratorError, ModelError), match="never any mesh"):
-        fit(str(copied), tmp_path / "target" / "images", "quick", out=tmp_path / "run", progress=False)
+        fit(
+            str(copied),
+            tmp_path / "target" / "images",
+            "quick",
+            out=tmp_path / "run",
+            execution=Execution(progress=False),
+        )
     assert not (tmp_path / "run").exists()
 
 

@@ -15,6 +15,7 @@ import pytest
 from probscene.app.api.fit import fit
 from probscene.app.datasets import generate as datasets
 from probscene.app.datasets.generate import _actor, generate
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.run import RunFolder
 from probscene.app.workers import actor_pool as crews
 from probscene.app.workers import cluster as clusters
@@ -130,7 +131,7 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_pa
 
 
 def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_path, monkeypatch):
-    words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "num_scenes=150"]
+    words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "structure.num_scenes=150"]
     assert call(*words, "--out", tmp_path / "alone").code == 0
     parts, run = [], crews.ActorPool.run
 
@@ -228,7 +229,7 @@ def test_a_fit_without_its_cluster_leaves_no_run(call, discs, target, tmp_path):
     assert result.code == 1 and result.err.count("\n") == 1
     assert "expected a Ray cluster at 127.0.0.1:1" in result.err and not (tmp_path / "out").exists()
     with pytest.raises(MachineError, match="expected a Ray cluster at 127.0.0.1:1"):
-        fit(discs.file, target.images, out=tmp_path / "out", cluster="127.0.0.1:1", progress=False)
+        fit(discs.file, target.images, out=tmp_path / "out", execution=Execution(cluster="127.0.0.1:1", progress=False))
     assert not (tmp_path / "out").exists()
 
 
