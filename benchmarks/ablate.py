@@ -32,8 +32,7 @@ from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.sources import PRIOR, START, before
 from probscene.app.files import write_json
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import STRUCTURE
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
@@ -123,10 +122,10 @@ def of_variant(args, seed: int, truth: np.ndarray, held_out: Derivation, name: s
     use_threads(1)
     start, variant = time.monotonic(), VARIANTS[name]
     other = changed(load_model(args.model), args.model, variant)
-    base = replace(preset(args.preset), learn=STRUCTURE, prior_if_worse=False)
+    base = preset(args.preset).set("parameters=none", "fallback_to_prior=false")
     images, path = args.out / f"target-{seed}" / "images", args.out / f"{name.replace(' ', '-')}-{seed}"
-    chosen = override(base, list(variant.settings))
-    run = fit(other, images, chosen, seed, threads=1, out=path, resume=True, cache=args.out / "cache")
+    execution = Execution(1, cache=args.out / "cache")
+    run = fit(other, images, base.set(*variant.settings), out=path, seed=seed, resume=True, execution=execution)
     took, found = round(time.monotonic() - start, 1), figures(run.model, run.guide, truth, held_out)
     return {"variant": name, "settings": " ".join(variant.settings), "seed": seed, **found, "seconds": took}
 

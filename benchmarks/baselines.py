@@ -1,7 +1,7 @@
 """The baselines at their best: each guide and objective gets the same search over its settings, beside the default.
 
     python benchmarks/baselines.py [--fits lstm pcfg grammar-vae mmd witness js] [--draws 24] [--seeds 0]
-        [--set divergence.variance=20 num_scenes=50]
+        [--set variance=20 num_scenes=50]
 
 Structures of Aerial 2D, with true counts of roads and of cars by road instead of images: what is compared is how a
 distribution is learnt, and not how images are read. The search draws step size, steps a batch, baseline and number of
@@ -29,14 +29,14 @@ from learn_aerial import Truth, judged, show
 from torch import Tensor
 
 from probscene.app.files import write_json
-from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.config import DIVERGENCES, FitConfig
 from probscene.app.fitting.presets import DEFAULT
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.errors import ProbsceneError
+from probscene.inference.divergence import MMD, KDELogRatio
 from probscene.inference.guides.base import Guide
-from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.pcfg import PCFG
 from probscene.inference.learn import Trainer
 from probscene.inference.objective import BASELINES, ScoreFunction
@@ -65,25 +65,28 @@ class Settings:
     variance: float | None  # of the kernel
 
 
-def preset_of(fit: str) -> Preset:
-    """The default preset with a guide or an objective."""
-    return DEFAULT.with_guide(fit) if fit in GUIDES else DEFAULT.with_objective(fit) if fit in OBJECTIVES else DEFAULT
+def config_of(fit: str) -> FitConfig:
+    """The default preset with a guide or a divergence."""
+    if fit in GUIDES:
+        return DEFAULT.with_guide(fit)
+    return DEFAULT.with_divergence(fit) if fit in DIVERGENCES else DEFAULT
 
 
 def drawn(fit: str, num: int) -> list[Settings]:
     """The default's settings, then others, in one order for all fits."""
-    preset = preset_of(fit)
+    training, kernel = config_of(fit).structure, config_of(fit).divergence
+    assert isinstance(kernel, KDELogRatio | MMD)
     every = [Settings(*each) for each in product(RATES, UPDATES, BASELINES, SCENES, BATCH, VARIANCES)]
     order = np.random.default_rng(7).permutation(len(every))
     # All scenes share the cost of MMD: without each one's own, the others' mean is all of it.
     useful = [every[i] for i in order if (fit, every[i].baseline) != ("mmd", "leave_one_out")]
-    scenes = preset.batches * preset.num_scenes
-    own = Settings(preset.learning_rate, preset.updates, preset.baseline, scenes, preset.num_scenes, preset.variance)
+    scenes, N = training.batches * training.num_scenes, training.num_scenes
+    own = Settings(training.learning_rate, training.updates, training.baseline, scenes, N, kernel.variance)
     return [own, *(each for each in useful if each != own)][:num]
 
 
 def changed(settings: Settings, words: list[str]) -> Settings:
-    """Settings with other values, such as ``divergence.variance=20``."""
+    """Settings with other values, such as ``variance=20``."""
     values = dict(word.split("=") for word in words)
     return replace(settings, **{key: type(getattr(settings, key))(value) for key, value in values.items()})
 
@@ -111,18 +114,19 @@ def structures(num_scenes: int) -> Drawing:
 
 def learnt(fit: str, settings: Settings, truth: Truth, seed: int) -> Guide:
     """A guide that has seen true counts of 5,000 structures."""
-    preset = preset_of(fit)
+    config = config_of(fit)
     seed_everything(1000 + seed)
     real = seen(derive_complete(GRAMMAR, truth.policy, REAL, MODEL.max_steps)[0])
     seed_everything(seed)
-    guide = make_guide(grammar=GRAMMAR, max_steps=MODEL.max_steps, **preset.guide_settings())
+    guide = config.guide_maker()(GRAMMAR, MODEL.max_steps)
     guide.bind(MODEL.support)
-    pretrain(guide, MODEL.pretraining_policy, learning_rate=preset.pretrain_rate)
+    pretrain(guide, MODEL.pretraining_policy, learning_rate=config.pretrain.learning_rate)
 
     def observe(scenes: Scenes) -> Tensor:
         return seen(scenes.derivation)
 
-    divergence = replace(preset, variance=settings.variance).divergence()
+    assert isinstance(config.divergence, KDELogRatio | MMD)
+    divergence = replace(config.divergence, variance=settings.variance)
     loss = ScoreFunction(observe, divergence, settings.baseline, updates=settings.updates)
     batches = max(1, settings.scenes // settings.num_scenes)
     rate, num_scenes = settings.learning_rate, settings.num_scenes

@@ -18,6 +18,7 @@ import json
 import shutil
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -32,7 +33,14 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.workers.actor_pool import ActorPool
 from probscene.app.workers.cluster import Cluster
 
-SHORT = {"features.schedule.steps": 60, "structure.batches": 8, "structure.num_scenes": 300, "pretrain.derivations": 500, "learn": "structure"}
+SHORT = {
+    "features": "count",
+    "parameters": "none",
+    "features.schedule.steps": 60,
+    "structure.batches": 8,
+    "structure.num_scenes": 300,
+    "pretrain.derivations": 500,
+}
 
 
 class CPU:
@@ -84,8 +92,8 @@ def main():
     target = out / "target"
     ps.generate(model.target(0), 300, target, format="images", progress=False)
     shutil.rmtree(out / "alone", ignore_errors=True)
-    fit = {"preset": "quick", "features": "count", "settings": SHORT, "threads": 1, "cache": out / "cache"}
-    alone = ps.fit("multi_mnist", target / "images", out=out / "alone", **fit)
+    config, alone_by = ps.preset("quick").set(SHORT), ps.Execution(threads=1, cache=out / "cache")
+    alone = ps.fit("multi_mnist", target / "images", config, out=out / "alone", execution=alone_by)
     run = RunFolder.at(alone.path)
 
     def made(name, number, **how):
@@ -146,7 +154,8 @@ def main():
 
     ActorPool.run = disturbed
     with CPU() as cost:
-        ps.fit("multi_mnist", target / "images", out=out / "nodes", cluster=simulated.address, **fit)
+        by_nodes = replace(alone_by, cluster=simulated.address)
+        ps.fit("multi_mnist", target / "images", config, out=out / "nodes", execution=by_nodes)
     guides = [(out / name / "guide.safetensors").read_bytes() for name in ("alone", "nodes")]
     found["fit"] = {"seconds": cost.wall, "same bytes": guides[0] == guides[1]}
     print("fit", json.dumps(found["fit"]), flush=True)

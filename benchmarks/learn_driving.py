@@ -14,7 +14,6 @@ those that can be seen, by correlation, in the start's scenes and in other ones 
 import argparse
 import json
 import time
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -25,8 +24,7 @@ from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.sources import FITTED, LEARNT, START, before
 from probscene.app.files import write_json
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import STRUCTURE
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from probscene.app.fitting.store import timing
@@ -34,6 +32,7 @@ from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
 from probscene.derive import derive_complete
 from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.counting.choices import CountFeatures
 from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
 from probscene.inference.statistics.tally import around
 from probscene.model import SceneModel
@@ -109,11 +108,12 @@ def main():
         target = model.target(seed)
         folder = args.out / f"target-{seed}"
         generate_scenes(target, target.prior, args.images, folder, seed=1000 + seed, format="images")
-        chosen = override(replace(preset(args.preset), learn=STRUCTURE), args.settings)
+        config = preset(args.preset).set("parameters=none", *args.settings)
         path = args.out / f"run-{seed}"
         began = path.exists()
         start = time.monotonic()
-        run = fit(args.model, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
+        execution = Execution(cache=args.out / "cache")
+        run = fit(args.model, folder / "images", config, out=path, seed=seed, resume=True, execution=execution)
         truth = counted(model, target.prior)
         row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
         policies = {**before(run.model), LEARNT: run.guide}
@@ -122,7 +122,7 @@ def main():
         row |= distances(model, counts, truth)
         net = run.network()
         if net is not None:
-            least = chosen.count.min_visible
+            least = run.features.schedule.min_visible if isinstance(run.features, CountFeatures) else 0.0
             sides = {START: (run.model, run.model.pretraining_policy), "target": (target, target.prior)}
             row["read"] = {name: correlations(*side, net, least) for name, side in sides.items()}
         rows.append(row)

@@ -29,8 +29,9 @@ from probscene.app.evaluation.labels import Labels, read_labels
 from probscene.app.evaluation.sources import FITTED
 from probscene.app.evaluation.structure_counts import StructureCounts
 from probscene.app.files import make_folder, write_json
-from probscene.app.fitting.preset import BOTH, STRUCTURE
-from probscene.app.fitting.presets import PRESETS
+from probscene.app.fitting.config import BOTH, STRUCTURE, configuration, parameter_choice
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import PRESETS, preset
 from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
@@ -91,11 +92,17 @@ def main():
         write_counts(out, [names[i] for i in few], counts[few], classes)
         seen = [folder.paths[i] for i in sorted({*few, *rest})]
         start = time.monotonic()
+        config = configuration(preset(args.preset), COUNTS, parameters=parameter_choice(args.learn, None))
         run = fit(
-            args.model, seen, args.preset, seed,
-            features=COUNTS, learn=args.learn, labels=out if args.number else None,
-            out=args.out / f"run-{seed}", resume=True, cache=False,
-        )  # fmt: skip
+            args.model,
+            seen,
+            config,
+            out=args.out / f"run-{seed}",
+            seed=seed,
+            labels=out if args.number else None,
+            resume=True,
+            execution=Execution(cache=False),
+        )
         judged = ImageFolder([folder.paths[i] for i in rest], model.canvas, model.channels)
         truth = Labels(StructureCounts(counts[rest], {}), None, classes, every.notes, every.min_height)
         found = evaluate(run, judged, truth, lambda *_: None, num=SCENES)

@@ -32,8 +32,9 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.parameter_stage import NAME, beside, learnt_by
-from probscene.app.fitting.preset import BOTH
+from probscene.app.fitting.learnt_parameters import NAME, beside, learnt_by
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import preset
 from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
@@ -102,12 +103,14 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
     """One seed's rows."""
     folder, truth = args.out / f"target-{seed}", hidden(model, seed)
     generate_scenes(truth, truth.prior, args.images, folder, seed=1000 + seed, format="images")
-    learn = {"learn": BOTH, "threads": args.threads, "cache": args.out / "cache", "resume": True}
-    run = fit(
-        args.model, folder / "images", args.preset, seed, out=args.out / f"run-{seed}", settings=args.set, **learn
-    )
+    config = preset(args.preset).set("parameters=any", *args.set)
+    execution = Execution(args.threads, cache=args.out / "cache")
+    out = args.out / f"run-{seed}"
+    run = fit(args.model, folder / "images", config, out=out, seed=seed, resume=True, execution=execution)
     tensors = run.read_tensors(NAME)
-    learnt = learnt_by(run, run.guide, beside(tensors)).suited(model) if tensors else model
+    learnt = (
+        learnt_by(model, run.config, run.parameters, run.guide, beside(tensors)).suited(model) if tensors else model
+    )
     structure = copy(run.guide)
     structure.suits = None
     true = quantiles(model, truth, truth.prior, 1)
@@ -156,7 +159,7 @@ def main():
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="street")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
+    parser.add_argument("--set", action="append", default=[], help="as of probscene fit")
     args = parser.parse_args()
     tune_malloc()
     model, rows = load_model(args.model), []

@@ -21,13 +21,13 @@ from learn_parameters import SIDE, picture, row_errors
 from torch import Tensor
 
 from probscene.app.files import write_json
-from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.presence_task import PresenceTask
+from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.meta_sim.task import TaskLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
 from probscene.inference.training import Training
@@ -94,8 +94,9 @@ def main():
     images = torch.stack([real.load(i) for i in range(IMAGES)])
     number, share = distributions(args.target)
     structure = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
-    settings = ["parameters=meta-sim", *(f"parameters.{setting}" for setting in args.set)]
-    schedule = override(QUICK, settings).meta_sim
+    given = (f"parameters.{setting}" for setting in args.set)
+    schedule = QUICK.set("parameters=meta-sim", *given).parameters
+    assert isinstance(schedule, MetaSimSchedule)
     look = EfficientNetLite(schedule.feature_size)
     seen = RenderedFeatures(MODEL, 1).observe(look)
     matching = MetaSimLearning(MODEL, structure, seen, look.embed(images), schedule, args.seed)

@@ -45,8 +45,8 @@ from probscene.app.evaluation.labels import Labels, read_labels
 from probscene.app.evaluation.sources import FITTED, LEARNT, before
 from probscene.app.evaluation.structure_counts import sampled
 from probscene.app.files import write_json
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import BOTH, STRUCTURE
+from probscene.app.fitting.config import BOTH, STRUCTURE
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.kitti import DONT_CARE, read_objects
@@ -63,9 +63,9 @@ from matplotlib.ticker import MaxNLocator
 DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
 PARAMETERS = "parameters"
 SETTINGS = {
-    STRUCTURE: [f"parameters=none"],
-    BOTH: [f"parameters=any"],
-    PARAMETERS: [f"parameters=any", "structure.batches=0", "refine.batches=0", "pretrain.on_prior=true"],
+    STRUCTURE: ["parameters=none"],
+    BOTH: ["parameters=any"],
+    PARAMETERS: ["parameters=any", "structure.batches=0", "refine.batches=0", "pretrain.on_prior=true"],
 }
 GRID, GRID_WIDTH = (4, 2), 420  # rows and columns of a source's images; pixels of one
 MARKED, SCENES = 0.01, 2000  # of a frame; of which objects are counted
@@ -227,9 +227,9 @@ def main():
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = override(preset("street").with_features(args.features), [*args.settings, *SETTINGS[args.learn]])
+        config = preset("street").with_features(args.features).set(*SETTINGS[args.learn], *args.settings)
         start = time.monotonic()
-        run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False)
+        run = fit(args.model, args.images, config, out=path, seed=seed, resume=True, execution=Execution(cache=False))
         seconds = round(time.monotonic() - start, 1)
         target = ImageFolder(args.images, run.model.canvas, run.model.channels)
         truth = read_labels(args.labels, run.model, target, False, args.min_height)

@@ -25,9 +25,7 @@ from torch import Tensor
 
 import probscene as ps
 from probscene.app.files import make_folder, write_json
-from probscene.app.fitting.overrides import override
 from probscene.app.fitting.parameter_stage import HELD
-from probscene.app.fitting.preset import TILTING
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from probscene.app.loading import load_model
@@ -37,6 +35,7 @@ from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import TiltingLearning
+from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.statistics.tally import around, resamples
 from probscene.inference.statistics.two_sample import Features
 from probscene.model import SceneModel
@@ -88,8 +87,9 @@ def learn(
     model: SceneModel, observer: RenderedFeatures, photographs: Tensor, seed: int, settings: list[str]
 ) -> TiltingLearning:
     """Parameters, learnt from photographs."""
-    given = [f"parameters={TILTING}", *(f"parameters.{setting}" for setting in settings)]
-    schedule = override(preset("quick"), given).tilting
+    given = (f"parameters.{setting}" for setting in settings)
+    schedule = preset("quick").set("parameters=tilting", *given).parameters
+    assert isinstance(schedule, TiltingSchedule)
     seen_by = EfficientNetLite(schedule.feature_size).embed, image_statistics
     real = tuple(embed(photographs) for embed in seen_by)
     learning = TiltingLearning(model, model.pretraining_policy, observer.labelled, seen_by, real, schedule, seed)

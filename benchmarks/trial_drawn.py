@@ -44,7 +44,7 @@ def main():
         _, counts = counts_of_dataset(truth, target)
         # A target may lack a class, or have it in none of the images that are tested on.
         there = [name for name, mean in zip(truth.classes, counts.mean(0), strict=True) if mean >= RARE]
-        fit(name, target / "images", args.preset, args.seed, out=out / "run", resume=True)
+        fit(name, target / "images", args.preset, out=out / "run", seed=args.seed, resume=True)
         with Display() as show:
             found = trial(
                 target,

@@ -2,7 +2,7 @@
 
     probscene fit examples/tabletop.py --target photos/ --out runs/own --features examples/own_features.py:TinyCounts
 
-In Python, ``probscene.fit(..., features=TinyCounts(steps=1000))``. ``Colours`` in its place is the short form.
+In Python, ``FitConfig(features=TinyCounts(steps=1000))``. ``Colours`` in its place is the short form.
 """
 
 from collections.abc import Callable

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Union, cast, get_args, get_origin, get_type_hints
 
 from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
@@ -582,7 +582,7 @@ def _with(value: Any, path: list[str], new: Any) -> Any:
     if isinstance(value, type) or not is_dataclass(value) or name not in _names(value):
         known = ", ".join(_names(value)) if is_dataclass(value) else "none"
         raise ProbsceneError(f"expected settings among {known}, got {name!r}.")
-    return replace(value, **{name: _with(getattr(value, name), rest, new) if rest else new})
+    return replace(cast(Any, value), **{name: _with(getattr(value, name), rest, new) if rest else new})
 
 
 def _replaced(value: Any, path: list[str], text: str, key: str) -> Any:
