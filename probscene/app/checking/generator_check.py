@@ -119,7 +119,8 @@ def cost(model: SceneModel, images: int) -> str:
     return (
         f"Note: this fit has about {images:,} images drawn, for which the generator {_name(generator)} "
         f"needs {_told(seconds)} ({1000 * each:.3g} ms an image, {workers} at once); fewer with "
-        "--features count=efficientnet, and with --set structure.render_cache=4, which takes renders of equal counts again."
+        "--features count=efficientnet, and with --set structure.render_cache=4, which takes renders of equal "
+        "counts again."
     )
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from probscene.app.fitting.presets import takers_of_labels
+from probscene.app.fitting.config import takers_of_labels
 from probscene.app.fitting.run import RunFolder
 
 PARTS = """
