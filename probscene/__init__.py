@@ -65,7 +65,7 @@ _MODULES = {
     "probscene.request": ("Objects", "Request"),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
     "probscene.scene": ("SceneGraph",),
-    "probscene.structure": ("StructurePrior", "TargetImages", "counts", "ranked", "weights"),
+    "probscene.structure": ("StructurePrior", "counts", "ranked", "weights"),
     "probscene.world": ("Camera", "Ground", "Light", "Meshes", "World"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -28,6 +28,11 @@ EXECUTION = ps.Execution(threads=1, cache=False, progress=False)
 FILES = ("features.safetensors", "real.safetensors", "guide.safetensors", "log.jsonl")
 
 
+def settings_for(features) -> dict[str, str | int]:
+    """Those of ``SHORT`` that features read; None for the preset's."""
+    return {key: value for key, value in SHORT.items() if features is None or not key.startswith("features.")}
+
+
 def probscene(*words):
     """Call the command line in this process; it must succeed."""
     result = CliRunner().invoke(app, [str(word) for word in words])
@@ -71,10 +76,11 @@ def both_ways(tmp_path_factory, tables):
 
     def fitted(words, options, model=TABLETOP, target=tables):
         folder = tmp_path_factory.mktemp("ways")
-        short = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+        settings = settings_for(options.get("features"))
+        short = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
         common = ["--preset", "quick", "--threads", 1, "--seed", 3, "--no-cache", *short]
         probscene("fit", model, "--target", target, "--out", folder / "command", *common, *words)
-        config = configuration(ps.preset("quick"), **options, settings=SHORT)
+        config = configuration(ps.preset("quick"), **options, settings=settings)
         fit = ps.fit(model, target, config, seed=3, out=folder / "python", execution=EXECUTION)
         for name in FILES:
             assert (folder / "command" / name).read_bytes() == (fit.path / name).read_bytes(), name
@@ -98,7 +104,7 @@ def goes_on(tmp_path, tables, monkeypatch):
             if line is not None and line["stage"] == stage:
                 raise Interrupted
 
-        config = configuration(ps.preset("quick"), **options, settings=SHORT)
+        config = configuration(ps.preset("quick"), **options, settings=settings_for(options.get("features")))
         whole = ps.fit(TABLETOP, tables, config, out=tmp_path / "whole", execution=EXECUTION)
         kept = checkpoints.Checkpointer.__call__
         with monkeypatch.context() as patch:

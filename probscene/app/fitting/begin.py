@@ -121,6 +121,7 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
     if request.threads is not None and request.threads < 1:
         raise ProbsceneError(f"expected a positive number of threads, got {request.threads}.")
     check_free(out)
+    plugins = config.plugins()
     loaded = checked_model(model)
     images = open_images(target.source, loaded, bool(target.skip_bad), show, target.value_range)
     check_target(images)
@@ -142,7 +143,6 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
         files |= {beside for file in files for beside in neighbours(file).values()}
         record["parts"] = {str(file): file_digest(file) for file in sorted(files)}
     # Built before the folder is, so that a wrong one leaves none behind.
-    plugins = config.plugins()
     run, labels = make(out, record, loaded, plugins), None
     if request.labels is not None:
         record["labels"] = labels_record(request.labels)

@@ -15,6 +15,9 @@ def quick(discs) -> Callable[..., ps.Run]:
 
     def fit(model, target, preset="quick", settings=discs.short, threads=1, skip_bad=None, **options):
         chosen = {name: options.pop(name) for name in ("features", "divergence", "guide") if name in options}
+        if chosen.get("features", "count") != "count" and isinstance(settings, dict):
+            settings = {key: value for key, value in settings.items() if not key.startswith("features.schedule.")}
+            settings.pop("features.width", None)
         preset = ps.preset(preset) if isinstance(preset, str) else preset
         config = configuration(preset, **chosen, settings=settings)
         images = ps.TargetImages(target, skip_bad)

@@ -252,7 +252,8 @@ def test_the_command_line_says_it_in_one_line(call, discs, target, tmp_path, nam
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.py").write_text(FILE)
     (tmp_path / "broken.py").write_text("def f(:\n")
-    short = [*discs.settings, "--set", "features.schedule.steps=2", option, word.replace("FILE", "part")]
+    settings = discs.without("features") if option == "--features" else discs.settings
+    short = [*settings, option, word.replace("FILE", "part")]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *short)
     (line,) = [line for line in done.err.splitlines() if line.startswith("probscene: ")]
     assert done.code == 2 and "Traceback" not in done.err

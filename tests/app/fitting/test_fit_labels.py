@@ -53,7 +53,7 @@ def few(target, tmp_path):
 
 
 def words(discs, target, out, *more):
-    return ["fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *more]
+    return ["fit", discs.file, "--target", target.images, "--out", out, *discs.without("features"), *more]
 
 
 def test_a_network_is_given_what_is_labelled(call, discs, target, parts, few, tmp_path):

@@ -191,7 +191,7 @@ def test_structure_is_learnt_again_in_the_learnt_layout(both):
 def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_path):
     words = ("--target", target.images, "--out", tmp_path / "run", "--features", "presence")
     short = ["--set", "features.images=40", "--set", "features.epochs=1"]
-    done = call("fit", discs.file, *words, *discs.without("count", "width"), *LEARN, *short)
+    done = call("fit", discs.file, *words, *discs.without("features"), *LEARN, *short)
     assert done.code == 0, done.err
     assert "keeps the prior: presence features are not read for it yet" in " ".join(done.err.split())
     assert RunFolder.at(tmp_path / "run").parameters == {}
