@@ -132,9 +132,9 @@ def main():
         print(name, json.dumps(found[name]), flush=True)
     simulated.whole()
     shutil.rmtree(out / "nodes", ignore_errors=True)
-    run_crew, parts = ActorPool.run, []
+    run_pool, parts = ActorPool.run, []
 
-    def disturbed(crew, tasks, done):
+    def disturbed(pool, tasks, done):
         def each(result):
             parts.append(result)
             for number, what in ((8, simulated.kill), (20, simulated.freeze)):
@@ -142,7 +142,7 @@ def main():
                     what()
             done(result)
 
-        run_crew(crew, tasks, each)
+        run_pool(pool, tasks, each)
 
     ActorPool.run = disturbed
     with CPU() as cost:

@@ -5,8 +5,8 @@
     fit = ps.fit(model, "photos/", preset="quick")
     fit.generate(10_000, "dataset/", format="coco")
 
-This face holds what a person writes; a name is imported when it is first used. Each is defined in one module, which is
-what the library itself imports.
+These are the public names. A name is imported when it is first used. Each is defined in one module, which is what the
+library itself imports.
 """
 
 import sys as _sys
@@ -21,7 +21,7 @@ if (_checkout / "pyproject.toml").is_file():  # a plain checkout: probscene.mode
 
 __version__ = "0.2.0"
 
-_HOME = {
+_APP_MODULES = {
     "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
     "api.fit": ("fit",),
     "api.label": ("label",),
@@ -31,7 +31,7 @@ _HOME = {
     "loading": ("load_model",),
 }
 _MODULES = {
-    **{f"probscene.app.{module}": names for module, names in _HOME.items()},
+    **{f"probscene.app.{module}": names for module, names in _APP_MODULES.items()},
     "probscene.batch": ("RenderBatch", "Renderer"),
     "probscene.dataset": ("ImageFolder",),
     "probscene.derivation": ("Derivation",),
@@ -127,16 +127,16 @@ __all__ = [
 ]  # fmt: skip
 
 
-class _Face(_ModuleType):
-    """A package of which ``derive`` is the function, though a module has that name, too: importing a submodule would
-    bind its name here."""
+class _PublicApi(_ModuleType):
+    """A package whose ``derive`` is the function, though a module has the same name: importing a submodule would bind
+    the module to that name."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _MODULE_OF and isinstance(value, _ModuleType)):
             super().__setattr__(name, value)
 
 
-_sys.modules[__name__].__class__ = _Face
+_sys.modules[__name__].__class__ = _PublicApi
 
 
 def __getattr__(name: str) -> object:

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
@@ -139,3 +140,9 @@ class Branching:
             if (grown == length).all():
                 return float(length[0])
             length = grown
+
+
+def expand_table(table: Tensor, P: int, C: int) -> Tensor:
+    """A table ``(..., p, c, K)`` with P and C entries on its two index axes; all later ones are as the last."""
+    parent_index, index = (torch.arange(n).clamp(max=table.shape[axis] - 1) for n, axis in ((P, -3), (C, -2)))
+    return table[..., parent_index, :, :][..., index, :]

@@ -62,7 +62,7 @@ def is_list(grammar: Grammar, symbol: int) -> bool:
 def bounded_lists(grammar: Grammar, prior: StructurePrior, support: Support) -> list[ListBounds]:
     """The lists that have a longest, in the grammar's order, then by rank."""
     found = []
-    every = [Branching(grammar, policy.table) for policy in (prior, support.uniform())]
+    every = [Branching(grammar, table) for table in (prior.table, support.uniform_table())]
     for symbol in (v for v in range(len(grammar.nonterminals)) if is_list(grammar, v)):
         own, possible = (_ends(process, symbol) for process in every)
         bounds = []

@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .branching import Branching
+from .branching import Branching, expand_table
 from .derivation import Frontier
 from .errors import GrammarError
 from .grammar import Grammar
 from .policy import Policy
+from .support import Support
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class StructurePrior(Policy):
             left += share * ((before * group).sum(-1, keepdim=True) / share.sum(-1, keepdim=True)).nan_to_num(0.0, 0.0)
         empty = (left == 0).all(-1, keepdim=True)
         table[:-1] = (left / left.sum(-1, keepdim=True)).log().where(~empty, -torch.inf).float()
-        made = StructurePrior.of_table(self.grammar, table)
+        made = StructurePrior.from_table(self.grammar, table)
         for symbol, repeat, rank in Branching(self.grammar, table).types:
             if empty[symbol, min(rank, P - 1), min(repeat, C - 1)]:
                 raise GrammarError(
@@ -173,11 +174,11 @@ class StructurePrior(Policy):
         for prior, v, k in zip(priors, first_symbol, first_rule, strict=True):
             own = expand_table(prior.table[:-1], P, C)
             table[v : v + own.shape[0], :, :, k : k + own.shape[3]] = own
-        return StructurePrior.of_table(grammar, table)
+        return StructurePrior.from_table(grammar, table)
 
     @staticmethod
-    def of_table(grammar: Grammar, table: Tensor) -> "StructurePrior":
-        """The prior of a ``table`` as it is."""
+    def from_table(grammar: Grammar, table: Tensor) -> "StructurePrior":
+        """The prior with a given ``table``, which is neither checked nor normalised."""
         prior = StructurePrior.__new__(StructurePrior)
         prior.grammar, prior.table = grammar, table
         return prior
@@ -201,10 +202,13 @@ class StructurePrior(Policy):
         return self.table.flatten(0, 2)[torch.from_numpy(row)]
 
 
-def expand_table(table: Tensor, P: int, C: int) -> Tensor:
-    """A table ``(..., p, c, K)`` for more ranks and repeats, of which all later ones are as the last."""
-    ranks, repeats = torch.arange(P).clamp(max=table.shape[-3] - 1), torch.arange(C).clamp(max=table.shape[-2] - 1)
-    return table[..., ranks, :, :][..., repeats, :]
+def support_of_policies(grammar: Grammar, policies: Sequence[Policy]) -> Support | None:
+    """What at least one of several policies does in a state that it can reach; None where one of them is no
+    ``StructurePrior``, since nothing says what it cannot do."""
+    priors = [policy for policy in policies if isinstance(policy, StructurePrior)]
+    if not priors or len(priors) < len(policies):
+        return None
+    return Support.from_tables(grammar, [prior.table for prior in priors])
 
 
 def hazards(probs: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What the roof makes of a model: a renderer for whatever it returns."""
+"""What the application makes of a model: a renderer for whatever it returns."""
 
 import numpy as np
 import torch

@@ -120,11 +120,11 @@ def generate(
     task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, *more)
     if cluster is None:
         return job.run(partial(spread, _worker, task, workers), progress, part)
-    crew = cluster.crew(_actor, task)
+    actors = cluster.actor_pool(_actor, task)
     try:
-        return job.run(crew.run, progress, part)
+        return job.run(actors.run, progress, part)
     finally:
-        crew.close()
+        actors.close()
 
 
 def generate_scenes(

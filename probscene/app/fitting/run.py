@@ -247,7 +247,7 @@ class RunFolder(Storage):
         made = guide_of(model.grammar, model.max_steps, make, **settings)
         made = made if make is None else check_guide(made, model.max_steps)
         if self.record.get("within_support"):  # runs of before have none, and stay as they were
-            made.bind(None if model.support is None else model.support.holding(model.prior, self.unread))
+            made.bind(model.guide_support(self.unread))
         return made
 
     @cached_property

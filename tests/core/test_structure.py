@@ -10,8 +10,7 @@ from probscene.enumeration import enumerate_derivations
 from probscene.errors import GrammarError
 from probscene.grammar import Grammar
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.structure import StructurePrior, counts, hazards, ranked, weights
-from probscene.support import Support
+from probscene.structure import StructurePrior, counts, hazards, ranked, support_of_policies, weights
 
 LIST = Grammar("Scene -> bg Items\nItems -> x Items | y Items | ε")
 ROADS = Grammar("Scene -> Roads\nRoads -> Road Roads | ε\nRoad -> road(Cars)\nCars -> car Cars | ε")
@@ -208,7 +207,7 @@ def test_a_production_may_depend_on_the_rank_around():
 def test_a_guide_keeps_to_what_is_legal():
     prior = StructurePrior(LIST, Items=counts(1, 1, 1))
     first_is_x = prior.where(lambda production, repeat, _: repeat > 0 or "y" not in production, repeats=2)
-    support = Support.of(LIST, [first_is_x])
+    support = support_of_policies(LIST, [first_is_x])
     guide = LSTMGuide(LIST, 6)
     guide.support = support
     every = enumerate_derivations(LIST, 6)
