@@ -25,14 +25,14 @@ class Frontier(NamedTuple):
 
     Attributes:
         symbol: ``(N,)`` int64 nonterminal; V where the scene is finished.
-        repeat: ``(N,)`` how often this list has repeated: a child with its parent's nonterminal counts one more, any
-            other child starts at 0.
-        parent_repeat: ``(N,)`` the ``repeat`` of the nearest list around it.
+        list_index: ``(N,)`` how many elements of this list come before: a child with its parent's nonterminal has one
+            more, any other child 0.
+        parent_list_index: ``(N,)`` the ``list_index`` of the nearest enclosing list.
     """
 
     symbol: Tensor
-    repeat: Tensor
-    parent_repeat: Tensor
+    list_index: Tensor
+    parent_list_index: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,35 +213,35 @@ class Fields(NamedTuple):
     scene is its symbol alone.
 
     Attributes:
-        repeat, parent_repeat, node: the first bit of each; that of ``symbol`` is 0.
+        list_index, parent_list_index, node: the first bit of each; that of ``symbol`` is 0.
     """
 
-    repeat: int
-    parent_repeat: int
+    list_index: int
+    parent_list_index: int
     node: int
 
     @staticmethod
     def of(grammar: Grammar, max_steps: int) -> "Fields":
         """As few bits as numbers need that so many steps can come to."""
-        repeat = len(grammar.nonterminals).bit_length()
-        parent_repeat = repeat + max_steps.bit_length()
-        node = parent_repeat + max_steps.bit_length()
+        list_index = len(grammar.nonterminals).bit_length()
+        parent_list_index = list_index + max_steps.bit_length()
+        node = parent_list_index + max_steps.bit_length()
         if node + (1 + max_steps * grammar.objects.shape[1]).bit_length() > 63:
             raise GrammarError(f"expected a max_steps of some thousands at most, got {max_steps}; lower it.")
-        return Fields(repeat, parent_repeat, node)
+        return Fields(list_index, parent_list_index, node)
 
     def frontier(self, entry: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Symbol, repeat and parent_repeat, as entries are."""
+        """Symbol, list_index and parent_list_index of entries."""
         return tuple(entry >> low & (1 << high - low) - 1 for low, high in pairwise((0, *self)))
 
     def owner(self, entry: np.ndarray) -> np.ndarray:
         """The node that hangs above, -1 for none."""
         return (entry >> self.node) - 1
 
-    def below(self, repeat: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """What is inside a list that has repeated so often, and hangs below the first of a rule's objects where there
+    def below(self, list_index: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """The bits of what is inside an element of a list, and hangs below the first of a rule's objects where there
         were so many nodes."""
-        return (repeat << self.parent_repeat) + (1 + nodes << self.node)
+        return (list_index << self.parent_list_index) + (1 + nodes << self.node)
 
 
 @lru_cache(64)
@@ -252,10 +252,10 @@ def _productions(grammar: Grammar, N: int, fields: Fields) -> np.ndarray:
     children, owner = grammar.children.T, grammar.child_owner.T
     same = children == grammar.lhs
     inside, hangs = ~same & grammar.recursive[grammar.lhs], owner >= 0
-    of_repeat, of_parent, of_node = ((1 << high) - (1 << low) for low, high in pairwise((*fields, 63)))
-    pushed = children + (same.long() << fields.repeat) + (owner.clamp(min=0) << fields.node)
-    kept = same * of_repeat + ~inside * of_parent + ~hangs * of_node
-    taken = inside * of_parent + hangs * of_node
+    of_list_index, of_parent_list_index, of_node = ((1 << high) - (1 << low) for low, high in pairwise((*fields, 63)))
+    pushed = children + (same.long() << fields.list_index) + (owner.clamp(min=0) << fields.node)
+    kept = same * of_list_index + ~inside * of_parent_list_index + ~hangs * of_node
+    taken = inside * of_parent_list_index + hangs * of_node
     numbers = torch.stack([N * (grammar.num_children - 1), grammar.num_objects])
     table = pad(torch.cat([pushed, kept, taken, numbers]), (0, 1))
     table[: len(children), -1] = len(grammar.nonterminals)

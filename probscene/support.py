@@ -74,7 +74,7 @@ class Support:
         possible = torch.zeros(len(grammar.nonterminals) + 1, P, C, len(grammar.rules), dtype=torch.bool)
         for table in tables:
             process = Branching(grammar, expand_table(table, P, C))
-            state = torch.tensor([(t.symbol, t.parent_repeat, t.repeat) for t in process.types])[process.owner]
+            state = torch.tensor([(t.symbol, t.parent_list_index, t.list_index) for t in process.types])[process.owner]
             possible[state[:, 0], state[:, 1], state[:, 2], torch.from_numpy(process.rule)] = True
         unreached = ~possible.any(-1, keepdim=True)  # takes the rules of the tables: all masked would be NaN
         written = torch.stack([expand_table(table, P, C) > -torch.inf for table in tables]).any(0)
@@ -100,7 +100,7 @@ class Support:
         if self.prior_table is None:
             return logits
         _, P, C, _ = self.prior_table.shape
-        index = frontier.parent_repeat.clamp(max=P - 1), frontier.repeat.clamp(max=C - 1)
+        index = frontier.parent_list_index.clamp(max=P - 1), frontier.list_index.clamp(max=C - 1)
         prior = self.prior_table[frontier.symbol, *index].clamp(min=MASKED_LOGIT)
         return torch.where(self.keeps_prior[frontier.symbol].unsqueeze(-1), prior.to(logits.dtype), logits)
 
@@ -111,7 +111,9 @@ class Support:
     def rows_of(self, frontier: Frontier) -> Tensor:
         """``(...)`` int64, which of ``rows`` holds."""
         _, P, C = self.row.shape
-        return self.row[frontier.symbol, frontier.parent_repeat.clamp(max=P - 1), frontier.repeat.clamp(max=C - 1)]
+        return self.row[
+            frontier.symbol, frontier.parent_list_index.clamp(max=P - 1), frontier.list_index.clamp(max=C - 1)
+        ]
 
     def uniform_table(self) -> Tensor:
         """``(V + 1, P, C, K)`` log-probabilities under which all rules that may be taken are equally probable."""
@@ -125,12 +127,12 @@ class Support:
         end[..., 0] = True
         return Support(grammar, torch.cat([self.possible[symbol : symbol + V, :, :, rule : rule + K], end]))
 
-    def widened(self, symbol: int, longest: int | None = None, rank: int | None = None) -> "Support":
+    def widened(self, symbol: int, longest: int | None = None, parent_list_index: int | None = None) -> "Support":
         """A copy in which one nonterminal may take all its rules in every state.
 
         Args:
             longest: for a list, up to how many elements it may go on; below its former end it stays as it was.
-            rank: the parent list index at which alone the list may be longer; all where None.
+            parent_list_index: at which alone the list may be longer; all where None.
         """
         legal = self.grammar.legal[symbol]
         if longest is None:
@@ -140,7 +142,7 @@ class Support:
         C = max(self.possible.shape[2], longest + 1)
         possible = expand_table(self.possible, self.possible.shape[1], C).clone()
         again = (self.grammar.children == symbol).any(1) & legal
-        for p in range(possible.shape[1]) if rank is None else [rank]:
+        for p in range(possible.shape[1]) if parent_list_index is None else [parent_list_index]:
             here = possible[symbol, p]  # (C, K)
             ends = (~(here & again).any(1)).nonzero().flatten()
             if not len(ends):

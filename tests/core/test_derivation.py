@@ -204,7 +204,7 @@ def test_incomplete_derivations_say_so():
     assert derivation.lengths.tolist() == [4, 4, 2, 2]
     finished, left = len(LIST.nonterminals), LIST.nonterminals.index("Items")
     assert derivation.frontier.symbol[2:].tolist() == [[0, left, finished, finished], [0, left, left, left]]
-    assert derivation.frontier.repeat[2:].tolist() == [[0, 0, 0, 0], [0, 0, 1, 1]]
+    assert derivation.frontier.list_index[2:].tolist() == [[0, 0, 0, 0], [0, 0, 1, 1]]
 
 
 def test_derive_complete_redraws_what_is_too_long():

@@ -88,7 +88,7 @@ def test_list_bounds_are_those_of_the_lists_that_are_derived(pair):
     found = every[prior.log_prob(every) > -torch.inf]
     assume(len(found) and Branching(grammar, prior.table).longest() <= 16)
     for bounds in bounded_lists(grammar, prior, support_of_policies(grammar, [prior])):
-        own = lengths(grammar, found, bounds.symbol).of(bounds, prior.table.shape[1])
+        own = lengths(grammar, found, bounds.symbol).select(bounds, prior.table.shape[1])
         assert (own.min(), own.max()) == (bounds.shortest, bounds.prior) and bounds.prior == bounds.longest
 
 
@@ -98,11 +98,11 @@ def test_shares_of_lengths_are_those_of_samples():
     torch.manual_seed(0)
     drawn, _ = derive_complete(NESTED, prior, 4000, 40)
     every = bounded_lists(NESTED, prior, support)
-    assert [(NESTED.nonterminals[b.symbol], b.rank, b.longest) for b in every] == [
+    assert [(NESTED.nonterminals[b.symbol], b.parent_list_index, b.longest) for b in every] == [
         ("Items", None, 2), ("Things", 0, 1), ("Things", 1, 2),
     ]  # fmt: skip
     for bounds in every:
-        found = lengths(NESTED, drawn, bounds.symbol).of(bounds, 2)
+        found = lengths(NESTED, drawn, bounds.symbol).select(bounds, 2)
         share = share_from(Branching(NESTED, prior.table), bounds, bounds.longest)
         assert abs((found >= bounds.longest).mean() - share) < 5 * (share * (1 - share) / len(found)) ** 0.5
 
