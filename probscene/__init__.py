@@ -57,7 +57,7 @@ _MODULES = {
     "probscene.inference.pretrain": ("pretrain",),
     "probscene.mesh": ("Mesh",),
     "probscene.model": ("Groups", "SceneModel", "scene_model"),
-    "probscene.photo": ("Photo",),
+    "probscene.camera_effects": ("CameraEffects",),
     "probscene.policy": ("Policy",),
     "probscene.request": ("Objects", "Request"),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
@@ -87,6 +87,7 @@ if TYPE_CHECKING:
     from probscene.inference.pretrain import pretrain
 
     from .batch import RenderBatch, Renderer
+    from .camera_effects import CameraEffects
     from .dataset import ImageFolder
     from .derivation import Derivation
     from .derive import derive
@@ -107,7 +108,6 @@ if TYPE_CHECKING:
     from .image_array import ImageArray
     from .mesh import Mesh
     from .model import Groups, SceneModel, scene_model
-    from .photo import Photo
     from .policy import Policy
     from .request import Objects, Request
     from .sampling import Scenes, sample, seed_everything
@@ -116,10 +116,10 @@ if TYPE_CHECKING:
     from .world import Camera, Ground, Light, Meshes, World
 
 __all__ = [
-    "Camera", "Command", "DataError", "Derivation", "Divergence", "Drawing", "FeatureNet", "Features",
+    "Camera", "CameraEffects", "Command", "DataError", "Derivation", "Divergence", "Drawing", "FeatureNet", "Features",
     "GeneratorError", "Grammar", "GrammarError", "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray",
     "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes",
-    "ModelError", "Objects", "PCFG", "ParameterGuide", "Photo", "Policy", "Preset", "ProbsceneError", "RenderBatch",
+    "ModelError", "Objects", "PCFG", "ParameterGuide", "Policy", "Preset", "ProbsceneError", "RenderBatch",
     "Renderer", "Request", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph", "SceneModel", "Scenes",
     "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive", "enumerate_derivations",
     "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",

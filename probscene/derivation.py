@@ -54,7 +54,7 @@ class Derivation:
     frontier: Frontier
 
     @staticmethod
-    def of(grammar: Grammar, rules: Tensor) -> "Derivation":
+    def from_rules(grammar: Grammar, rules: Tensor) -> "Derivation":
         """The derivations that given rules ``(N, T)`` spell; -1 pads.
 
         Raises:
@@ -82,7 +82,7 @@ class Derivation:
                 )
             return rule
 
-        return expand(grammar, of_tensors(choose), len(given), given.shape[1])
+        return expand(grammar, tensor_chooser(choose), len(given), given.shape[1])
 
     @staticmethod
     def merged(grammar: Grammar, parts: "list[tuple[Tensor, Derivation]]") -> "Derivation":
@@ -115,7 +115,7 @@ class Derivation:
         )
 
     def trimmed(self) -> "Derivation":
-        """The same derivations without the columns that pad every scene, as ``of`` gives them."""
+        """The same derivations without the columns that pad every scene, as ``from_rules`` gives them."""
         steps = max(1, int(self.lengths.max())) if len(self) else 1
         nodes = max(1, int((self.kind >= 0).sum(1).max())) if len(self) else 1
         if (steps, nodes) == (self.rules.shape[1], self.kind.shape[1]):
@@ -156,7 +156,7 @@ Arrays = tuple[np.ndarray, ...]  # of a frontier, in its order
 Chooser = Callable[[int, Arrays, np.ndarray], np.ndarray]  # rules ``(N,)`` of the step, frontier and rules before it
 
 
-def of_tensors(choose: Callable[[int, Frontier, Tensor], Tensor]) -> Chooser:
+def tensor_chooser(choose: Callable[[int, Frontier, Tensor], Tensor]) -> Chooser:
     """A chooser that is given tensors and gives one."""
 
     def choose_arrays(t: int, frontier: Arrays, previous: np.ndarray) -> np.ndarray:
@@ -173,7 +173,7 @@ def expand(grammar: Grammar, choose: Chooser, N: int, max_steps: int) -> Derivat
     Raises:
         GrammarError: so many steps that a stack's entry does not fit into 63 bits.
     """
-    fields, R = Fields.of(grammar, max_steps), grammar.children.shape[1]
+    fields, R = Fields.from_grammar(grammar, max_steps), grammar.children.shape[1]
     deepest = 2 + (max_steps + 1) * max(1, R - 1)
     # Entry 0 is the finished scene and is never popped. Scenes lie side by side: the next entry is N further.
     stack = np.zeros((deepest + R) * N, np.int64)
@@ -221,7 +221,7 @@ class Fields(NamedTuple):
     node: int
 
     @staticmethod
-    def of(grammar: Grammar, max_steps: int) -> "Fields":
+    def from_grammar(grammar: Grammar, max_steps: int) -> "Fields":
         """As few bits as numbers need that so many steps can come to."""
         list_index = len(grammar.nonterminals).bit_length()
         parent_list_index = list_index + max_steps.bit_length()

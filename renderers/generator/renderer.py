@@ -20,7 +20,7 @@ from probscene.request import Renderable, Request
 from probscene.threads import cores
 from probscene.worker import packed, scene_of
 
-from ..camera.effects import photographed
+from ..camera.effects import apply_camera_effects
 from .pool import pool_for
 from .reply import Fault, Picture, read
 
@@ -61,7 +61,7 @@ class GeneratedRenderer:
         batch = _batch(drawing, pictures, self.canvas)
         if drawing.photo is None or not len(drawing):
             return batch
-        return batch._replace(image=photographed(drawing.photo, batch.image, self.threads))
+        return batch._replace(image=apply_camera_effects(drawing.photo, batch.image, self.threads))
 
 
 def _drawn_here(generator: Callable[[Any], Any], record: dict[str, Any]) -> Picture:

@@ -128,7 +128,7 @@ def test_what_is_not_named_is_uniform():
 def test_beyond_the_last_length_a_list_stops():
     grammar = Grammar("Scene -> A B\nA -> x A | ε\nB -> y B | ε")
     prior = StructurePrior(grammar, A=counts(0, 1), B=counts(0, 0, 0, 1))
-    too_long = Derivation.of(grammar, torch.tensor([[0, 1, 1, 2, 3, 3, 3, 4], [0, 1, 2, 3, 3, 3, 4, -1]]))
+    too_long = Derivation.from_rules(grammar, torch.tensor([[0, 1, 1, 2, 3, 3, 3, 4], [0, 1, 2, 3, 3, 3, 4, -1]]))
     assert prior.log_prob(too_long).tolist() == [-torch.inf, 0.0]
 
 

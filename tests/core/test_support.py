@@ -103,7 +103,7 @@ def test_the_score_functions_gradient_is_that_of_the_exact_expectation(prior, se
 @pytest.mark.parametrize("kind", GUIDES)
 def test_a_guide_that_is_not_bound_passes_the_priors_longest(kind):
     prior = StructurePrior(LISTS, Items=counts(1, 1), Item=weights(0, 1))
-    long = Derivation.of(LISTS, torch.tensor([[0, *[1, 4] * 3, 2]]))
+    long = Derivation.from_rules(LISTS, torch.tensor([[0, *[1, 4] * 3, 2]]))
     guide = bound_guide(kind, LISTS, None, 0)
     assert guide.log_prob(long).isfinite().all()
     guide.bind(support_of_policies(LISTS, [prior]))

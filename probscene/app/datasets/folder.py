@@ -38,7 +38,7 @@ class Shard(NamedTuple):
     shards: int
 
     @staticmethod
-    def of(text: str) -> "Shard":
+    def from_text(text: str) -> "Shard":
         """Of ``"I/N"``.
 
         Raises:
@@ -97,9 +97,9 @@ class DatasetFolder:
             self._compare(json.loads(self.place.read(SETTINGS)))
         except FileNotFoundError:  # another process has finished the dataset
             return self.missing(shard)
-        return [chunk for chunk in self.of(shard) if not self._done(chunk)]
+        return [chunk for chunk in self.chunks_of(shard) if not self._done(chunk)]
 
-    def of(self, shard: Shard) -> range:
+    def chunks_of(self, shard: Shard) -> range:
         """The chunks of a shard."""
         return range(shard.number, len(self._chunks()), shard.shards)
 

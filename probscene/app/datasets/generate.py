@@ -107,7 +107,7 @@ def generate(
         raise ProbsceneError(f"expected a positive number of workers, got {workers}.")
     if cluster is not None and workers > 1:
         raise ProbsceneError(f"expected workers or a cluster, got {workers} workers and a cluster; leave one out.")
-    part = WHOLE if shard is None else Shard.of(shard)
+    part = WHOLE if shard is None else Shard.from_text(shard)
     more = min_visible, flat, box_margin, amodal, attributes.chosen(values)
     job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), *more)
     if workers == 1 and cluster is None:
@@ -148,7 +148,7 @@ def generate_scenes(
     """
     more = min_visible, flat, box_margin, amodal, values
     job = Job(model, policy, num, out, seed, format, None, *more)
-    return job.run(job.each, progress, WHOLE if shard is None else Shard.of(shard))
+    return job.run(job.each, progress, WHOLE if shard is None else Shard.from_text(shard))
 
 
 class Job:
@@ -211,7 +211,7 @@ class Job:
         folder, made = self.folder, 0
         if not folder.finished:
             self._check()
-        chunks, num = folder.missing(shard), sum(map(folder.size, folder.of(shard)))
+        chunks, num = folder.missing(shard), sum(map(folder.size, folder.chunks_of(shard)))
         before = num - sum(map(folder.size, chunks))
 
         def done(chunk: int | None) -> None:

@@ -36,8 +36,8 @@ def more_room(model: SceneModel, bounds: ListBounds, longest: int, shortest: int
     line = f"counts({zeros}*[1] * {longest - least + 1})"
     where = f" in {scenario}" if scenario else ""
     if bounds.parent_list_index is not None:
-        said = f"{name}=ranked(...){where} with counts(...) up to {longest} at rank {bounds.parent_list_index + 1}, such as "
-        said += line
+        rank = bounds.parent_list_index + 1
+        said = f"{name}=ranked(...){where} with counts(...) up to {longest} at rank {rank}, such as {line}"
     else:
         lower = f" from {least}" if least < bounds.shortest else ""
         said = f"{name}=counts(...){where}{lower} up to {longest}, such as {name}={line}"

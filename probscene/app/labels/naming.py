@@ -59,7 +59,7 @@ def matched(
     names, of_file = _Names(files, stems), defaultdict[int, list[int]](list)
     others = list[int]()
     for number, entry in enumerate(entries):
-        found = names.of(entry.name)
+        found = names.lookup(entry.name)
         if len(found) > 1:
             raise DataError(
                 f"expected the name of one image {entry.where}, got {entry.name!r}, which {len(found)} files in "
@@ -81,7 +81,7 @@ def matched(
         chosen[i] = best[0]
         others += [number for number in numbers if number != best[0]]
     passed = _Names(list(left_out), stems)
-    unknown = [entries[number] for number in sorted(others) if not passed.of(entries[number].name)]
+    unknown = [entries[number] for number in sorted(others) if not passed.lookup(entries[number].name)]
     _check_case(unknown, [file for i, file in enumerate(files) if i not in chosen], folder, stems)
     more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
     shown = [f"{_last(entry.name)}.txt" if stems else entry.name for entry in unknown]
@@ -165,7 +165,7 @@ class _Names:
             for table, key in zip(self.tables, _keys(file.stem if stems else file.name), strict=True):
                 table[key].append(i)
 
-    def of(self, name: str) -> list[int]:
+    def lookup(self, name: str) -> list[int]:
         """The numbers of the files that a name may be of: of those that it is of by its last part, the ones whose
         folders are the most like its own."""
         for said in (name, _last(name)):

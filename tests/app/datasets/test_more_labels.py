@@ -33,11 +33,11 @@ from probscene.app.datasets.scene_dataset import SceneDataset
 from probscene.app.datasets.yolo import around
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model, renderer_for
+from probscene.camera_effects import CameraEffects
 from probscene.derive import derive
 from probscene.drawing import Atlas, Drawing, Sprites, resolve
 from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.photo import Photo
 from probscene.request import Objects
 from probscene.scenarios import join
 from probscene.scene import SceneGraph
@@ -148,7 +148,7 @@ def only(drawing, i: int, node: int):
             present = torch.zeros_like(layer.present)
             present[0, node] = layer.present[0, node]
             layers.append(replace(layer, present=present))
-    more = {} if isinstance(drawing, Drawing) else {"ground": None, "photo": resolve_scene(Photo(), 1)}
+    more = {} if isinstance(drawing, Drawing) else {"ground": None, "photo": resolve_scene(CameraEffects(), 1)}
     return replace(drawing[i : i + 1], layers=tuple(layers), **more)
 
 
