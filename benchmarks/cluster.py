@@ -93,7 +93,7 @@ def main():
         with CPU() as cost:
             if how.pop("auto", False):
                 with Cluster("auto") as cluster:
-                    generate(run, number, out / name, 0, cluster=cluster)
+                    generate(run, number, out / name, 0, workers=cluster)
             else:
                 generate(run, number, out / name, 0, **how)
         found.setdefault(name, []).append({"images": number, "seconds": cost.wall, "cpu": cost.seconds})
@@ -125,7 +125,7 @@ def main():
                     what()
 
         with Cluster(simulated.address, said.append) as cluster:
-            generate(run, args.disturbed, out / name, 0, progress=progress, cluster=cluster)
+            generate(run, args.disturbed, out / name, 0, progress=progress, workers=cluster)
         longest = max(later - earlier for earlier, later in zip(times, times[1:], strict=False))
         found[name] = {"images": args.disturbed, "seconds": times[-1] - times[0], "longest wait": longest}
         found[name] |= {"same bytes": same(out / "fewer", out / name), "said": said}

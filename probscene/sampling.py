@@ -46,7 +46,7 @@ class Scenes:
     drawing: Renderable
     failures: Tensor
 
-    def some(self, which: Tensor) -> "Scenes":
+    def select(self, which: Tensor) -> "Scenes":
         """Those of a mask ``(N,)`` bool."""
         return Scenes(
             self.derivation[which],

@@ -4,8 +4,8 @@ from ..engine import ti
 from .lanes import LANES, SHIFT, floats, high, low, whole
 
 # Columns of the table of effects, one row a scene, float64: whether colours change, by what 3 x 3 matrix and bias, what
-# is missing a square pixel from the middle, where that is; noise before the blur and after it, of 1; radius of the blur,
-# pixels; whether there is JPEG.
+# is missing a square pixel from the middle, where that is; noise before the blur and after it, of 1; radius of the
+# blur, pixels; whether there is JPEG.
 TONED, MATRIX, BIAS, VIGNETTE, MIDDLE_U, MIDDLE_V, NOISE, LATER, RADIUS, JPEG, NUM_COLUMNS = (
     0,
     1,

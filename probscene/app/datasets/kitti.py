@@ -15,7 +15,7 @@ ends exclusive. ``occluded`` goes by the visible fraction over the share within 
 on, 2 below. Where the canvas cuts an object, that share is its box's, not its silhouette's: what only the canvas cuts
 may come out as 1, seldom as 2. Where a generator does not tell them, ``truncated`` is -1 and ``occluded`` 3, unknown.
 
-Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``labelling.kitti.TYPES``)
+Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``labels.kitti.TYPES``)
 is written as that type. The 2D box is the whole silhouette's, what others cover included, within the image: KITTI's own
 boxes of hidden cars are as near to their projected 3D boxes as those of free ones, half a pixel. (So its boxes of cars
 are projections, a few pixels wider than a silhouette, which does not reach its 3D box's corners.) Its pixels are P2's,

@@ -1,11 +1,11 @@
 """The truth that learnt structures are judged by. Three kinds:
 
-``counts.csv``, how many objects of each class an image shows, see ``labelling.counts``.
+``counts.csv``, how many objects of each class an image shows, see ``labels.counts``.
 
 ``provenance.jsonl`` as ``generate`` writes it: one line an image with the rules of its structure, which says also what
 hangs below what, and how likely a policy would have derived it.
 
-Labels with boxes of COCO, KITTI and YOLO, see ``labelling.reading``.
+Labels with boxes of COCO, KITTI and YOLO, see ``labels.reading``.
 """
 
 import json

@@ -23,7 +23,7 @@ from probscene.sampling import seed_everything
 from probscene.threads import threads
 
 from ..files import write_text
-from ..labels.partial_labels import PartialLabels, PartlyLabelled
+from ..labels.partial_labels import PartialLabels, PartlyLabelledImages
 from ..progress import Progress
 from ..workers.cluster import Cluster
 from .cache import NetworkCache
@@ -110,7 +110,7 @@ class _Network:
         labels: PartialLabels | None,
     ):
         self.run, self.observer, self.progress, self.target = run, observer, progress, target
-        self.photographs = cache(lambda: PartlyLabelled(target(), labels))
+        self.photographs = cache(lambda: PartlyLabelledImages(target(), labels))
         seed_everything(batch_seed(run.record["seed"], 0))
         self.net = run.build_network() if run.built is None else run.built
         run.built = None

@@ -47,7 +47,9 @@ class Boxes(NamedTuple):
         return torch.stack(each).numpy() if each else np.zeros((0, len(self.classes)), np.int64)
 
 
-def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Boxes:
+def read_boxes(
+    path: Path, model: SceneModel, target: Images, allow_missing: bool = False, min_height: float = 0.0
+) -> Boxes:
     """The boxes of a target's images, see ``read_annotations``. Labels of files that the target left out as bad, or
     that it has not, are not read.
 
@@ -57,7 +59,7 @@ def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False
     that one of its own types counts as, and those that occur.
 
     Args:
-        some: there need not be labels of every image; those without are left out.
+        allow_missing: there need not be labels of every image; those without are left out.
         min_height: of a box that is kept, pixels of its file.
 
     Raises:
@@ -69,7 +71,7 @@ def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False
     if not labels.kitti:
         expected = f"categories among the classes of model {model.name!r} ({', '.join(model.classes)})"
         classes, notes = labelled_classes(labels.classes, model.classes, expected, path)
-    found = match_target(path, labels.images, target, some, labels.stems)
+    found = match_target(path, labels.images, target, allow_missing, labels.stems)
     read = {i: labels.read(entry, target.sizes[i]) for i, entry in found.entries.items()}
     if labels.kitti:
         classes, notes = _classes_of_types(read.values(), model, path)

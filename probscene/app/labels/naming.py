@@ -89,15 +89,17 @@ def matched(
     return Matched(chosen, notes, tuple(unknown))
 
 
-def match_target(path: Path, entries: Sequence[Entry], target: Images, some: bool, stems: bool = False) -> Matched:
+def match_target(
+    path: Path, entries: Sequence[Entry], target: Images, allow_missing: bool, stems: bool = False
+) -> Matched:
     """Match entries with a target's images; those of files that the target left out as bad are passed over.
 
     Args:
         path: of the labels, for messages.
-        some: there need not be an entry for every image.
+        allow_missing: there need not be an entry for every image.
 
     Raises:
-        DataError: see ``matched``; an image without an entry, where not only some are expected; none of any.
+        DataError: see ``matched``; an image without an entry, unless ``allow_missing``; none of any.
     """
     found = matched(entries, target.paths, target.path, target.bad, stems)
     missing = [file.name for i, file in enumerate(target.paths) if i not in found.entries]
@@ -105,12 +107,12 @@ def match_target(path: Path, entries: Sequence[Entry], target: Images, some: boo
     if found.others:
         entry, more = found.others[0], len(found.others) - 1
         but = f", but of {_last(entry.name)!r} {entry.where}{f' and {more} more' if more else ''}, which it has not"
-    if not found.entries and (some or not missing):
+    if not found.entries and (allow_missing or not missing):
         raise DataError(
             f"expected labels of images of {target.path} in {path}, got none{but}; label at least one, by the name "
             "of its file."
         )
-    if missing and not some:
+    if missing and not allow_missing:
         names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
         raise DataError(
             f"expected labels of every image of {target.path} in {path}, got none of {names}{but}; if only some are "

@@ -120,7 +120,7 @@ def page(
     about = {"classes": classes, "before": before}
     digest = hashlib.sha256(json.dumps([model, about, names]).encode()).hexdigest()[:16]
     return Template(
-        resources.files("probscene.app.labelling").joinpath("sheet.html").read_text(encoding="utf-8")
+        resources.files("probscene.app.labels").joinpath("sheet.html").read_text(encoding="utf-8")
     ).substitute(
         title=html.escape(f"Count in {len(names)} pictures: {model}"),
         classes=html.escape(", ".join(classes)),

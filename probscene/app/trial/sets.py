@@ -87,7 +87,7 @@ def read_set(
 
     Args:
         classes: those to keep; all that it has where None. KITTI's types count as classes of their names, whatever the
-            case, or by ``labelling.kitti.TYPES``.
+            case, or by ``labels.kitti.TYPES``.
         same: a set of COCO or YOLO must have no others.
         progress: called with the number of images read, and of all.
 

@@ -8,13 +8,12 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets import generate as datasets
-from probscene.app.datasets.generate import _actor, generate
+from probscene.app.datasets.generate import DatasetOptions, _actor, generate, workers_or_cluster
 from probscene.app.fitting.run import RunFolder
 from probscene.app.workers import actor_pool
 from probscene.app.workers import cluster as clusters
@@ -124,7 +123,7 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_pa
         if len(made) == 5:
             simulated.freeze()
 
-    dataset = generate(run, 700, tmp_path / "out", 3, format="coco,yolo", progress=progress, cluster=nodes)
+    dataset = generate(run, 700, tmp_path / "out", 3, format="coco,yolo", progress=progress, workers=nodes)
     assert dataset.made == 700 and dataset.finished and made[-1] == 700
     assert contents(tmp_path / "out") == contents(tmp_path / "alone")
 
@@ -184,11 +183,11 @@ def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr(datasets, "_actor", partial(unwritable, node, code, tmp_path / "tried"))
         with pytest.raises(MachineError, match=f"On node .*: .*{what}"):
-            generate(run, 700, out, seed=3, cluster=nodes)
+            generate(run, 700, out, seed=3, workers=nodes)
     generate(run, 700, tmp_path / "alone", seed=3)
     shown = {name: data for name, data in contents(out).items() if not name.startswith(".")}
     assert shown.items() <= contents(tmp_path / "alone").items()  # whole or absent
-    generate(run, 700, out, seed=3, cluster=nodes)
+    generate(run, 700, out, seed=3, workers=nodes)
     assert contents(out) == contents(tmp_path / "alone")
 
 
@@ -213,9 +212,8 @@ def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
     assert run.guide_hash() and run.guide  # as of another machine's disk, which nodes do not have
     run.path = tmp_path / "elsewhere"
     with pytest.raises(ProbsceneError, match="On node .*: expected a run folder .*elsewhere.*by the same paths"):
-        nodes.actor_pool(_actor, (run.path, 10, tmp_path / "out", 0, ("coco",), 0.0, False)).run(
-            [0], lambda result: None
-        )
+        arguments = run.path, 10, tmp_path / "out", 0, ("coco",), DatasetOptions()
+        nodes.actor_pool(_actor, arguments).run([0], lambda result: None)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "nowhere", "nowhere.invalid:6379"])
@@ -263,6 +261,7 @@ def test_auto_starts_one_where_what_ray_remembers_is_gone(monkeypatch):
     assert sorted(found) == [(1, 2), (2, 4)]
 
 
-def test_workers_or_a_cluster(fitted, tmp_path):
+def test_workers_or_a_cluster(nodes):
+    assert workers_or_cluster(2, None) == 2 and workers_or_cluster(1, nodes) is nodes
     with pytest.raises(ProbsceneError, match="expected workers or a cluster"):
-        generate(RunFolder.at(fitted), 4, tmp_path / "out", workers=2, cluster=SimpleNamespace())
+        workers_or_cluster(2, nodes)
