@@ -22,7 +22,7 @@ from .derive import ConditionDerivation, derive_complete
 from .errors import ModelError
 from .model import SceneModel
 from .policy import Policy
-from .program_errors import remedy, told, useful_text
+from .program_errors import remedy, useful_text, user_errors
 from .request import Renderable
 
 
@@ -103,7 +103,7 @@ def run_program(
             "nonterminals left; draw them with derive_complete."
         )
     known = ConditionDerivation(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
-    with told(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
+    with user_errors(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"].get("value")

@@ -16,7 +16,7 @@ from probscene.checks import Report, check
 from probscene.errors import MachineError, ProbsceneError
 from probscene.inference.features.counting.net import CountNet
 from probscene.model import SceneModel
-from probscene.program_errors import told
+from probscene.program_errors import user_errors
 from probscene.sampling import Scenes, run_program, sample
 
 from ..chunks import chunk_randomness
@@ -26,7 +26,7 @@ from .watch import Watch, longer, lookups, shorter, watched
 
 SCENES, RENDERED = 256, 32  # how many scenes the program is run on, and how many of them are rendered
 QUICK = 64, 16  # the same before a fit
-FEW = 5  # objects of a class: from fewer nothing is concluded
+MIN_CLASS_OBJECTS = 5  # objects of a class: from fewer nothing is concluded
 SELDOM = 0.05  # share of a class's objects that can be seen
 LEAST_SIZE = 6.0  # pixels that an object needs in what the count network reads, see CountNet.fit_to
 
@@ -84,7 +84,7 @@ def check_program(model: SceneModel, scenes: int, rendered: int, again: SceneMod
             wrong = [*_not_finite(drawn), *_parameters(set(store.keys()) - known)]
             if wrong:
                 return Findings(wrong, [], {})
-            with told(f"the renderer of model {model.name!r}", model.renderer):
+            with user_errors(f"the renderer of model {model.name!r}", model.renderer):
                 render = renderer_for(model)
                 batches = _rendered(model, render, drawn, rendered)
                 few = drawn[0].derivation[_telling(model, drawn[0], randomness.SCENES)]
@@ -164,12 +164,12 @@ def _seen(model: SceneModel, batches: list[tuple[Tensor, RenderBatch]]) -> tuple
             )
     hidden = {name: found for name, found in each.items() if found.drawn and not found.seen}
     boxes = [found.box for found in hidden.values()]
-    if hidden and len(hidden) == len(each) and sum(found.drawn for found in hidden.values()) >= FEW:
+    if hidden and len(hidden) == len(each) and sum(found.drawn for found in hidden.values()) >= MIN_CLASS_OBJECTS:
         objects = ", ".join(map(repr, hidden))
         return [f"Nothing that is drawn can be seen ({objects}): {_why_hidden(model, torch.cat(boxes))}."], []
     for name, found in each.items():
         share = found.seen / found.derived
-        if name in hidden and found.drawn >= FEW:
+        if name in hidden and found.drawn >= MIN_CLASS_OBJECTS:
             faults.append(f"Class {name!r} can never be seen: {_why_hidden(model, found.box)}.")
         elif found.drawn and share < SELDOM:
             warnings.append(
@@ -224,7 +224,7 @@ def _colours(model: SceneModel, drawn: Scenes) -> list[str]:
 
 def _small(model: SceneModel, sizes: dict[str, Tensor]) -> list[str]:
     """Classes of which half are too small for the count network, as it would reduce the images."""
-    sizes = {name: size for name, size in sizes.items() if len(size) >= FEW}
+    sizes = {name: size for name, size in sizes.items() if len(size) >= MIN_CLASS_OBJECTS}
     if not sizes:
         return []
     with torch.random.fork_rng(devices=[]):

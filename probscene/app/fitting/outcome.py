@@ -121,10 +121,10 @@ def worse_than_labels(labels: PartialLabels, learnt: dict[str, NDArray[np.float6
     for name, counts in zip(labels.classes, labels.counts.T.double().numpy(), strict=True):
         if name not in learnt or len(counts) < ENOUGH:
             continue
-        select_scenes, of_labels = scores(learnt[name], counts), histogram_scores(counts)
-        chance = float((select_scenes - of_labels).std(ddof=1)) / math.sqrt(len(counts))
-        if (select_scenes - of_labels).mean() > max(WORSE * chance, LITTLE):
-            found[name] = float(select_scenes.mean()), float(of_labels.mean())
+        of_scenes, of_labels = scores(learnt[name], counts), histogram_scores(counts)
+        chance = float((of_scenes - of_labels).std(ddof=1)) / math.sqrt(len(counts))
+        if (of_scenes - of_labels).mean() > max(WORSE * chance, LITTLE):
+            found[name] = float(of_scenes.mean()), float(of_labels.mean())
     return found
 
 

@@ -21,7 +21,7 @@ from .kitti import DONT_CARE, TYPES, class_of
 from .naming import labelled_classes, match_target
 from .reading import read_annotations
 
-NAMED = 5  # images in a note
+MAX_NAMED_IMAGES = 5  # images in a note
 
 
 class Boxes(NamedTuple):
@@ -78,10 +78,10 @@ def read_boxes(
         notes += _regions(read.values(), min_height)
     crowded = [i for i, each in read.items() if any(one.crowd and one.name in classes for one in each)]
     if crowded:
-        names = ", ".join(sorted(target.paths[i].name for i in crowded)[:NAMED])
+        names = ", ".join(sorted(target.paths[i].name for i in crowded)[:MAX_NAMED_IMAGES])
         notes += (
             f"{len(crowded)} images are taken as not labelled, since a crowd (iscrowd) says not how many it has: "
-            f"{names}{' ...' if len(crowded) > NAMED else ''}.",
+            f"{names}{' ...' if len(crowded) > MAX_NAMED_IMAGES else ''}.",
         )
     boxes = {
         i: [one._replace(name=classes[one.name]) for one in each if one.name in classes]

@@ -23,8 +23,8 @@ from ..labels.naming import composed
 from .sets import Example, LabelledSet
 
 REAL = "real"
-NAMED = 5  # images in a message
-LOOSE = 1.25  # times as wide as generated boxes, from which photographs' labels are said to be looser
+MAX_NAMED_IMAGES = 5  # images in a message
+LOOSE_BOX_RATIO = 1.25  # times as wide as generated boxes, from which photographs' labels are said to be looser
 
 
 class Part(NamedTuple):
@@ -165,11 +165,11 @@ def check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet,
             if e.digest in of_digest and len(e.boxes) + len(of_digest[e.digest].boxes)  # empty scenes may be the same
         ]
         if both:
-            more = f" and {len(both) - NAMED} more" if len(both) > NAMED else ""
+            more = f" and {len(both) - MAX_NAMED_IMAGES} more" if len(both) > MAX_NAMED_IMAGES else ""
             raise DataError(
                 f"expected test images that are in no set, got {len(both)} in {name!r}: "
-                f"{'; '.join(both[:NAMED])}{more}. Take them out of one of the two; for a part of one folder, name "
-                "'real' with --hold-out N."
+                f"{'; '.join(both[:MAX_NAMED_IMAGES])}{more}. Take them out of one of the two; for a part of "
+                "one folder, name 'real' with --hold-out N."
             )
 
 
@@ -245,7 +245,7 @@ def looser(photographs: LabelledSet, made: LabelledSet) -> str | None:
     sides = [_sides(found, len(made.classes), made.examples[0].size) for found in (photographs, made)]
     known = {name: (a, b) for name, a, b in zip(made.classes, *sides, strict=True) if a > 0 and b > 0}
     margin = round(float(np.median([(a - b) / 2 for a, b in known.values()]))) if known else 0
-    if margin < 1 or max(a / b for a, b in known.values()) < LOOSE:
+    if margin < 1 or max(a / b for a, b in known.values()) < LOOSE_BOX_RATIO:
         return None
     words = ", ".join(f"{name} {a:.0f} for {b:.0f}" for name, (a, b) in known.items())
     return (
