@@ -1,4 +1,4 @@
-"""Errors inside a user's own program, told with the user's file, line and source text, and with what to do.
+"""Errors inside a user's own program, raised with the user's file, line and source text, and with what to do.
 
 A traceback is the user's where one of its frames lies in code that belongs neither to probscene nor to an installed
 package; any other error is a bug of probscene and passes through as it is.

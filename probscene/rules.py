@@ -81,7 +81,7 @@ class InverseCDF(NamedTuple):
 
 
 class Choice:
-    """What ``expand`` asks for rules, where nothing hears of them.
+    """Chooses rules for ``expand``, where no handler sees them.
 
     Args:
         grammar: the grammar.

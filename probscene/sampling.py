@@ -90,9 +90,9 @@ def run_program(
         density: see ``sample``.
 
     Raises:
-        ModelError: a derivation that is not complete; the program raises an error, which is told with the line that it
-            comes from; its sites are not what a scene model's must be; it returns no ``Drawing``, or one of other nodes
-            than were derived.
+        ModelError: a derivation that is not complete; the program raises an error, which is given with its line; its
+            sites are not what a scene model's must be; it returns no ``Drawing``, or one of other nodes than were
+            derived.
     """
     N = len(derivation)
     sites = derivation.sites()

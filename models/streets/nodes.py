@@ -55,7 +55,7 @@ class Nodes:
         """``(N, 1)``, the value of the one node in the mask; 0 in a scene without it."""
         return (value * mask).sum(1, keepdim=True)
 
-    def each(self, name: str) -> Tensor:
+    def thing_parameter(self, name: str) -> Tensor:
         """``(N, M)``, every thing's own parameter; 1 elsewhere."""
         value = torch.ones(self.graph.kind.shape)
         for kind in self.things:

@@ -148,13 +148,13 @@ class Process:
             raise GeneratorError(self._protocol_error("something else")) from error
         if hello is None:
             raise Fault(f"{self._ended()}it hung up")
-        said = hello[0]
-        if said.get("protocol") != worker.PROTOCOL or said.get("token") != self._token:
-            raise GeneratorError(self._protocol_error(f"protocol {said.get('protocol')!r}"))
-        if self.command.version and said.get("version") != self.command.version:
+        greeting = hello[0]
+        if greeting.get("protocol") != worker.PROTOCOL or greeting.get("token") != self._token:
+            raise GeneratorError(self._protocol_error(f"protocol {greeting.get('protocol')!r}"))
+        if self.command.version and greeting.get("version") != self.command.version:
             raise GeneratorError(
                 f"expected version {self.command.version!r} of the generator {self.command.name}, got "
-                f"{said.get('version')!r}; start that one, or change version= of the Command and fit again."
+                f"{greeting.get('version')!r}; start that one, or change version= of the Command and fit again."
             )
 
     def _protocol_error(self, actual: str) -> str:

@@ -37,7 +37,7 @@ from .formats import chosen
 from .places import place_at
 from .provenance import image_name, provenance
 
-Done = Callable[[int, int], None]
+ProgressCallback = Callable[[int, int], None]
 """Called with the number of images there are, and how many there are to be."""
 
 
@@ -113,7 +113,7 @@ def generate(
     seed: int = 0,
     workers: int | Cluster = 1,
     format: str | Iterable[str] = "coco",
-    progress: Done | None = None,
+    progress: ProgressCallback | None = None,
     options: DatasetOptions = DatasetOptions(),
 ) -> Dataset:
     """Write ``num`` images of the learnt structures.
@@ -141,7 +141,7 @@ def generate(
         raise ProbsceneError(f"expected a positive number of workers, got {workers}.")
     job = Job(run.model, run.guide, num, out, seed, chosen(format), options, run.guide_hash())
     if workers == 1:
-        return job.run(job.each, progress)
+        return job.run(job.make_all, progress)
     if run.objects:
         raise ProbsceneError(
             f"expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), got "
@@ -175,7 +175,7 @@ def generate_scenes(
     out: Path | str,
     seed: int = 0,
     format: str | Iterable[str] = "coco",
-    progress: Done | None = None,
+    progress: ProgressCallback | None = None,
     options: DatasetOptions = DatasetOptions(),
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
@@ -183,7 +183,7 @@ def generate_scenes(
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
     job = Job(model, policy, num, out, seed, chosen(format), options)
-    return job.run(job.each, progress)
+    return job.run(job.make_all, progress)
 
 
 class Job:
@@ -225,7 +225,9 @@ class Job:
         self.folder = DatasetFolder(out, self.origin, num, formats, options.flat)
         self._renderer = renderer_for(model, threads=1)
 
-    def run(self, work: Callable[[list[int], Callable[[int], None]], None], progress: Done | None) -> Dataset:
+    def run(
+        self, work: Callable[[list[int], Callable[[int], None]], None], progress: ProgressCallback | None
+    ) -> Dataset:
         """Do what is missing of the shard by ``work(chunks, done)``; of the whole, then write the labels."""
         folder, shard, made = self.folder, self.options.part(), 0
         if not folder.finished:
@@ -267,7 +269,7 @@ class Job:
             if "depth" in self.formats:
                 depth.files(self.model, first)
 
-    def each(self, chunks: list[int], done: Callable[[int], None]) -> None:
+    def make_all(self, chunks: list[int], done: Callable[[int], None]) -> None:
         """Make chunks one after the other."""
         for chunk in chunks:
             done(self.make(chunk))

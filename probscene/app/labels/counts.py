@@ -42,8 +42,8 @@ class Table(NamedTuple):
 
 
 def read_table(path: Path, classes: tuple[str, ...], target: Images, allow_missing: bool = False) -> Table:
-    """The counts of a target's images. Rows of files that the target left out as bad, or that it has not, are passed
-    over; the latter are said.
+    """The counts of a target's images. Rows of files that the target left out as bad, or that it has not, are skipped;
+    a note names the latter.
 
     Args:
         classes: the model's.

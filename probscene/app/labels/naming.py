@@ -170,8 +170,8 @@ class _Names:
     def lookup(self, name: str) -> list[int]:
         """The numbers of the files that a name may be of: of those that it is of by its last part, the ones whose
         folders are the most like its own."""
-        for said in (name, _last(name)):
-            for table, key in zip(self.tables, _keys(said), strict=True):
+        for text in (name, _last(name)):
+            for table, key in zip(self.tables, _keys(text), strict=True):
                 if found := table.get(key):
                     alike = [_folders_alike(name, self.files[i]) for i in found]
                     return [i for i, depth in zip(found, alike, strict=True) if depth == max(alike)]

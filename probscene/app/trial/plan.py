@@ -79,12 +79,12 @@ def plan(sets: Mapping[str, str | Path], known: Iterable[str], numbers: Iterable
     for name in known:
         if name != REAL:
             rows[name] = Row(name, ((Part(name),),))
-    for name, said in sets.items():
+    for name, text in sets.items():
         if name in rows or name in known:
             raise ProbsceneError(f"expected a name for each set of a trial, got {name!r} twice; rename one.")
         if not name or name.startswith(".") or any(letter in name for letter in '/\\:"\n'):
             raise ProbsceneError(f"expected a name that can be a file's for a set of a trial, got {name!r}.")
-        rows[name] = Row(name, _stages(said, known, rows, paths))
+        rows[name] = Row(name, _stages(text, known, rows, paths))
     if not rows:
         raise ProbsceneError(
             "expected sets to compare, got none; give --set NAME=PATH, --run RUN or --real-numbers 10,20,50,all."
@@ -192,12 +192,12 @@ def _row_name(part: Part) -> str:
 
 
 def _stages(
-    said: str | Path, known: tuple[str, ...], rows: Mapping[str, Row], paths: dict[str, Path]
+    text: str | Path, known: tuple[str, ...], rows: Mapping[str, Row], paths: dict[str, Path]
 ) -> tuple[tuple[Part, ...], ...]:
-    if isinstance(said, Path) or Path(said).exists():
-        return ((_path(str(said), paths),),)
+    if isinstance(text, Path) or Path(text).exists():
+        return ((_path(str(text), paths),),)
     stages: list[tuple[Part, ...]] = []
-    for words in said.split(","):
+    for words in text.split(","):
         found: list[tuple[tuple[Part, ...], ...]] = [
             _named(word.strip(), known, rows, paths) for word in words.split("+")
         ]
