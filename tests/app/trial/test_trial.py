@@ -159,7 +159,8 @@ def test_test_images_in_a_set_are_named(drawn, tmp_path):
 )
 def test_settings_that_make_no_sense(drawn, sets, tmp_path, options, said):
     with pytest.raises(ProbsceneError, match=said):
-        trial(drawn / "test", tmp_path / "out", sets, TrialOptions(**{**SMALL, **options}))
+        workers, options = options.get("workers", 1), {key: value for key, value in options.items() if key != "workers"}
+        trial(drawn / "test", tmp_path / "out", sets, TrialOptions(**{**SMALL, **options}), workers=workers)
     assert not (tmp_path / "out").exists()
 
 
