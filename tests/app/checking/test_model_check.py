@@ -29,9 +29,9 @@ FAULTS = {
     "negative scale": (
         X,
         'x = pyro.sample("x", dist.Normal(32.0, -1.0))',
-        ("line 24", "expected parameter scale", "GreaterThan(lower_bound=0.0), but found -1.0"),
+        ("line 24", "Expected parameter scale", "GreaterThan(lower_bound=0.0), but found -1.0"),
     ),
-    "inverted Uniform": (X, X.replace("8.0, 56.0", "56.0, 8.0"), ("line 24", "expected parameter low")),
+    "inverted Uniform": (X, X.replace("8.0, 56.0", "56.0, 8.0"), ("line 24", "Expected parameter low")),
     "repeated name": (X, X.replace('"x"', '"y"'), ("line 25", "Multiple sample sites named 'y'")),
     "a class never drawn": (BLUE, "", ("Class 'blue' is never drawn", "a layer of kind 'blue'")),
     "a class off the canvas": (
