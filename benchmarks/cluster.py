@@ -101,7 +101,7 @@ def main():
         with CPU() as cost:
             if how.pop("auto", False):
                 with Cluster("auto") as cluster:
-                    generate(run, number, out / name, 0, cluster=cluster)
+                    generate(run, number, out / name, 0, workers=cluster)
             else:
                 generate(run, number, out / name, 0, **how)
         found.setdefault(name, []).append({"images": number, "seconds": cost.wall, "cpu": cost.seconds})
@@ -133,16 +133,16 @@ def main():
                     what()
 
         with Cluster(simulated.address, said.append) as cluster:
-            generate(run, args.disturbed, out / name, 0, progress=progress, cluster=cluster)
+            generate(run, args.disturbed, out / name, 0, progress=progress, workers=cluster)
         longest = max(later - earlier for earlier, later in zip(times, times[1:], strict=False))
         found[name] = {"images": args.disturbed, "seconds": times[-1] - times[0], "longest wait": longest}
         found[name] |= {"same bytes": same(out / "fewer", out / name), "said": said}
         print(name, json.dumps(found[name]), flush=True)
     simulated.whole()
     shutil.rmtree(out / "nodes", ignore_errors=True)
-    run_crew, parts = ActorPool.run, []
+    run_pool, parts = ActorPool.run, []
 
-    def disturbed(crew, tasks, done):
+    def disturbed(pool, tasks, done):
         def each(result):
             parts.append(result)
             for number, what in ((8, simulated.kill), (20, simulated.freeze)):
@@ -150,7 +150,7 @@ def main():
                     what()
             done(result)
 
-        run_crew(crew, tasks, each)
+        run_pool(pool, tasks, each)
 
     ActorPool.run = disturbed
     with CPU() as cost:

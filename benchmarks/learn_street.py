@@ -108,7 +108,7 @@ def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) ->
     """The correlation of what is read of cars with the labels, and in how many frames."""
     net = run.network()
     assert net is not None and truth.classes is not None
-    read = net.embed(frames.some(len(frames))).numpy()[:, net.names.index("car")]
+    read = net.embed(frames.subset(len(frames))).numpy()[:, net.names.index("car")]
     true = truth.structures.counts[:, truth.classes.index("car")]
     which = {"all": np.full(len(frames), True)}
     if labels.is_dir():
@@ -162,7 +162,7 @@ def said(images: Tensor) -> dict[str, list[float]]:
 
 def looks(run: RunFolder, frames: ImageFolder, num: int, grid: Path) -> dict:
     """What is said of frames and of each source's images, and how far these are from the frames; some as a picture."""
-    real = frames.some(len(frames))
+    real = frames.subset(len(frames))
     policies = before(run.model)
     if run.parameters:
         policies["structure"] = copy(run.guide)

@@ -38,7 +38,7 @@ from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, weights
 
 LOW, HIGH = multi_mnist.MARGIN, multi_mnist.CANVAS - multi_mnist.MARGIN
-UNIFORM_NUMBER, UNIFORM_CLASS = (1,) * (multi_mnist.MOST + 1), (1,) * 10
+UNIFORM_NUMBER, UNIFORM_CLASS = (1,) * (multi_mnist.MAX_DIGITS + 1), (1,) * 10
 FONTS = cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX
 WITHIN, BEYOND = "not learnt", "another domain"
 Place = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor | float, Tensor | float]]

@@ -45,4 +45,4 @@ class PlaceGuide(ps.Guide):
         return self._at(derivation.frontier)
 
     def _at(self, frontier: Frontier) -> Tensor:
-        return self.table[frontier.parent_repeat.clamp(max=PLACES - 1), frontier.repeat.clamp(max=PLACES - 1)]
+        return self.table[frontier.parent_list_index.clamp(max=PLACES - 1), frontier.list_index.clamp(max=PLACES - 1)]

@@ -48,7 +48,7 @@ class RenderCache:
             new = row < 0
             if new.any():
                 row[new] = torch.arange(self.drawn, self.drawn + int(new.sum()))
-                self._keep(counts[new], observe(scenes.some(new)))
+                self._keep(counts[new], observe(scenes.select(new)))
             self.asked += len(row)
             return torch.stack([self._features[each] for each in row])
 

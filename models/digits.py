@@ -51,7 +51,7 @@ class Digits(NamedTuple):
     count: Tensor
 
     @staticmethod
-    def of(images: np.ndarray, labels: np.ndarray) -> "Digits":
+    def from_arrays(images: np.ndarray, labels: np.ndarray) -> "Digits":
         """From images ``(n, 28, 28)`` uint8 and their digits ``(n,)``; the order within a digit is kept.
 
         Raises:
@@ -95,7 +95,7 @@ def shipped(held_out: bool) -> Digits:
     table = table[np.argsort(table[:, -1], kind="stable")].reshape(10, 500, -1)
     part = table[:, -HELD_OUT:] if held_out else table[:, :-HELD_OUT]
     part = part.reshape(-1, part.shape[-1])
-    return Digits.of(part[:, :-1].reshape(-1, SIZE, SIZE), part[:, -1])
+    return Digits.from_arrays(part[:, :-1].reshape(-1, SIZE, SIZE), part[:, -1])
 
 
 @cache
@@ -115,7 +115,7 @@ def idx(folder: str | Path, held_out: bool) -> Digits:
             f"expected as many {name} images as labels in {folder}, got {len(images)} and {len(labels)}; "
             "take both files from one source."
         )
-    return Digits.of(images, labels)
+    return Digits.from_arrays(images, labels)
 
 
 def read_idx(file: Path, axes: int) -> np.ndarray:
@@ -156,7 +156,7 @@ def fonts(held_out: bool, each: int = 500, seed: int = 0) -> Digits:
     target's are drawn with another seed. OpenCV 5 sets the Hershey faces in a typeface of its own."""
     rng = np.random.default_rng([seed, held_out])
     labels = np.repeat(np.arange(10), each)
-    return Digits.of(np.stack([_glyph(str(digit), rng) for digit in labels]), labels)
+    return Digits.from_arrays(np.stack([_glyph(str(digit), rng) for digit in labels]), labels)
 
 
 def _glyph(text: str, rng: np.random.Generator) -> np.ndarray:

@@ -83,9 +83,9 @@ class Images:
         """
         raise TypeError(f"expected images with a 'load' method, got {type(self).__name__}.")
 
-    def some(self, most: int) -> Tensor:
+    def subset(self, max_images: int) -> Tensor:
         """At most so many of the images, ``(l, C, H, W)`` uint8, evenly spread over all."""
-        number = min(most, len(self))
+        number = min(max_images, len(self))
         return torch.stack([self.load(i * len(self) // number) for i in range(number)])
 
     def batches(self, size: int, view: int = 0) -> Iterator[Tensor]:

@@ -18,7 +18,7 @@ from pyro.poutine.messenger import Messenger
 from pyro.poutine.runtime import _PYRO_STACK, effectful
 from torch import Tensor
 
-from .derivation import Chooser, Derivation, Frontier, expand, of_tensors
+from .derivation import Chooser, Derivation, Frontier, expand, tensor_chooser
 from .errors import ModelError, SamplingError
 from .grammar import Grammar
 from .policy import Policy, masked
@@ -105,7 +105,7 @@ def derive(
         _check(grammar, f"{name}_{t}", value, frontier)
         return value.squeeze(-1)
 
-    derivation = _effect(grammar, of_tensors(choose), num_scenes, max_steps, name=_message(name))
+    derivation = _effect(grammar, tensor_chooser(choose), num_scenes, max_steps, name=_message(name))
     given = done == 0  # by a handler
     if _without_density():
         static = not given
@@ -202,5 +202,5 @@ def derive_complete(
             f"still open after {attempts} attempts; raise max_steps or make the lists shorter."
         )
     if not parts:
-        return Derivation.of(grammar, torch.full((0, 1), -1)), failures
+        return Derivation.from_rules(grammar, torch.full((0, 1), -1)), failures
     return Derivation.merged(grammar, parts).trimmed(), failures

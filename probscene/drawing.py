@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .camera_effects import CameraEffects
 from .errors import ModelError
-from .photo import Photo
 
 _COLOUR_LIMITS = -1.0, 2.0  # within which a channel is clipped to 0..1; beyond them it has another scale
 
@@ -198,7 +198,7 @@ class Drawing:
     kinds: tuple[str, ...]
     layers: tuple[Layer, ...]
     background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
-    photo: Photo | None = None
+    photo: CameraEffects | None = None
 
     def __post_init__(self):
         try:
@@ -217,8 +217,8 @@ class Drawing:
 
     def __getitem__(self, scenes: slice | Tensor) -> "Drawing":
         """The same drawing of some of the scenes."""
-        layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
-        return replace(self, kind=self.kind[scenes], layers=layers, photo=of_scenes(self.photo, scenes))
+        layers = tuple(select_scenes(layer, scenes) for layer in self.layers)
+        return replace(self, kind=self.kind[scenes], layers=layers, photo=select_scenes(self.photo, scenes))
 
 
 def check_colour(name: str, colour: Tensor) -> None:
@@ -239,7 +239,7 @@ def check_colour(name: str, colour: Tensor) -> None:
 AnyPart = TypeVar("AnyPart")
 
 
-def of_scenes(part: AnyPart, scenes: slice | Tensor) -> AnyPart:
+def select_scenes(part: AnyPart, scenes: slice | Tensor) -> AnyPart:
     """A dataclass with some of the scenes' rows of all its tensors; what has none is as it is."""
     if part is None:
         return part

@@ -47,7 +47,7 @@ def enumerate_derivations(grammar: Grammar, max_steps: int, limit: int = 100_000
             if len(rules) + 1 + fewest <= max_steps:
                 todo.append(((*rules, k), (*stack[:-1], *children[k]), fewest))
     longest = max(map(len, found))
-    return Derivation.of(grammar, torch.tensor([rules + (-1,) * (longest - len(rules)) for rules in found]))
+    return Derivation.from_rules(grammar, torch.tensor([rules + (-1,) * (longest - len(rules)) for rules in found]))
 
 
 def shortest_lengths(grammar: Grammar) -> list[int]:

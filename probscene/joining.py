@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from .camera_effects import CameraEffects
 from .drawing import Drawing, Layer
 from .errors import ModelError
-from .photo import Photo
 from .request import Renderable, Request, Values
 from .world import Ground, MeshLayer, Part, World, resolve_scene
 
@@ -97,11 +97,13 @@ def _chosen(parts: list[tuple[Tensor, Part]]) -> Part:
     return type(parts[0][1])(**{name: _rows([(own, getattr(part, name)) for own, part in parts]) for name in names})
 
 
-def _photo(parts: list[tuple[Tensor, Photo | None]]) -> Photo | None:
+def _photo(parts: list[tuple[Tensor, CameraEffects | None]]) -> CameraEffects | None:
     """Scenarios without a photo keep their images as they are among others with one."""
     if all(photo is None for _, photo in parts):
         return None
-    return _chosen([(own, resolve_scene(Photo(), len(own)) if photo is None else photo) for own, photo in parts])
+    return _chosen(
+        [(own, resolve_scene(CameraEffects(), len(own)) if photo is None else photo) for own, photo in parts]
+    )
 
 
 def _ground(parts: list[tuple[Tensor, Ground | None]]) -> Ground | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .errors import ModelError
 
-LARGEST = 200.0  # metres; what is larger was not made in metres
+MAX_MESH_SIZE = 200.0  # metres; what is larger was not made in metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +65,9 @@ class Mesh:
                 f"expected vertices 0..{len(self.positions) - 1} in a mesh's triangles, got {low}..{high}."
             )
         size = float(np.ptp(self.positions, axis=0).max())
-        if not 0 < size <= LARGEST:
+        if not 0 < size <= MAX_MESH_SIZE:
             raise ModelError(
-                f"expected a mesh of at most {LARGEST:g} m, got {size:g} m; meshes are in metres, scale it."
+                f"expected a mesh of at most {MAX_MESH_SIZE:g} m, got {size:g} m; meshes are in metres, scale it."
             )
 
     def _keep(self, name: str, value: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:

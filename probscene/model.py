@@ -22,6 +22,7 @@ from .grammar import Grammar
 from .policy import Policy
 from .request import Renderable
 from .scene import SceneGraph
+from .structure import StructurePrior, support_of_policies
 from .support import Support
 
 
@@ -206,7 +207,14 @@ class SceneModel:
     @functools.cached_property
     def support(self) -> Support | None:
         """What its prior or its policy of pretraining may derive; None where one of them is no ``StructurePrior``."""
-        return Support.of(self.grammar, (self.prior, self.pretraining_policy))
+        return support_of_policies(self.grammar, (self.prior, self.pretraining_policy))
+
+    def guide_support(self, prior_kinds: Sequence[str] = ()) -> Support | None:
+        """What a guide is bound to: ``support``, where nonterminals that derive objects of ``prior_kinds`` alone keep
+        the prior's probabilities."""
+        if self.support is None or not isinstance(self.prior, StructurePrior):
+            return self.support
+        return self.support.with_prior(self.prior.table, prior_kinds)
 
     def __call__(self, num_scenes: int, structure: Policy | None = None) -> Renderable:
         """Run the program; under the prior where no structure policy is given."""

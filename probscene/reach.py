@@ -37,7 +37,7 @@ class Reach:
     """
 
     def __init__(self, grammar: Grammar, support: Support, max_steps: int | None, kinds: Sequence[Sequence[int]]):
-        self.process = process = Branching(grammar, support.uniform().table)
+        self.process = process = Branching(grammar, support.uniform_table())
         size, uses = len(process.types), len(process.owner)
         self.uses = uses
         owner, each = process.owner, np.arange(uses)

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .drawing import Drawing, of_scenes
+from .camera_effects import CameraEffects
+from .drawing import Drawing, select_scenes
 from .errors import ModelError
-from .photo import Photo
 from .world import World
 
 
@@ -41,8 +41,8 @@ class Values:
     present: Tensor
     values: dict[str, Tensor]
 
-    def of(self, scenes: slice | Tensor) -> "Values":
-        """Those of some of the scenes."""
+    def select(self, scenes: slice | Tensor) -> "Values":
+        """The values of some scenes."""
         return Values(self.present[scenes], {key: value[scenes] for key, value in self.values.items()})
 
 
@@ -66,7 +66,7 @@ class Request:
     seed: Tensor
     objects: tuple[Values, ...]
     scene: tuple[Values, ...]
-    photo: Photo | None = None
+    photo: CameraEffects | None = None
 
     def __len__(self) -> int:
         return self.kind.shape[0]
@@ -78,9 +78,9 @@ class Request:
             kind=self.kind[scenes],
             parent=self.parent[scenes],
             seed=self.seed[scenes],
-            objects=tuple(some.of(scenes) for some in self.objects),
-            scene=tuple(some.of(scenes) for some in self.scene),
-            photo=of_scenes(self.photo, scenes),
+            objects=tuple(some.select(scenes) for some in self.objects),
+            scene=tuple(some.select(scenes) for some in self.scene),
+            photo=select_scenes(self.photo, scenes),
         )
 
     def records(self, canvas: tuple[int, int]) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ from .derive import ConditionDerivation, derive_complete
 from .errors import ModelError
 from .model import SceneModel
 from .policy import Policy
-from .program_errors import remedy, told, useful_text
+from .program_errors import remedy, useful_text, user_errors
 from .request import Renderable
 
 
@@ -46,7 +46,7 @@ class Scenes:
     drawing: Renderable
     failures: Tensor
 
-    def some(self, which: Tensor) -> "Scenes":
+    def select(self, which: Tensor) -> "Scenes":
         """Those of a mask ``(N,)`` bool."""
         return Scenes(
             self.derivation[which],
@@ -90,9 +90,9 @@ def run_program(
         density: see ``sample``.
 
     Raises:
-        ModelError: a derivation that is not complete; the program raises an error, which is told with the line that it
-            comes from; its sites are not what a scene model's must be; it returns no ``Drawing``, or one of other nodes
-            than were derived.
+        ModelError: a derivation that is not complete; the program raises an error, which is given with its line; its
+            sites are not what a scene model's must be; it returns no ``Drawing``, or one of other nodes than were
+            derived.
     """
     N = len(derivation)
     sites = derivation.sites()
@@ -103,7 +103,7 @@ def run_program(
             "nonterminals left; draw them with derive_complete."
         )
     known = ConditionDerivation(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
-    with told(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
+    with user_errors(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"].get("value")

@@ -100,8 +100,8 @@ def serve(render, version=""):
         try:
             reply, arrays = packed(render(scene_of(message[0])))
         except Exception as error:
-            told = "".join(traceback.format_exception(type(error), error, error.__traceback__))
-            reply, arrays = {"error": told}, []
+            text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+            reply, arrays = {"error": text}, []
         send(wire, dict(reply, memory=memory()), arrays)
 
 

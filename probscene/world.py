@@ -12,10 +12,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from .drawing import check_colour, of_scenes
+from .camera_effects import CameraEffects, check_camera_effects
+from .drawing import check_colour, select_scenes
 from .errors import ModelError
 from .mesh import Mesh, Surface
-from .photo import Photo, check_photo
 
 KITTI_FOCAL, KITTI_CENTRE, KITTI_CANVAS, KITTI_HEIGHT = 721.5377, (609.5593, 172.854), (375, 1242), 1.65
 
@@ -162,7 +162,7 @@ class World:
     camera: Camera
     light: Light
     ground: Ground | None
-    photo: Photo
+    photo: CameraEffects
 
     def __len__(self) -> int:
         return self.kind.shape[0]
@@ -170,8 +170,8 @@ class World:
     def __getitem__(self, scenes: slice | Tensor) -> "World":
         """The same world of some of the scenes."""
 
-        parts = {name: of_scenes(getattr(self, name), scenes) for name in ("camera", "light", "photo", "ground")}
-        layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
+        parts = {name: select_scenes(getattr(self, name), scenes) for name in ("camera", "light", "photo", "ground")}
+        layers = tuple(select_scenes(layer, scenes) for layer in self.layers)
         return replace(self, kind=self.kind[scenes], layers=layers, **parts)
 
 
@@ -206,7 +206,7 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
     return MeshLayer(layer.meshes, present, index, labelled=layer.labelled, **numbers)
 
 
-Part = TypeVar("Part", Camera, Light, Photo)
+Part = TypeVar("Part", Camera, Light, CameraEffects)
 
 
 def resolve_scene(part: Part, num_scenes: int) -> Part:
@@ -229,8 +229,8 @@ def resolve_scene(part: Part, num_scenes: int) -> Part:
     if isinstance(part, Camera) and not (values["focal"] > 0).all():
         worst = float(values["focal"].min())
         raise ModelError(f"expected a positive focal length in pixels, got {worst:g}; fix Camera.focal of the model.")
-    if isinstance(part, Photo):
-        check_photo(values)
+    if isinstance(part, CameraEffects):
+        check_camera_effects(values)
     return replace(part, **values)
 
 

@@ -46,8 +46,8 @@ def test_every_option_of_a_command_is_listed(name):
     assert listed == there - {"--help", "--objective", "--guide"}
 
 
-def test_the_face_is_listed_whole():
-    tables = re.findall(r"^\|.*\|$", text("api/face.md"), re.MULTILINE)
+def test_the_public_api_is_listed_whole():
+    tables = re.findall(r"^\|.*\|$", text("api/public.md"), re.MULTILINE)
     assert set(re.findall(r"`(\w+)`", " ".join(tables))) == set(probscene.__all__)
 
 

@@ -125,7 +125,7 @@ class Photographs(Protocol):
         """Those that are labelled; None where none is."""
         ...
 
-    def some(self, most: int) -> Tensor:
+    def subset(self, max_images: int) -> Tensor:
         """At most so many of them, evenly spread, ``(L, C, H, W)`` uint8."""
         ...
 

@@ -22,7 +22,7 @@ def open_images(
     show: Display,
     value_range: Sequence[float] | None = None,
 ) -> Images:
-    """Images as a model reads them; what a person should know about them is said.
+    """Images as a model reads them; notes on them are shown.
 
     Args:
         target: a folder, a list of files, or images in memory, see ``ImageArray``; images that are open already.

@@ -1,15 +1,14 @@
-"""Rendered images to photos: the host's side of ``kernels``, for sprites and meshes alike.
+"""Camera effects on rendered images: the host's side of ``kernels``, for sprites and meshes alike.
 
-Everything is float64 arithmetic on the numbers of one scene alone, element by element, so that an image does not depend
-on its batch.
+Tables are computed in float64 from the values of one scene alone, so that an image does not depend on its batch.
 """
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from probscene.camera_effects import CameraEffects, check_camera_effects
 from probscene.errors import ModelError
-from probscene.photo import Photo, check_photo
 
 from .. import engine
 from ..kernels import tone
@@ -29,10 +28,10 @@ _COLOUR = """
 _STEPS = np.array([_LUMINANCE.split(), _COLOUR.split()]).astype(np.int64).reshape(1, 128)
 
 
-class PhotoFinish:
-    """Makes photos of images, in place.
+class EffectsProcessor:
+    """Applies camera effects to images, in place.
 
-    A call needs for each thread about 12 bytes a pixel where it blurs, 6 where there is JPEG, and keeps them.
+    A call allocates about 12 bytes a pixel and thread where it blurs, 6 where there is JPEG, and keeps them.
 
     Args:
         canvas: height and width of the images, pixels.
@@ -43,20 +42,20 @@ class PhotoFinish:
         self.canvas, self.threads = canvas, threads
         self._scratch = np.zeros(1, np.float32)
 
-    def __call__(self, photo: Photo, image: np.ndarray, number: int, toned: bool) -> None:
-        """Finish images.
+    def __call__(self, photo: CameraEffects, image: np.ndarray, number: int, toned: bool) -> None:
+        """Apply the effects.
 
         Args:
             photo: every value ``(N,)``.
             image: flat uint8, contiguous, of at least 8 bytes; what is behind the images stays as it is.
             number: N, how many images.
-            toned: whether their colours have been developed already.
+            toned: whether the effects on colours have been applied already.
 
         Raises:
-            ModelError: see ``photo_table``.
+            ModelError: see ``effects_table``.
         """
         (height, width), pixels = self.canvas, self.canvas[0] * self.canvas[1]
-        table = photo_table(photo, number, self.canvas, exposed=toned)
+        table = effects_table(photo, number, self.canvas, exposed=toned)
         late = table[:, tone.RADIUS] + table[:, tone.JPEG] > 0
         if not (late if toned else late | (table[:, tone.TONED] != 0) | (table[:, tone.NOISE] > 0)).any():
             return
@@ -64,13 +63,13 @@ class PhotoFinish:
         most = int(table[:, tone.RADIUS].max())
         blurred = 3 * (height + 2) * width + 6 * most if most else 0
         coded = _coded(height, width) if table[:, tone.JPEG].any() else 0
-        room = max(1, blurred, coded)
+        scratch = max(1, blurred, coded)
         step = max(8, _CHUNK // pixels // 8 * 8)  # images begin at whole words
         for start in range(0, number, step):
             part = slice(start, min(start + step, number))
-            workers = max(1, min(self.threads, part.stop - start, ((1 << 31) - 1) // room))
-            if self._scratch.size < workers * room:
-                self._scratch = np.zeros(workers * room, np.float32)
+            workers = max(1, min(self.threads, part.stop - start, ((1 << 31) - 1) // scratch))
+            if self._scratch.size < workers * scratch:
+                self._scratch = np.zeros(workers * scratch, np.float32)
             some = image[3 * start * pixels : 3 * part.stop * pixels + 8]
             words = some[: some.size // 8 * 8].view(np.uint64)
             rows, size = table[part], (workers, part.stop - start, height, width)
@@ -79,56 +78,56 @@ class PhotoFinish:
                 develop_images(0, *size, np.zeros(1, np.int32), photos, seeds[part], some, words)
             if most:
                 queue = np.zeros(1, np.int32)
-                blur_images(*size, room, weights.shape[1], queue, photos, weights[part].ravel(), self._scratch, some)
+                blur_images(*size, scratch, weights.shape[1], queue, photos, weights[part].ravel(), self._scratch, some)
                 if (rows[:, tone.LATER] > 0).any():
                     develop_images(1, *size, np.zeros(1, np.int32), photos, seeds[part], some, words)
             if coded:
                 queue = np.zeros(1, np.int32)
-                compress_images(*size, room, queue, photos, steps[part].ravel(), _COSINES, self._scratch, some)
+                compress_images(*size, scratch, queue, photos, steps[part].ravel(), _COSINES, self._scratch, some)
 
 
-def photographed(photo: Photo, image: Tensor, threads: int = 1) -> Tensor:
-    """Photos of images ``(N, 3, H, W)`` uint8, for renderers of one's own.
+def apply_camera_effects(photo: CameraEffects, image: Tensor, threads: int = 1) -> Tensor:
+    """Images ``(N, 3, H, W)`` uint8 with camera effects, for a user's own renderer.
 
     Args:
         photo: every value ``(N,)``, as a drawing has it.
-        image: as they are without a photo.
+        image: without the effects.
         threads: how many threads work.
 
     Raises:
-        ModelError: images of another shape; see ``photo_table``.
+        ModelError: images of another shape; see ``effects_table``.
     """
     if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3:
         raise ModelError(f"expected images as uint8 (N, 3, H, W), got {image.dtype} {tuple(image.shape)}.")
     number, _, height, width = image.shape
     flat = np.append(image.permute(0, 2, 3, 1).flatten().numpy(), np.zeros(8, np.uint8))
     engine.start()
-    PhotoFinish((height, width), threads)(photo, flat, number, toned=False)
+    EffectsProcessor((height, width), threads)(photo, flat, number, toned=False)
     return torch.from_numpy(flat[:-8]).view(number, height, width, 3).permute(0, 3, 1, 2)
 
 
-def photo_table(photo: Photo, number: int, canvas: tuple[int, int], exposed: bool) -> np.ndarray:
-    """``(N, PHOTO)`` float64, see ``kernels.tone``.
+def effects_table(photo: CameraEffects, number: int, canvas: tuple[int, int], exposed: bool) -> np.ndarray:
+    """``(N, NUM_COLUMNS)`` float64, see ``kernels.tone``.
 
     Args:
         photo: every value ``(N,)``.
         number: N.
         canvas: height and width, pixels.
-        exposed: whether the colours have the exposure already.
+        exposed: whether the exposure has been applied already.
 
     Raises:
-        ModelError: values of another shape, or that a photo cannot have.
+        ModelError: values of another shape, or beyond their limits.
     """
     values = {name: torch.as_tensor(value).detach().cpu() for name, value in vars(photo).items()}
     shapes = {name: tuple(value.shape) for name, value in values.items() if value.shape != (number,)}
     if shapes:
         raise ModelError(
-            f"expected a photo with one value for each of {number} scenes, got {shapes}; make it with "
+            f"expected camera effects with one value for each of {number} scenes, got {shapes}; make them with "
             "probscene.world.resolve_scene."
         )
-    check_photo(values)
+    check_camera_effects(values)
     value = {name: tensor.numpy().astype(np.float64) for name, tensor in values.items()}
-    table = np.zeros((number, tone.PHOTO))
+    table = np.zeros((number, tone.NUM_COLUMNS))
     gains = np.stack([value["red_gain"], np.ones(number), value["blue_gain"]], 1)
     if not exposed:
         gains *= value["exposure"][:, None]
@@ -150,12 +149,12 @@ def photo_table(photo: Photo, number: int, canvas: tuple[int, int], exposed: boo
     return table
 
 
-def seeds_of(photo: Photo) -> np.ndarray:
+def seeds_of(photo: CameraEffects) -> np.ndarray:
     """``(N,)`` int64."""
     return torch.as_tensor(photo.seed).cpu().numpy().astype(np.int64)
 
 
-def _weights(photo: Photo, table: np.ndarray) -> np.ndarray:
+def _weights(photo: CameraEffects, table: np.ndarray) -> np.ndarray:
     """``(N, reach)`` float32 of the middle, halved, and of each distance from it; they count twice."""
     sigma = torch.as_tensor(photo.blur).detach().cpu().numpy().astype(np.float64)[:, None]
     away = np.arange(int(table[:, tone.RADIUS].max(initial=0)) + 1.0)
@@ -169,7 +168,7 @@ def _weights(photo: Photo, table: np.ndarray) -> np.ndarray:
     return (weights / total[:, None]).astype(np.float32)
 
 
-def _steps(photo: Photo) -> np.ndarray:
+def _steps(photo: CameraEffects) -> np.ndarray:
     """``(N, 128)`` float32, quantisation steps of luminance and colours, as libjpeg takes them from the quality."""
     quality = torch.as_tensor(photo.jpeg_quality).detach().cpu().numpy().astype(np.float64)
     quality = np.rint(np.where(np.isfinite(quality), quality, 100)).astype(np.int64)[:, None]

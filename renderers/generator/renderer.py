@@ -15,14 +15,14 @@ from torch import Tensor
 from probscene.batch import RenderBatch
 from probscene.errors import ModelError
 from probscene.generator import Command, Generator
-from probscene.program_errors import told
+from probscene.program_errors import user_errors
 from probscene.request import Renderable, Request
 from probscene.threads import cores
 from probscene.worker import packed, scene_of
 
-from ..camera.effects import photographed
+from ..camera.effects import apply_camera_effects
 from .pool import pool_for
-from .reply import Fault, Picture, read
+from .reply import Fault, Picture, parse_reply
 
 
 class GeneratedRenderer:
@@ -56,19 +56,19 @@ class GeneratedRenderer:
         if isinstance(self.generator, Command):
             pictures = pool_for(self.generator, self.threads).draw(records)
         else:
-            with self._alone, told("the generator", self.generator):
+            with self._alone, user_errors("the generator", self.generator):
                 pictures = [_drawn_here(self.generator, record) for record in records]
         batch = _batch(drawing, pictures, self.canvas)
         if drawing.photo is None or not len(drawing):
             return batch
-        return batch._replace(image=photographed(drawing.photo, batch.image, self.threads))
+        return batch._replace(image=apply_camera_effects(drawing.photo, batch.image, self.threads))
 
 
 def _drawn_here(generator: Callable[[Any], Any], record: dict[str, Any]) -> Picture:
     drawn = generator(scene_of(record))
     try:
         reply, arrays = packed(drawn)
-        return read(record, reply, b"".join(arrays))
+        return parse_reply(record, reply, b"".join(arrays))
     except (Fault, ValueError) as error:
         raise ModelError(f"expected a picture of the generator, got another answer: {error}.") from error
 

@@ -31,7 +31,7 @@ class Picture(NamedTuple):
     amodal_box: np.ndarray | None
 
 
-def read(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
+def parse_reply(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
     """An answer to ``record``, see ``probscene.worker.packed``.
 
     Raises:

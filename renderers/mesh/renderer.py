@@ -3,7 +3,7 @@
 A pixel shows what its middle sees: the nearest triangle that faces the camera, the ground, or the sky. Light is added
 and multiplied in sRGB and clipped once, at the end: a face's colour, times the tint if it takes one, times the texture,
 times the light of the sun, where a shadow map lets it through, and of the sky, of which an upright surface gets three
-quarters and one that faces down half; then haze, and what the world's ``Photo`` says. Corners' normals are
+quarters and one that faces down half; then haze, and what the world's ``CameraEffects`` says. Corners' normals are
 interpolated as they are, not to unit length. Textures are filtered bilinearly, from a level chosen for their width and
 height apart. The ground's textures lie from x = ``offset`` and y = 0; it is seen from above only. Nothing nearer than
 0.1 m along the camera's z is seen. A sun below the horizon gives no light.
@@ -26,7 +26,7 @@ from probscene.request import Renderable
 from probscene.world import World
 
 from .. import engine
-from ..camera.effects import PhotoFinish, photo_table, seeds_of
+from ..camera.effects import EffectsProcessor, effects_table, seeds_of
 from ..kernels.lanes import LANES
 from .instances import Instances, instances, names
 from .kernels import draw as kernel
@@ -63,7 +63,7 @@ class MeshRenderer:
             raise ModelError(f"expected 1 or 4 samples a pixel, got {samples}.")
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
         self.samples, self.map_size = samples, min(2048, max(256, 5 * self.canvas[1] // 96 * 16))
-        self._atlas, self._finish = MeshAtlas(), PhotoFinish(self.canvas, self.threads)
+        self._atlas, self._finish = MeshAtlas(), EffectsProcessor(self.canvas, self.threads)
         self._scratch: dict[str, np.ndarray] = {}
 
     def __call__(self, drawing: Renderable) -> RenderBatch:
@@ -144,7 +144,7 @@ class MeshRenderer:
             if name not in self._scratch or self._scratch[name].size < workers * size:
                 self._scratch[name] = _zeros(max(1, workers * size), dtype)
         self._scratch["opened"][:] = 0
-        atlas, photos = self._atlas, photo_table(world.photo, N, self.canvas, exposed=True).ravel()
+        atlas, photos = self._atlas, effects_table(world.photo, N, self.canvas, exposed=True).ravel()
         buffers = [self._scratch[name] for name in each]
         buffers += [image, instance, semantic, depth, self._scratch["seen"].reshape(-1, LANES)]
         buffers += [_words(flat) for flat in (self._scratch["shadow"], image, instance, semantic, depth)]

@@ -6,7 +6,7 @@ at most one, chosen for x and y apart; one drawn larger keeps edges one pixel wi
 order into 8-bit channels. A node's id is written where its sprite's own alpha is at least one half; a sprite without a
 label erases ids there. At angle 0 and scale 1, with texels on pixels, an opaque sprite's bytes appear unchanged.
 
-A drawing's ``Photo`` then changes the images, and nothing else.
+A drawing's ``CameraEffects`` then changes the images, and nothing else.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from probscene.errors import ModelError
 from probscene.request import Renderable
 
 from .. import engine
-from ..camera.effects import PhotoFinish
+from ..camera.effects import EffectsProcessor
 from . import kernel
 from .instances import Instances, instances
 from .sheet import Sheet
@@ -43,7 +43,7 @@ class SpriteRenderer:
 
     def __init__(self, canvas: tuple[int, int], threads: int | None = None):
         self.canvas, self.threads = engine.check_canvas(canvas, threads, _MAX_CANVAS)
-        self._sheet, self._finish = Sheet(), PhotoFinish(self.canvas, self.threads)
+        self._sheet, self._finish = Sheet(), EffectsProcessor(self.canvas, self.threads)
 
     def __call__(self, drawing: Renderable) -> RenderBatch:
         """Render every scene of a drawing.

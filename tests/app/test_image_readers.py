@@ -22,7 +22,7 @@ from probscene.app.progress import Display
 from probscene.app.trial.jobs import Job
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures
-from probscene.app.trial.trial import trial
+from probscene.app.trial.trial import TrialOptions, trial
 from probscene.dataset import ImageFolder
 from probscene.decoding import read_rgb
 from probscene.errors import DataError, ProbsceneError, RunError
@@ -246,7 +246,8 @@ def test_a_trial_reads_all_its_sets_over_one_range(folder, tmp_path, monkeypatch
     for given, used in ((None, [0, 4095]), ((500, 5000), [500, 5000])):
         out = tmp_path / f"out {given}"
         with pytest.raises(SystemExit):
-            trial(tmp_path / "bright", out, {"dim": tmp_path / "dim"}, value_range=given, say=said.append)
+            options = TrialOptions(value_range=given)
+            trial(tmp_path / "bright", out, {"dim": tmp_path / "dim"}, options, callback=said.append)
         assert json.loads((out / "trial.json").read_text())["value_range"] == used == list(jobs.pop().value_range)
     assert "Note: 4 of 4 images have 16 bits" in said[0] and "500 to 5000" in said[1]
 

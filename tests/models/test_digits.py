@@ -67,7 +67,7 @@ def test_glyphs_are_white_with_ink_in_alpha(source):
 def test_an_exemplar_picks_a_sprite_of_its_digit(more, part, digit):
     labels = np.array([*range(10), *more])
     images = np.broadcast_to(np.arange(len(labels), dtype=np.uint8)[:, None, None], (len(labels), 28, 28))
-    digits = Digits.of(images, labels)
+    digits = Digits.from_arrays(images, labels)
     specimens = [i for i, label in enumerate(labels) if label == digit]
     index = digits.sprite(torch.tensor([[digit]]), torch.tensor([[part / 1024]])).item()
     assert digits.atlas.sprites[index][0, 0, 3] == specimens[part * len(specimens) // 1024]
@@ -78,7 +78,7 @@ def test_an_exemplar_picks_a_sprite_of_its_digit(more, part, digit):
 def test_a_missing_digit_is_a_fault():
     images, labels = some_digits(10)
     with pytest.raises(DataError, match="all digits 0..9"):
-        Digits.of(images[labels != 3], labels[labels != 3])
+        Digits.from_arrays(images[labels != 3], labels[labels != 3])
 
 
 @pytest.mark.parametrize("end", ["", ".gz"])

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.meshes import MeshReference
 
+from probscene.camera_effects import CameraEffects
 from probscene.errors import ModelError
-from probscene.photo import Photo
 from probscene.renderers.mesh import renderer as meshes_module
 from probscene.renderers.mesh.renderer import MeshRenderer
 from probscene.world import KITTI_CANVAS, Camera, Light, Meshes, resolve_scene
@@ -54,7 +54,9 @@ def random_world(shapes, seed, sun=True, lying=True):
     light = Light(
         uniform(-3, 3, number, 1), uniform(0.3, 1.4, number, 1), 0.6 if sun else 0.0, haze=uniform(0, 0.03, number, 1)
     )
-    photo = Photo(*(uniform(0.7, 1.3, number, 1) for _ in range(3)), noise=uniform(0, 9, number, 1), seed=seed % 1000)
+    photo = CameraEffects(
+        *(uniform(0.7, 1.3, number, 1) for _ in range(3)), noise=uniform(0, 9, number, 1), seed=seed % 1000
+    )
     gains = torch.from_numpy(np.random.default_rng(seed).uniform(0.8, 1.2, (2, number, 1)))
     photo = replace(photo, red_gain=gains[0], blue_gain=gains[1], vignette=1.5 * (1.2 - gains[0]))
     layers = [
@@ -308,9 +310,9 @@ def test_a_users_own_taichi_is_left_alone():
 import torch
 from probscene.renderers import engine
 from probscene.renderers.mesh.renderer import MeshRenderer
-from probscene.world import KITTI_CANVAS, Camera, Light, Photo, World, resolve_scene
+from probscene.world import KITTI_CANVAS, Camera, Light, CameraEffects, World, resolve_scene
 engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)
-parts = {k: resolve_scene(v, 1) for k, v in dict(camera=Camera(), light=Light(), photo=Photo()).items()}
+parts = {k: resolve_scene(v, 1) for k, v in dict(camera=Camera(), light=Light(), photo=CameraEffects()).items()}
 batch = MeshRenderer((20, 20), threads=1)(World(torch.zeros(1, 0, dtype=torch.int64), (), (), ground=None, **parts))
 assert batch.image.float().mean() > 100
 """

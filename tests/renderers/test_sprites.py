@@ -18,7 +18,7 @@ RENDERER = SpriteRenderer(CANVAS, threads=1)
 
 
 def _atlas(generator) -> Atlas:
-    """Noise of every sort of outline, and the two that the hub has."""
+    """Noise of every sort of outline, and the two that the core has."""
     sprites = [disc(), box()]
     for sort in range(5):
         height, width = generator.integers(1, 18, 2)

@@ -27,7 +27,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
     Returns:
         ``"classes"``: a record of each.
     """
-    images, labelled = photographs.some(most), photographs.labelled
+    images, labelled = photographs.subset(most), photographs.labelled
     marked = images[:0] if labelled is None else labelled.images
     total = len(images) + len(marked)
     whole = _look(net, images, 0, total, each)

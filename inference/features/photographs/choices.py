@@ -57,7 +57,7 @@ class PretrainedCountFeatures(Features):
 
         heads, target = cast("PretrainedCountNet", net), photographs()
         heads.bind(target.fingerprint)
-        draw, images = renders.draw_twice, target.some(self.photographs)
+        draw, images = renders.draw_twice, target.subset(self.photographs)
         return PretrainedCountTraining(
             heads, draw, self.pairs, self.epochs, photographs=images, seed=batch_seed(seed, 1)
         )

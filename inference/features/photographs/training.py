@@ -30,7 +30,7 @@ from ..counting.batches import STRIDE, cells
 from ..counting.training import relative_count_loss
 from .head import KINDS, Kind, Maps
 from .heads import PretrainedCountNet
-from .looks import photographed
+from .looks import augment
 from .readability import disagreement
 from .reading import SCOPES, SMALL
 
@@ -157,7 +157,7 @@ class PretrainedCountTraining:
         while done < total:
             number = min(DRAWN_AT_ONCE, total - done, self.pairs - done if done < self.pairs else total)
             drawn = self.draw_twice(number)
-            maps = self.net.look(photographed(drawn.image, rng))
+            maps = self.net.look(augment(drawn.image, rng))
             targets = [self._target(drawn, kind).half() for kind in KINDS]
             parts.append([*(some.half() for some in maps), *targets, self.net.true_counts(drawn)])
             shown = drawn.label.masked_fill(drawn.visible < SCOPES[SMALL].visible, -1)

@@ -38,7 +38,7 @@ def label(
     progress: bool = True,
     value_range: Sequence[float] | None = None,
 ) -> Sheet:
-    """Propose which images to label next, see ``labelling.choosing``, and write the sheet to count in.
+    """Propose which images to label next, see ``labels.selection``, and write the sheet to count in.
 
     Args:
         source: a run, whose network's counts say which images to take, as far as it has some; or a model.
@@ -65,7 +65,7 @@ def label(
         if value_range is None and run is not None:
             value_range = run.record.get("value_range")
         images = open_images(target, model, skip_bad, show, value_range)
-        few = None if labels is None else read_partial_labels(Path(labels), model, images, least=1)
+        few = None if labels is None else read_partial_labels(Path(labels), model, images, min_images=1)
         rows = _proposed(run, model, images, number, few, seed, show)
     if not rows:
         raise DataError(f"expected images without labels in {images.path}, got all {len(images)} labelled.")

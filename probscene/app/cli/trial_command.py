@@ -47,14 +47,16 @@ def trial(
         str | None, typer.Option(metavar="NAME,...", help="What it is about; all classes if not given.")
     ] = None,
     detector: Annotated[str, typer.Option(metavar="NET", help="efficientnet or maskrcnn=FILE.")] = "efficientnet",
-    presentations: Annotated[
-        int | None, typer.Option(metavar="N", help="Images shown in a training; 2400, of maskrcnn 10000.")
+    iterations: Annotated[
+        int | None, typer.Option(metavar="N", help="Steps of a training; 600, of maskrcnn 5000.")
     ] = None,
     batch: Annotated[int | None, typer.Option(metavar="N", help="Images a step; 4, of maskrcnn 2.")] = None,
     rate: Annotated[float | None, typer.Option(metavar="X", help="Of Adam; the detector's if not given.")] = None,
-    last: Annotated[float, typer.Option(metavar="SHARE", help="Of the presentations, for the last of A,B.")] = 0.5,
-    chain: Annotated[
-        bool, typer.Option("--chain", help="Each set goes on from the detector of the set before.")
+    finetune_fraction: Annotated[
+        float, typer.Option(metavar="FRACTION", help="Of the images of a training, for the last of A,B.")
+    ] = 0.5,
+    warm_start: Annotated[
+        bool, typer.Option("--warm-start", help="Each set starts from the detector of the set before.")
     ] = False,
     size: Annotated[
         str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Images come so large; about 256x192 if not given.")
@@ -98,7 +100,7 @@ def trial(
         box_margin=box_margin,
         classes=None if classes is None else _words(classes),
         detector=detector,
-        budget=Budget(presentations, batch, rate, last, chain),
+        budget=Budget(iterations, batch, rate, finetune_fraction, warm_start),
         size=None if size is None else _size(size),
         seeds=seeds,
         seed=seed,

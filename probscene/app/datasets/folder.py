@@ -25,9 +25,9 @@ from .places import PARTS, place_at
 from .provenance import image_name
 
 LINES, SETTINGS = "provenance.jsonl", f"{PARTS}/settings.json"
-SEEN = 20  # seconds
-FLAT = 10_000  # images
-UNSAID = {"min_visible": 0.0, "box_margin": 0, "flat": True, "amodal": False, "values": ""}
+VISIBLE_TIMEOUT = 20  # seconds
+MAX_FLAT_IMAGES = 10_000  # images
+DEFAULT_SETTINGS = {"min_visible": 0.0, "box_margin": 0, "flat": True, "amodal": False, "values": ""}
 """Settings that are recorded only where they have another value than this."""
 
 
@@ -38,7 +38,7 @@ class Shard(NamedTuple):
     shards: int
 
     @staticmethod
-    def of(text: str) -> "Shard":
+    def from_text(text: str) -> "Shard":
         """Of ``"I/N"``.
 
         Raises:
@@ -61,7 +61,7 @@ class DatasetFolder:
         origin: the settings that every line of provenance names.
         num: how many images.
         formats: see ``formats.chosen``.
-        flat: all images in one folder; of more than ``FLAT``, a thousand share one otherwise.
+        flat: all images in one folder; of more than ``MAX_FLAT_IMAGES``, a thousand share one otherwise.
 
     Attributes:
         flat: whether they are.
@@ -69,7 +69,7 @@ class DatasetFolder:
 
     def __init__(self, out: Path | str, origin: dict[str, Any], num: int, formats: tuple[str, ...], flat: bool = False):
         self.place, self.num = place_at(out), num
-        self.flat = flat or num <= FLAT
+        self.flat = flat or num <= MAX_FLAT_IMAGES
         self.settings = {**origin, "num": num, "format": ",".join(formats), "flat": self.flat}
         self._kept = formats != ("webdataset",)
         self._origin = origin
@@ -97,9 +97,9 @@ class DatasetFolder:
             self._compare(json.loads(self.place.read(SETTINGS)))
         except FileNotFoundError:  # another process has finished the dataset
             return self.missing(shard)
-        return [chunk for chunk in self.of(shard) if not self._done(chunk)]
+        return [chunk for chunk in self.chunks_of(shard) if not self._done(chunk)]
 
-    def of(self, shard: Shard) -> range:
+    def chunks_of(self, shard: Shard) -> range:
         """The chunks of a shard."""
         return range(shard.number, len(self._chunks()), shard.shards)
 
@@ -177,8 +177,8 @@ class DatasetFolder:
             lines = self.place.lines(LINES)
             line = json.loads(next(lines))
             num = 1 + sum(1 for _ in lines)
-            settings = {key: line[key] for key in self._origin.keys() - UNSAID}
-            settings |= {key: line.get(key, usual) for key, usual in UNSAID.items()}
+            settings = {key: line[key] for key in self._origin.keys() - DEFAULT_SETTINGS}
+            settings |= {key: line.get(key, usual) for key, usual in DEFAULT_SETTINGS.items()}
         except (OSError, StopIteration, ValueError, KeyError, TypeError) as error:
             raise DataError(
                 f"expected lines of provenance in {self.place}/{LINES}, got something else; name another folder."
@@ -187,7 +187,7 @@ class DatasetFolder:
         return settings | {"flat": line["image"] == image_name(line["index"], True)}
 
     def _compare(self, before: dict[str, Any]) -> None:
-        before, settings = UNSAID | before, UNSAID | self.settings
+        before, settings = DEFAULT_SETTINGS | before, DEFAULT_SETTINGS | self.settings
         differing = [key for key in settings if before.get(key) != settings[key]]
         if differing:
             was, now = (", ".join(f"{key} {s.get(key)}" for key in differing) for s in (before, settings))
@@ -204,7 +204,7 @@ def check_begun(out: Path | str) -> None:
         DataError: it is not.
     """
     place = place_at(out)
-    for _ in range(SEEN):  # a network's file system may be some seconds behind
+    for _ in range(VISIBLE_TIMEOUT):  # a network's file system may be some seconds behind
         if place.exists(SETTINGS):
             return
         time.sleep(1)

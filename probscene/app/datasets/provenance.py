@@ -79,7 +79,7 @@ def remake(model: SceneModel, line: dict[str, Any]) -> tuple[Tensor, RenderBatch
             f"expected a line whose rules are those of model {model.name!r}, {_named(line)}; name its model."
         )
     try:
-        derivation = Derivation.of(model.grammar, torch.tensor([rules], dtype=torch.int64))
+        derivation = Derivation.from_rules(model.grammar, torch.tensor([rules], dtype=torch.int64))
     except GrammarError as error:
         raise DataError(f"expected a derivation of model {model.name!r}, {_named(line)}: {error}") from error
     if not derivation.complete.all():

@@ -37,7 +37,7 @@ from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
 from . import amodal
 from .coco import check_box_margin, check_min_visible, labelled, with_margin
-from .depth import of as depth_of
+from .depth import depth_of
 
 Sample = tuple[Tensor, dict[str, Any]]
 _ENDLESS = 1 << 20  # chunks of an epoch that has no end

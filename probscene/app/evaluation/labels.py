@@ -1,11 +1,11 @@
 """The truth that learnt structures are judged by. Three kinds:
 
-``counts.csv``, how many objects of each class an image shows, see ``labelling.counts``.
+``counts.csv``, how many objects of each class an image shows, see ``labels.counts``.
 
 ``provenance.jsonl`` as ``generate`` writes it: one line an image with the rules of its structure, which says also what
 hangs below what, and how likely a policy would have derived it.
 
-Labels with boxes of COCO, KITTI and YOLO, see ``labelling.reading``.
+Labels with boxes of COCO, KITTI and YOLO, see ``labels.reading``.
 """
 
 import json
@@ -98,7 +98,7 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
         for line in map(json.loads, file):
             names.append(Path(line["image"]).name)
             rules.append(line["rules"])
-    return names, count(model, Derivation.of(model.grammar, _padded(rules))).counts
+    return names, count(model, Derivation.from_rules(model.grammar, _padded(rules))).counts
 
 
 def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool) -> Labels:
@@ -117,7 +117,7 @@ def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool)
     found = match_target(path, entries, target, some)
     rules = [_rules(model, *of_line[k], entries[k].where) for k in found.entries.values()]
     try:
-        derivation = Derivation.of(model.grammar, _padded(rules))
+        derivation = Derivation.from_rules(model.grammar, _padded(rules))
         whole = derivation.complete.all()
     except GrammarError:
         whole = False
@@ -138,7 +138,7 @@ def _rules(model: SceneModel, rules: list[Any], spelt: str, where: str) -> list[
 
 def _is_whole(model: SceneModel, rules: list[int]) -> bool:
     try:
-        return bool(Derivation.of(model.grammar, _padded([rules])).complete.all())
+        return bool(Derivation.from_rules(model.grammar, _padded([rules])).complete.all())
     except GrammarError:
         return False
 

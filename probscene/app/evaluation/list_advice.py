@@ -35,8 +35,9 @@ def more_room(model: SceneModel, bounds: ListBounds, longest: int, shortest: int
     zeros = f"*[0] * {least}, " if least else ""
     line = f"counts({zeros}*[1] * {longest - least + 1})"
     where = f" in {scenario}" if scenario else ""
-    if bounds.rank is not None:
-        said = f"{name}=ranked(...){where} with counts(...) up to {longest} at rank {bounds.rank + 1}, such as {line}"
+    if bounds.parent_list_index is not None:
+        rank = bounds.parent_list_index + 1
+        said = f"{name}=ranked(...){where} with counts(...) up to {longest} at rank {rank}, such as {line}"
     else:
         lower = f" from {least}" if least < bounds.shortest else ""
         said = f"{name}=counts(...){where}{lower} up to {longest}, such as {name}={line}"

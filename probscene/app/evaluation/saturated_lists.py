@@ -122,7 +122,7 @@ def saturated_lists(model: SceneModel, guide: Policy, read: Source | None, seed:
     before = [Branching(model.grammar, one.table) for one in (prior, policy)]
     found = []
     for bounds in every:
-        learnt = lengths(model.grammar, parts, bounds.symbol).of(bounds, support.possible.shape[1])
+        learnt = lengths(model.grammar, parts, bounds.symbol).select(bounds, support.possible.shape[1])
         if not len(learnt):
             continue
 
@@ -150,7 +150,7 @@ def read_lengths(model: SceneModel, bounds: ListBounds, read: Source | None) -> 
     kinds, more = element_kinds(grammar, bounds.symbol, numbers)
     if read is None or not kinds:
         return None
-    if bounds.rank is None and is_alone(grammar, bounds.symbol, kinds):
+    if bounds.parent_list_index is None and is_alone(grammar, bounds.symbol, kinds):
         columns = [numbers.index(kind) for kind in kinds]
         whole = len(columns) == len(numbers)
         return ((read.total if whole else read.counts[:, columns].sum(1)) - more).clip(min=0)
@@ -160,7 +160,7 @@ def read_lengths(model: SceneModel, bounds: ListBounds, read: Source | None) -> 
     below = [found for found in each if found is not None]
     if not below or len(below) < len(each):
         return None
-    of_rank = below[0].rank >= 0 if bounds.rank is None else below[0].rank == bounds.rank
+    of_rank = below[0].rank >= 0 if bounds.parent_list_index is None else below[0].rank == bounds.parent_list_index
     count = torch.stack([found.count for found in below]).sum(0)[of_rank]
     return (count.numpy() - more).clip(min=0)
 
@@ -186,7 +186,7 @@ def _piled(
     length = max(length, end + 1 if past else end + 2)
     name = called(model.grammar, bounds.symbol)
     return SaturatedList(
-        name, bounds.rank, end, past, share, declared, beyond, length, more_room(model, bounds, length)
+        name, bounds.parent_list_index, end, past, share, declared, beyond, length, more_room(model, bounds, length)
     )
 
 

@@ -181,7 +181,7 @@ class _Walls:
             if side == MORE:
                 longest = self.shortest_that(lets, bounds, need)
                 if longest is not None:
-                    reach = self.reach(self.support.widened(bounds.symbol, longest, bounds.rank))
+                    reach = self.reach(self.support.widened(bounds.symbol, longest, bounds.parent_list_index))
                     return _Room(bounds, bounds.shortest, longest, int(reach.fewest_rules(wanted, True)))
             elif lets(self.support.widened(bounds.symbol)):
                 kinds, more = element_kinds(grammar, bounds.symbol, self.kinds[s])
@@ -204,7 +204,7 @@ class _Walls:
         low, high = bounds.longest, bounds.longest + need
 
         def enough(longest: int) -> bool:
-            return lets(self.support.widened(bounds.symbol, longest, bounds.rank))
+            return lets(self.support.widened(bounds.symbol, longest, bounds.parent_list_index))
 
         if not enough(high):
             return None

@@ -25,7 +25,7 @@ from probscene.sampling import seed_everything
 from probscene.threads import threads
 
 from ..files import write_json, write_text
-from ..labels.partial_labels import PartialLabels, PartlyLabelled
+from ..labels.partial_labels import PartialLabels, PartlyLabelledImages
 from ..progress import Display, Progress
 from ..workers.cluster import Cluster
 from .cache import NetworkCache
@@ -142,7 +142,7 @@ class _Network:
 
     def __init__(self, begun: Begun, observer: RenderedFeatures, show: Display, target: Callable[[], Images]):
         self.run, self.observer, self.progress, self.say, self.target = begun.run, observer, show, show.say, target
-        self.photographs = cache(lambda: PartlyLabelled(target(), begun.labels))
+        self.photographs = cache(lambda: PartlyLabelledImages(target(), begun.labels))
         seed_everything(batch_seed(self.run.record["seed"], 0))
         self.net = self.run.build_network() if begun.net is None else begun.net
 

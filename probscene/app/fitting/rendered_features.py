@@ -140,7 +140,7 @@ class RenderedFeatures:
     def part(self, some: "Chunk", net: FeatureNet, draws_per_structure: int) -> tuple[int, Tensor]:
         """A part's number and its features ``(N, D)``."""
         with chunk_randomness(some.seed, some.number), torch.no_grad():
-            derivation = Derivation.of(self.model.grammar, some.rules)
+            derivation = Derivation.from_rules(self.model.grammar, some.rules)
             return some.number, self.observe(net, draws_per_structure)(run_program(self.model, derivation))
 
     def _as_read(self, images: Tensor) -> Tensor:

@@ -244,7 +244,7 @@ class RunFolder(Storage):
         if self.plugins.guide is not None or not isinstance(self.config.guide, GuideConfig):
             made = check_guide(made, model.max_steps)
         if self.record.get("within_support"):  # runs of before have none, and stay as they were
-            made.bind(None if model.support is None else model.support.holding(model.prior, self.unread))
+            made.bind(model.guide_support(self.unread))
         return made
 
     @cached_property

@@ -176,7 +176,7 @@ def _crew(
     run: RunFolder, cluster: Cluster | None, draws_per_structure: int, again: bool = False, finder: bool = False
 ) -> ActorPool | None:
     task = run.path.resolve(), draws_per_structure, again, finder
-    return None if cluster is None else cluster.crew(_actor, task, run.record["threads"])
+    return None if cluster is None else cluster.actor_pool(_actor, task, run.record["threads"])
 
 
 def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> Callable[[Chunk], tuple[int, Tensor]]:

@@ -21,7 +21,7 @@ from .kitti import DONT_CARE, TYPES, class_of
 from .naming import labelled_classes, match_target
 from .reading import read_annotations
 
-NAMED = 5  # images in a note
+MAX_NAMED_IMAGES = 5  # images in a note
 
 
 class Boxes(NamedTuple):
@@ -47,7 +47,9 @@ class Boxes(NamedTuple):
         return torch.stack(each).numpy() if each else np.zeros((0, len(self.classes)), np.int64)
 
 
-def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Boxes:
+def read_boxes(
+    path: Path, model: SceneModel, target: Images, allow_missing: bool = False, min_height: float = 0.0
+) -> Boxes:
     """The boxes of a target's images, see ``read_annotations``. Labels of files that the target left out as bad, or
     that it has not, are not read.
 
@@ -57,7 +59,7 @@ def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False
     that one of its own types counts as, and those that occur.
 
     Args:
-        some: there need not be labels of every image; those without are left out.
+        allow_missing: there need not be labels of every image; those without are left out.
         min_height: of a box that is kept, pixels of its file.
 
     Raises:
@@ -69,17 +71,17 @@ def read_boxes(path: Path, model: SceneModel, target: Images, some: bool = False
     if not labels.kitti:
         expected = f"categories among the classes of model {model.name!r} ({', '.join(model.classes)})"
         classes, notes = labelled_classes(labels.classes, model.classes, expected, path)
-    found = match_target(path, labels.images, target, some, labels.stems)
+    found = match_target(path, labels.images, target, allow_missing, labels.stems)
     read = {i: labels.read(entry, target.sizes[i]) for i, entry in found.entries.items()}
     if labels.kitti:
         classes, notes = _classes_of_types(read.values(), model, path)
         notes += _regions(read.values(), min_height)
     crowded = [i for i, each in read.items() if any(one.crowd and one.name in classes for one in each)]
     if crowded:
-        names = ", ".join(sorted(target.paths[i].name for i in crowded)[:NAMED])
+        names = ", ".join(sorted(target.paths[i].name for i in crowded)[:MAX_NAMED_IMAGES])
         notes += (
             f"{len(crowded)} images are taken as not labelled, since a crowd (iscrowd) says not how many it has: "
-            f"{names}{' ...' if len(crowded) > NAMED else ''}.",
+            f"{names}{' ...' if len(crowded) > MAX_NAMED_IMAGES else ''}.",
         )
     boxes = {
         i: [one._replace(name=classes[one.name]) for one in each if one.name in classes]

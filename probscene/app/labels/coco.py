@@ -44,10 +44,10 @@ def read_coco(path: Path) -> Annotated:
     keys, images = list(names), [Entry(name, _place(path, "images", i)) for i, name in enumerate(names.values())]
 
     def read(i: int, size: Size) -> list[Annotation]:
-        said = tuple(number_of(whole["images"][i].get(side)) for side in ("height", "width"))
-        if all(side > 0 for side in said) and said != size:
+        value = tuple(number_of(whole["images"][i].get(side)) for side in ("height", "width"))
+        if all(side > 0 for side in value) and value != size:
             raise DataError(
-                f"expected {images[i].name} to be {said[1]:.9g}x{said[0]:.9g} as {images[i].where}, got "
+                f"expected {images[i].name} to be {value[1]:.9g}x{value[0]:.9g} as {images[i].where}, got "
                 f"{size[1]}x{size[0]}; give labels of these images, not of images of another size."
             )
         return [_annotation(*each, size) for each in of_image[keys[i]]]
@@ -73,10 +73,10 @@ def _by_id(path: Path, key: str, entries: list[Any], named: str) -> dict[str, st
     names: dict[str, str] = {}
     for i, entry in enumerate(entries):
         where = _place(path, key, i)
-        said = entry.get("id") if isinstance(entry, dict) else None
-        number, name = _id(said), entry.get(named) if isinstance(entry, dict) else None
+        value = entry.get("id") if isinstance(entry, dict) else None
+        number, name = _id(value), entry.get(named) if isinstance(entry, dict) else None
         if number is None or number in names:
-            raise DataError(f"expected an id that no other entry has {where}, got {json.dumps(said)}; fix the entry.")
+            raise DataError(f"expected an id that no other entry has {where}, got {json.dumps(value)}; fix the entry.")
         if isinstance(name, bool) or not isinstance(name, str | int) or name == "":
             raise DataError(f"expected a {named} {where}, got {json.dumps(name)}; fix the entry.")
         names[number] = str(name)
@@ -97,17 +97,17 @@ def _id(value: Any) -> str | None:
 
 
 def _known(entry: Any, key: str, known: dict[str, str], where: str) -> str:
-    said = entry.get(key) if isinstance(entry, dict) else None
-    found = _id(said)
+    value = entry.get(key) if isinstance(entry, dict) else None
+    found = _id(value)
     if found is None or found not in known:
-        raise DataError(f"expected {key} to be an id that is listed {where}, got {json.dumps(said)}; fix it.")
+        raise DataError(f"expected {key} to be an id that is listed {where}, got {json.dumps(value)}; fix it.")
     return found
 
 
 def _annotation(name: str, where: str, entry: dict[str, Any], size: Size) -> Annotation:
-    said = entry.get("bbox")
-    box = _numbers(said, 4)
-    if (said is None or said == [] or box == [0, 0, 0, 0]) and (shape := entry.get("segmentation")):
+    value = entry.get("bbox")
+    box = _numbers(value, 4)
+    if (value is None or value == [] or box == [0, 0, 0, 0]) and (shape := entry.get("segmentation")):
         box = around(shape, where)
         height, width = map(number_of, shape["size"]) if isinstance(shape, dict) else size
         if (height, width) != size:
@@ -117,7 +117,7 @@ def _annotation(name: str, where: str, entry: dict[str, Any], size: Size) -> Ann
             )
     if box is None or min(box[2:]) <= 0:
         raise DataError(
-            f"expected bbox: x, y, and a width and height above 0 {where}, got {json.dumps(said)}; fix or delete it."
+            f"expected bbox: x, y, and a width and height above 0 {where}, got {json.dumps(value)}; fix or delete it."
         )
     x, y, width, height = box
     crowd = number_of(entry.get("iscrowd")) > 0 or entry.get("iscrowd") is True

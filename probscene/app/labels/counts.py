@@ -41,13 +41,13 @@ class Table(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def read_table(path: Path, classes: tuple[str, ...], target: Images, some: bool = False) -> Table:
-    """The counts of a target's images. Rows of files that the target left out as bad, or that it has not, are passed
-    over; the latter are said.
+def read_table(path: Path, classes: tuple[str, ...], target: Images, allow_missing: bool = False) -> Table:
+    """The counts of a target's images. Rows of files that the target left out as bad, or that it has not, are skipped;
+    a note names the latter.
 
     Args:
         classes: the model's.
-        some: there need not be a row with counts for every image; those without are left out.
+        allow_missing: there need not be a row with counts for every image; those without are left out.
 
     Raises:
         DataError: no such file, no column of a class, two of one name, a row of another length or with some of its
@@ -69,7 +69,7 @@ def read_table(path: Path, classes: tuple[str, ...], target: Images, some: bool 
         notes += (f"Not labelled, since its column is empty: {', '.join(empty)}.",)
     cells = [(number, row) for number, row in cells if any(row[name].strip() for name in found)]
     entries = [Entry(row["image"], f"in line {number} of {path}") for number, row in cells]
-    images = match_target(path, entries, target, some)
+    images = match_target(path, entries, target, allow_missing)
     counts = [[_count(cells[k][1][name].strip(), name, *entries[k]) for name in found] for k in images.entries.values()]
     whole = np.array(counts, np.int64).reshape(len(counts), len(found))
     return Table(list(images.entries), whole, tuple(found.values()), (*images.notes, *notes))

@@ -59,7 +59,7 @@ def matched(
     names, of_file = _Names(files, stems), defaultdict[int, list[int]](list)
     others = list[int]()
     for number, entry in enumerate(entries):
-        found = names.of(entry.name)
+        found = names.lookup(entry.name)
         if len(found) > 1:
             raise DataError(
                 f"expected the name of one image {entry.where}, got {entry.name!r}, which {len(found)} files in "
@@ -81,7 +81,7 @@ def matched(
         chosen[i] = best[0]
         others += [number for number in numbers if number != best[0]]
     passed = _Names(list(left_out), stems)
-    unknown = [entries[number] for number in sorted(others) if not passed.of(entries[number].name)]
+    unknown = [entries[number] for number in sorted(others) if not passed.lookup(entries[number].name)]
     _check_case(unknown, [file for i, file in enumerate(files) if i not in chosen], folder, stems)
     more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
     shown = [f"{_last(entry.name)}.txt" if stems else entry.name for entry in unknown]
@@ -89,15 +89,17 @@ def matched(
     return Matched(chosen, notes, tuple(unknown))
 
 
-def match_target(path: Path, entries: Sequence[Entry], target: Images, some: bool, stems: bool = False) -> Matched:
+def match_target(
+    path: Path, entries: Sequence[Entry], target: Images, allow_missing: bool, stems: bool = False
+) -> Matched:
     """Match entries with a target's images; those of files that the target left out as bad are passed over.
 
     Args:
         path: of the labels, for messages.
-        some: there need not be an entry for every image.
+        allow_missing: there need not be an entry for every image.
 
     Raises:
-        DataError: see ``matched``; an image without an entry, where not only some are expected; none of any.
+        DataError: see ``matched``; an image without an entry, unless ``allow_missing``; none of any.
     """
     found = matched(entries, target.paths, target.path, target.bad, stems)
     missing = [file.name for i, file in enumerate(target.paths) if i not in found.entries]
@@ -105,12 +107,12 @@ def match_target(path: Path, entries: Sequence[Entry], target: Images, some: boo
     if found.others:
         entry, more = found.others[0], len(found.others) - 1
         but = f", but of {_last(entry.name)!r} {entry.where}{f' and {more} more' if more else ''}, which it has not"
-    if not found.entries and (some or not missing):
+    if not found.entries and (allow_missing or not missing):
         raise DataError(
             f"expected labels of images of {target.path} in {path}, got none{but}; label at least one, by the name "
             "of its file."
         )
-    if missing and not some:
+    if missing and not allow_missing:
         names = missing[0] + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
         raise DataError(
             f"expected labels of every image of {target.path} in {path}, got none of {names}{but}; if only some are "
@@ -165,11 +167,11 @@ class _Names:
             for table, key in zip(self.tables, _keys(file.stem if stems else file.name), strict=True):
                 table[key].append(i)
 
-    def of(self, name: str) -> list[int]:
+    def lookup(self, name: str) -> list[int]:
         """The numbers of the files that a name may be of: of those that it is of by its last part, the ones whose
         folders are the most like its own."""
-        for said in (name, _last(name)):
-            for table, key in zip(self.tables, _keys(said), strict=True):
+        for text in (name, _last(name)):
+            for table, key in zip(self.tables, _keys(text), strict=True):
                 if found := table.get(key):
                     alike = [_folders_alike(name, self.files[i]) for i in found]
                     return [i for i, depth in zip(found, alike, strict=True) if depth == max(alike)]

@@ -1,5 +1,6 @@
-"""A handful of labels, by which a fit reads counts in a target's images. Axis letters: K labelled images, C classes, n
-boxes of one image, H W of the canvas.
+"""Labels of some of a target's images, by which a fit reads counts in the others.
+
+Axis letters: K labelled images, C classes, n boxes of one image, H W of the canvas.
 """
 
 import hashlib
@@ -19,7 +20,7 @@ from .boxes import read_boxes
 from .counts import read_table
 from .reading import has_boxes, label_files
 
-LEAST = 3  # images, of which one can be left out and two are left to choose by
+MIN_LABELLED_IMAGES = 3  # one can be left out, and two are left to choose by
 
 
 class PartialLabels(NamedTuple):
@@ -41,15 +42,17 @@ class PartialLabels(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_partial_labels(path: Path, model: SceneModel, target: Images, least: int = LEAST) -> PartialLabels:
+def read_partial_labels(
+    path: Path, model: SceneModel, target: Images, min_images: int = MIN_LABELLED_IMAGES
+) -> PartialLabels:
     """The labels of some of a target's images: with boxes, see ``read_annotations``, else a CSV of counts.
 
     Args:
-        least: images that must be labelled.
+        min_images: images that must be labelled.
 
     Raises:
         DataError: see ``read_boxes`` and ``read_table``; whole structures (``.jsonl``); fewer than
-            ``least`` images are labelled.
+            ``min_images`` images are labelled.
     """
     path, boxes, notes = Path(path), None, ()
     if path.suffix == ".jsonl":
@@ -68,10 +71,10 @@ def read_partial_labels(path: Path, model: SceneModel, target: Images, least: in
                 f"Of {cut} labelled images only the middle is seen, and counts may be of the whole; count in the "
                 "middle alone, or give boxes.",
             )
-    if len(read.rows) < least:
-        short = len(target) < least
+    if len(read.rows) < min_images:
+        short = len(target) < min_images
         raise DataError(
-            f"expected labels of at least {least} images of {target.path} in {path}, got {len(read.rows)}; "
+            f"expected labels of at least {min_images} images of {target.path} in {path}, got {len(read.rows)}; "
             f"{'add images' if short else 'label more (probscene label says which)'}."
         )
     counts = torch.from_numpy(read.counts)
@@ -81,23 +84,23 @@ def read_partial_labels(path: Path, model: SceneModel, target: Images, least: in
     return PartialLabels(torch.tensor(read.rows), counts, read.classes, boxes, (*read.notes, *notes))
 
 
-class PartlyLabelled:
+class PartlyLabelledImages:
     """A target's images of which some are labelled: what a feature network looks at before it is used."""
 
-    def __init__(self, images: Images, few: PartialLabels | None):
-        self.images, self.few, self.fingerprint = images, few, images.fingerprint
+    def __init__(self, images: Images, labels: PartialLabels | None):
+        self.images, self.labels, self.fingerprint = images, labels, images.fingerprint
 
-    def some(self, most: int) -> Tensor:
+    def subset(self, max_images: int) -> Tensor:
         """At most so many of them, evenly spread, ``(L, C, H, W)`` uint8."""
-        return self.images.some(most)
+        return self.images.subset(max_images)
 
     @property
     def labelled(self) -> Labelled | None:
         """Those that are labelled, with their counts; None where none is."""
-        if self.few is None:
+        if self.labels is None:
             return None
-        pictures = torch.stack([self.images.load(row) for row in self.few.rows.tolist()])
-        return Labelled(pictures, self.few.counts, self.few.classes)
+        pictures = torch.stack([self.images.load(row) for row in self.labels.rows.tolist()])
+        return Labelled(pictures, self.labels.counts, self.labels.classes)
 
 
 def labels_record(path: Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from ..files import make_folder, write_text, write_whole
 from .counts import write_cells
 from .naming import printable
 
-LARGEST = 1280  # pixels of a picture's longer side
+MAX_PICTURE_SIDE = 1280  # pixels of a picture's longer side
 
 
 class Sheet(NamedTuple):
@@ -120,7 +120,7 @@ def page(
     about = {"classes": classes, "before": before}
     digest = hashlib.sha256(json.dumps([model, about, names]).encode()).hexdigest()[:16]
     return Template(
-        resources.files("probscene.app.labelling").joinpath("sheet.html").read_text(encoding="utf-8")
+        resources.files("probscene.app.labels").joinpath("sheet.html").read_text(encoding="utf-8")
     ).substitute(
         title=html.escape(f"Count in {len(names)} pictures: {model}"),
         classes=html.escape(", ".join(classes)),
@@ -148,7 +148,7 @@ def _picture(target: Images, row: int) -> bytes:
         picture, seen = Image.fromarray(target.load(row).permute(1, 2, 0).squeeze(2).numpy()), None
     if seen is not None:
         picture = picture.crop((seen.left, seen.top, seen.left + seen.width, seen.top + seen.height))
-    picture.thumbnail((LARGEST, LARGEST), Image.Resampling.LANCZOS)
+    picture.thumbnail((MAX_PICTURE_SIDE, MAX_PICTURE_SIDE), Image.Resampling.LANCZOS)
     data = io.BytesIO()
     picture.convert("RGB").save(data, "JPEG", quality=92)
     return data.getvalue()

@@ -23,8 +23,8 @@ from ..labels.naming import composed
 from .sets import Example, LabelledSet
 
 REAL = "real"
-NAMED = 5  # images in a message
-LOOSE = 1.25  # times as wide as generated boxes, from which photographs' labels are said to be looser
+MAX_NAMED_IMAGES = 5  # images in a message
+LOOSE_BOX_RATIO = 1.25  # times as wide as generated boxes, from which photographs' labels are said to be looser
 
 
 class Part(NamedTuple):
@@ -79,12 +79,12 @@ def plan(sets: Mapping[str, str | Path], known: Iterable[str], numbers: Iterable
     for name in known:
         if name != REAL:
             rows[name] = Row(name, ((Part(name),),))
-    for name, said in sets.items():
+    for name, text in sets.items():
         if name in rows or name in known:
             raise ProbsceneError(f"expected a name for each set of a trial, got {name!r} twice; rename one.")
         if not name or name.startswith(".") or any(letter in name for letter in '/\\:"\n'):
             raise ProbsceneError(f"expected a name that can be a file's for a set of a trial, got {name!r}.")
-        rows[name] = Row(name, _stages(said, known, rows, paths))
+        rows[name] = Row(name, _stages(text, known, rows, paths))
     if not rows:
         raise ProbsceneError(
             "expected sets to compare, got none; give --set NAME=PATH, --run RUN or --real-numbers 10,20,50,all."
@@ -165,11 +165,11 @@ def check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet,
             if e.digest in of_digest and len(e.boxes) + len(of_digest[e.digest].boxes)  # empty scenes may be the same
         ]
         if both:
-            more = f" and {len(both) - NAMED} more" if len(both) > NAMED else ""
+            more = f" and {len(both) - MAX_NAMED_IMAGES} more" if len(both) > MAX_NAMED_IMAGES else ""
             raise DataError(
                 f"expected test images that are in no set, got {len(both)} in {name!r}: "
-                f"{'; '.join(both[:NAMED])}{more}. Take them out of one of the two; for a part of one folder, name "
-                "'real' with --hold-out N."
+                f"{'; '.join(both[:MAX_NAMED_IMAGES])}{more}. Take them out of one of the two; for a part of "
+                "one folder, name 'real' with --hold-out N."
             )
 
 
@@ -192,12 +192,12 @@ def _row_name(part: Part) -> str:
 
 
 def _stages(
-    said: str | Path, known: tuple[str, ...], rows: Mapping[str, Row], paths: dict[str, Path]
+    text: str | Path, known: tuple[str, ...], rows: Mapping[str, Row], paths: dict[str, Path]
 ) -> tuple[tuple[Part, ...], ...]:
-    if isinstance(said, Path) or Path(said).exists():
-        return ((_path(str(said), paths),),)
+    if isinstance(text, Path) or Path(text).exists():
+        return ((_path(str(text), paths),),)
     stages: list[tuple[Part, ...]] = []
-    for words in said.split(","):
+    for words in text.split(","):
         found: list[tuple[tuple[Part, ...], ...]] = [
             _named(word.strip(), known, rows, paths) for word in words.split("+")
         ]
@@ -245,7 +245,7 @@ def looser(photographs: LabelledSet, made: LabelledSet) -> str | None:
     sides = [_sides(found, len(made.classes), made.examples[0].size) for found in (photographs, made)]
     known = {name: (a, b) for name, a, b in zip(made.classes, *sides, strict=True) if a > 0 and b > 0}
     margin = round(float(np.median([(a - b) / 2 for a, b in known.values()]))) if known else 0
-    if margin < 1 or max(a / b for a, b in known.values()) < LOOSE:
+    if margin < 1 or max(a / b for a, b in known.values()) < LOOSE_BOX_RATIO:
         return None
     words = ", ".join(f"{name} {a:.0f} for {b:.0f}" for name, (a, b) in known.items())
     return (

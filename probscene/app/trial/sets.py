@@ -34,7 +34,7 @@ LEVELS = {EASY: (40.0, 0, 0.15), MODERATE: (25.0, 1, 0.30), HARD: (25.0, 2, 0.50
 """KITTI's levels: least height in pixels, most occluded, most truncated."""
 ALIKE = {"Van": "Car", "Person_sitting": "Pedestrian"}
 """Whom KITTI's protocol does not count as the other, nor as a mistake."""
-NAMED = 5  # images in a message
+MAX_NAMED_IMAGES = 5  # images in a message
 
 
 class Example(NamedTuple):
@@ -87,7 +87,7 @@ def read_set(
 
     Args:
         classes: those to keep; all that it has where None. KITTI's types count as classes of their names, whatever the
-            case, or by ``labelling.kitti.TYPES``.
+            case, or by ``labels.kitti.TYPES``.
         same: a set of COCO or YOLO must have no others.
         progress: called with the number of images read, and of all.
 
@@ -137,10 +137,10 @@ def read_set(
         examples.append(_example(files[i], pixels, entries, kept))
         progress(number, len(order))
     if bad:
-        more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+        more = f" and {len(bad) - MAX_NAMED_IMAGES} more" if len(bad) > MAX_NAMED_IMAGES else ""
         raise DataError(
             f"expected images that decode in {path}, got {len(bad)} of {len(order)} bad: "
-            f"{', '.join(bad[:NAMED])}{more}; fix or delete them."
+            f"{', '.join(bad[:MAX_NAMED_IMAGES])}{more}; fix or delete them."
         )
     return LabelledSet(path, kept, tuple(examples), labels.kitti, found.notes)
 

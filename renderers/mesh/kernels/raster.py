@@ -9,7 +9,7 @@ from ...engine import ti
 from ...kernels.lanes import high, low, whole_lanes
 from ..tables import layout
 
-LEAST = 1e-9  # of 1/z, which rounding may not take to 0 or below
+MIN_INVERSE_DEPTH = 1e-9  # of 1/z, which rounding may not take to 0 or below
 
 i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
 
@@ -25,7 +25,7 @@ def up(value: f64, most: i32):
 @ti.func
 def key(w: f32, record: i32):
     """A word of the visibility buffer."""
-    return (ti.cast(ti.bit_cast(high(w, f32(LEAST)), u32), u64) << 32) | ti.cast(record, u64)
+    return (ti.cast(ti.bit_cast(high(w, f32(MIN_INVERSE_DEPTH)), u32), u64) << 32) | ti.cast(record, u64)
 
 
 @ti.func

@@ -4,7 +4,7 @@ from ...engine import ti
 from ...kernels.lanes import LANES, SHIFT, floats, high, whole, words
 from ..tables import layout
 from . import shading
-from .raster import LEAST
+from .raster import MIN_INVERSE_DEPTH
 from .shading import record_of, residual_ratio
 
 i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
@@ -43,7 +43,7 @@ def read_ground(
         if start < column + count and end > column:
             for i in range(i32(LANES)):
                 here = ti.min(column + i, column + count - 1)
-                near = high(w + w_u * ti.cast(here, f32), f32(LEAST))
+                near = high(w + w_u * ti.cast(here, f32), f32(MIN_INVERSE_DEPTH))
                 covers = (here >= start) & (here < end) & (near > some.w[i])
                 some.record[i] = ti.select(covers, ti.cast(strip + 1, i32), some.record[i])
                 some.w[i] = ti.select(covers, near, some.w[i])

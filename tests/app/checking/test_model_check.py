@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from probscene.app.checking.model_check import QUICK, check_model
-from probscene.app.checking.randomness import beside_sites
+from probscene.app.checking.randomness import hidden_randomness
 from probscene.app.loading import load_model
 from probscene.drawing import Sprites
 from probscene.generator import Command
@@ -29,9 +29,9 @@ FAULTS = {
     "negative scale": (
         X,
         'x = pyro.sample("x", dist.Normal(32.0, -1.0))',
-        ("line 24", "expected parameter scale", "GreaterThan(lower_bound=0.0), but found -1.0"),
+        ("line 24", "Expected parameter scale", "GreaterThan(lower_bound=0.0), but found -1.0"),
     ),
-    "inverted Uniform": (X, X.replace("8.0, 56.0", "56.0, 8.0"), ("line 24", "expected parameter low")),
+    "inverted Uniform": (X, X.replace("8.0, 56.0", "56.0, 8.0"), ("line 24", "Expected parameter low")),
     "repeated name": (X, X.replace('"x"', '"y"'), ("line 25", "Multiple sample sites named 'y'")),
     "a class never drawn": (BLUE, "", ("Class 'blue' is never drawn", "a layer of kind 'blue'")),
     "a class off the canvas": (
@@ -157,7 +157,7 @@ def asks_for(chance):
 def test_so_is_what_a_renderer_draws_and_what_a_generator_is_asked_for(who, random):
     model = asks_for(random) if who == "request" else load_model(str(DISCS))
     render = noisy(model.canvas, 1) if random else SpriteRenderer(model.canvas, 1)
-    faults = beside_sites(model, sample(model, model.prior, 4).derivation, render)
+    faults = hidden_randomness(model, sample(model, model.prior, 4).derivation, render)
     assert [RECORDED in fault for fault in faults] == [True] * random
     assert [TWICE in fault for fault in faults] == [who == "renderer"] * random
 

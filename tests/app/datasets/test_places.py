@@ -5,7 +5,7 @@ import os
 import pytest
 from fsspec.core import url_to_fs
 
-from probscene.app.datasets.generate import generate
+from probscene.app.datasets.generate import DatasetOptions, generate
 from probscene.app.datasets.places import PARTS, RemotePlace
 from probscene.errors import DataError, MachineError, ProbsceneError
 
@@ -64,7 +64,7 @@ def test_it_goes_on_where_it_was_interrupted_and_what_is_damaged_is_made_again(r
         generate(run, 200, address, seed=3, format="coco,kitti", progress=stop)
     assert "annotations.json" not in there(address) and len(there(address)) == 64 * 4 + 2
     files, root = url_to_fs(address)
-    assert generate(run, 200, address, seed=3, format="coco,kitti", shard="1/2").made == 72
+    assert generate(run, 200, address, seed=3, format="coco,kitti", options=DatasetOptions(shard="1/2")).made == 72
     files.pipe_file(f"{root}/images/000070.png", b"half")
     assert generate(run, 200, address, seed=3, format="coco,kitti", workers=2).made == 64 + 64
     generate(run, 200, tmp_path / "out", seed=3, format="coco,kitti")

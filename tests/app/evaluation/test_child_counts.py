@@ -118,7 +118,7 @@ def test_distances_below_parents_are_those_of_the_counts(found):
 def test_labels_that_are_structures_tell_what_a_policy_makes_of_them(plates, found):
     model = plates.run.model
     rules = [json.loads(line)["rules"] for line in plates.lines.read_text(encoding="utf-8").splitlines()]
-    each = [Derivation.of(model.grammar, torch.tensor([row])) for row in rules]
+    each = [Derivation.from_rules(model.grammar, torch.tensor([row])) for row in rules]
     for name, policy in (("prior", model.prior), ("learnt", plates.run.guide)):
         with torch.no_grad():
             logp = np.array([policy.log_prob(one).item() for one in each])

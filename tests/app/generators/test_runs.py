@@ -15,7 +15,7 @@ import torch
 
 from probscene.app.api.fit import fit
 from probscene.app.checking.generator_check import check_generator, cost
-from probscene.app.datasets.generate import generate, generate_scenes
+from probscene.app.datasets.generate import DatasetOptions, generate, generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.datasets.scene_dataset import SceneDataset
 from probscene.app.fitting.pipeline import Execution
@@ -82,7 +82,7 @@ def test_what_the_generator_does_not_know_is_not_in_the_labels(model, tmp_path, 
         assert len(lines) == len(plain) and all(line[2] == "3" for line in lines)
         assert all(line[1] == "-1" if name == "plain" else 0 <= float(line[1]) <= 1 for line in lines)
     with pytest.raises(ProbsceneError, match="no min_visible with model 'boxes'"):
-        generate_scenes(model, model.prior, 20, tmp_path / "least", min_visible=0.25)
+        generate_scenes(model, model.prior, 20, tmp_path / "least", options=DatasetOptions(min_visible=0.25))
 
 
 def test_a_dataset_in_memory_leaves_them_out_too(model):

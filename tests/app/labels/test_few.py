@@ -15,7 +15,12 @@ from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.labels.annotations import Annotation
 from probscene.app.labels.boxes import on_canvas
 from probscene.app.labels.counts import write_cells
-from probscene.app.labels.partial_labels import LEAST, PartlyLabelled, labels_record, read_partial_labels
+from probscene.app.labels.partial_labels import (
+    MIN_LABELLED_IMAGES,
+    PartlyLabelledImages,
+    labels_record,
+    read_partial_labels,
+)
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.decoding import fitted, window
@@ -67,10 +72,10 @@ def test_a_box_lies_where_its_pixels_are_seen(case):
     assert np.allclose(found[0, 1:].numpy(), seen, atol=near)
 
 
-@given(st.lists(st.none() | st.lists(st.integers(0, 1), max_size=4), min_size=LEAST, max_size=8))
+@given(st.lists(st.none() | st.lists(st.integers(0, 1), max_size=4), min_size=MIN_LABELLED_IMAGES, max_size=8))
 def test_counts_are_those_of_the_boxes(tmp_path_factory, each):
     """An image that is listed has as many as it has boxes; one that is not has no labels."""
-    assume(sum(found is not None for found in each) >= LEAST)
+    assume(sum(found is not None for found in each) >= MIN_LABELLED_IMAGES)
     listed = [
         (f"image {i}", [(c, 4 * k, 5, 3, 6) for k, c in enumerate(x)]) for i, x in enumerate(each) if x is not None
     ]
@@ -87,13 +92,13 @@ def test_counts_are_those_of_the_boxes(tmp_path_factory, each):
     assert any(all(name in note for name in never) for note in few.notes) == bool(never)
 
 
-rows_of_counts = st.lists(st.none() | st.tuples(*[st.integers(0, 30)] * 3), min_size=LEAST, max_size=9)
+rows_of_counts = st.lists(st.none() | st.tuples(*[st.integers(0, 30)] * 3), min_size=MIN_LABELLED_IMAGES, max_size=9)
 
 
 @given(rows_of_counts, st.sampled_from(",;\t"), st.integers(0, 2), st.randoms(use_true_random=False))
 def test_a_sheet_may_be_filled_in_partly(tmp_path_factory, each, delimiter, without, rng):
     """Rows without any count are not labelled, nor is a class whose column is empty; spreadsheets change commas."""
-    assume(sum(found is not None for found in each) >= LEAST)
+    assume(sum(found is not None for found in each) >= MIN_LABELLED_IMAGES)
     path, classes = tmp_path_factory.mktemp("few") / "few.csv", CELLS.classes
     rows = [
         [f"image {i}", *("" if x is None or c == without else str(x[c]) for c in range(3))] for i, x in enumerate(each)
@@ -109,7 +114,7 @@ def test_a_sheet_may_be_filled_in_partly(tmp_path_factory, each, delimiter, with
     assert any(classes[without] in note and "empty" in note for note in few.notes)
 
 
-GOOD = [(f"image {i}", [(0, 5, 5, 9, 9), (1, 8, 8, 9, 9)]) for i in range(LEAST)]
+GOOD = [(f"image {i}", [(0, 5, 5, 9, 9), (1, 8, 8, 9, 9)]) for i in range(MIN_LABELLED_IMAGES)]
 TWICE = [{"id": 1, "name": "rbc"}, {"id": 1, "name": "wbc"}]
 JSON = {
     "no json": ("{", "COCO's JSON"),
@@ -218,9 +223,9 @@ def test_a_generated_dataset_is_read_back(tmp_path, discs):
     few = read_partial_labels(path, model, target)
     assert (few.counts.numpy() <= counts).all() and few.counts.sum() > 0.8 * counts.sum()  # discs hide discs
     assert few.classes == model.classes and few.rows.tolist() == list(range(6))
-    labelled = PartlyLabelled(target, few).labelled
+    labelled = PartlyLabelledImages(target, few).labelled
     assert torch.equal(labelled.images[2], target.load(2)) and torch.equal(labelled.counts, few.counts)
-    assert PartlyLabelled(target, None).labelled is None
+    assert PartlyLabelledImages(target, None).labelled is None
 
 
 def test_a_record_changes_with_what_labels_say(tmp_path):

@@ -119,10 +119,10 @@ def test_images_without_a_file_are_left_out_only_where_some_are_labelled(tmp_pat
     target = images("x", ["a.png", "b.png", "c.png"])
     with pytest.raises(DataError, match="got none of a.png and 1 more"):
         read_boxes(tmp_path, STREET, target)
-    assert read_boxes(tmp_path, STREET, target, some=True).counts.tolist() == [[1, 0, 0, 0]]
+    assert read_boxes(tmp_path, STREET, target, allow_missing=True).counts.tolist() == [[1, 0, 0, 0]]
     (tmp_path / "b.txt").unlink()
     with pytest.raises(DataError, match="got none; label at least one"):
-        read_boxes(tmp_path, STREET, target, some=True)
+        read_boxes(tmp_path, STREET, target, allow_missing=True)
 
 
 FAULTS = {

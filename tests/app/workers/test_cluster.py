@@ -8,16 +8,15 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets import generate as datasets
-from probscene.app.datasets.generate import _actor, generate
+from probscene.app.datasets.generate import DatasetOptions, _actor, generate, workers_or_cluster
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.run import RunFolder
-from probscene.app.workers import actor_pool as crews
+from probscene.app.workers import actor_pool
 from probscene.app.workers import cluster as clusters
 from probscene.app.workers.cluster import Cluster
 from probscene.errors import MachineError, ModelError, ProbsceneError
@@ -29,7 +28,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
 
 
 def doubling(pause=0.0, fault=None):
-    """A crew's work, found by nodes under this file's name."""
+    """A pool's work, found by nodes under this file's name."""
 
     def do(task):
         time.sleep(pause)
@@ -61,7 +60,7 @@ def unwritable(node, code, tried, *arguments):
 
 
 def slow():
-    """The work of a crew whose preparation takes its time."""
+    """The work of a pool whose preparation takes its time."""
     time.sleep(4)
     return doubling()
 
@@ -78,22 +77,22 @@ def contents(folder):
 
 
 @pytest.fixture
-def said():
+def messages():
     return []
 
 
 @pytest.fixture
-def nodes(simulated, said, monkeypatch):
+def nodes(simulated, messages, monkeypatch):
     """A connection to the cluster; what is late is soon found to be."""
-    monkeypatch.setattr(crews, "LATE", 2.0)
-    with Cluster(simulated.address, said.append) as connected:
+    monkeypatch.setattr(actor_pool, "MIN_LATE_SECONDS", 2.0)
+    with Cluster(simulated.address, messages.append) as connected:
         yield connected
 
 
-def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, said):
-    crew, found = nodes.crew(doubling, (0.1,)), []
-    while sum(isinstance(member.asked, int) for member in crew._members) < 3:  # until every node is at work
-        crew.run(range(3), lambda result: None)
+def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, messages):
+    pool, found = nodes.actor_pool(doubling, (0.1,)), []
+    while sum(isinstance(member.request, int) for member in pool._members) < 3:  # until every node is at work
+        pool.run(range(3), lambda result: None)
 
     def done(result):
         found.append(result)
@@ -102,16 +101,16 @@ def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, sa
         if len(found) == 12:
             simulated.freeze()
 
-    crew.run(range(40), done)
+    pool.run(range(40), done)
     assert sorted(found) == [(task, 2 * task) for task in range(40)]
     end = time.monotonic() + 120
-    while len(crew._names) == 3:  # Ray needs some seconds to see that one is lost
+    while len(pool._names) == 3:  # Ray needs some seconds to see that one is lost
         again = []
-        crew.run([7, 8], again.append)  # on the node that is left
+        pool.run([7, 8], again.append)  # on the node that is left
         assert sorted(again) == [(7, 14), (8, 16)] and time.monotonic() < end
-    told = [line for line in said if "is lost" in line or "has not answered" in line]
+    told = [line for line in messages if "is lost" in line or "has not answered" in line]
     assert len(told) == 2 and sum("has not answered" in line for line in told) >= 1  # on a busy machine both are late
-    crew.close()
+    pool.close()
 
 
 def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_path):
@@ -125,7 +124,7 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_pa
         if len(made) == 5:
             simulated.freeze()
 
-    dataset = generate(run, 700, tmp_path / "out", 3, format="coco,yolo", progress=progress, cluster=nodes)
+    dataset = generate(run, 700, tmp_path / "out", 3, format="coco,yolo", progress=progress, workers=nodes)
     assert dataset.made == 700 and dataset.finished and made[-1] == 700
     assert contents(tmp_path / "out") == contents(tmp_path / "alone")
 
@@ -133,9 +132,9 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_pa
 def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_path, monkeypatch):
     words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "structure.num_scenes=150"]
     assert call(*words, "--out", tmp_path / "alone").code == 0
-    parts, run = [], crews.ActorPool.run
+    parts, run = [], actor_pool.ActorPool.run
 
-    def disturbed(crew, tasks, done):
+    def disturbed(pool, tasks, done):
         def each(result):
             parts.append(result)
             if len(parts) == 4:
@@ -144,10 +143,10 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
                 simulated.freeze()
             done(result)
 
-        return run(crew, tasks, each)
+        return run(pool, tasks, each)
 
-    monkeypatch.setattr(crews, "LATE", 2.0)
-    monkeypatch.setattr(crews.ActorPool, "run", disturbed)
+    monkeypatch.setattr(actor_pool, "MIN_LATE_SECONDS", 2.0)
+    monkeypatch.setattr(actor_pool.ActorPool, "run", disturbed)
     result = call(*words, "--out", tmp_path / "out", "--cluster", simulated.address)
     assert result.code == 0, result.err
     assert len(parts) == 4 * 3
@@ -156,27 +155,27 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
 
 
 def test_an_actor_that_prepares_itself_for_long_is_waited_for(nodes, monkeypatch):
-    crew, found = nodes.crew(slow, ()), []
-    monkeypatch.setattr(crews, "START", 0.0)
-    while not crew._there():  # this has no actor yet
+    pool, found = nodes.actor_pool(slow, ()), []
+    monkeypatch.setattr(actor_pool, "START_TIMEOUT", 0.0)
+    while not pool.any_answered():  # this has no actor yet
         with suppress(MachineError):
-            crew.run([1], lambda result: None)
-    crew.run([1, 2], found.append)
+            pool.run([1], lambda result: None)
+    pool.run([1, 2], found.append)
     assert sorted(found) == [(1, 2), (2, 4)]
 
 
 def test_generators_that_nodes_have_started_leave_no_files(nodes):
     argv = [sys.executable, str(Path(__file__).parents[1] / "generators" / "draw_boxes.py")]
-    crew, folders = nodes.crew(drawing, (argv,)), []
-    crew.run(range(3), folders.append)
+    pool, folders = nodes.actor_pool(drawing, (argv,)), []
+    pool.run(range(3), folders.append)
     assert len(folders) == 3 and any(map(os.path.exists, folders))
-    crew.close()
+    pool.close()
     assert not any(map(os.path.exists, folders))
 
 
 def test_what_a_task_raises_is_told_with_its_node(nodes):
     with pytest.raises(ModelError, match="^On node .*: this one cannot be drawn$"):
-        nodes.crew(doubling, (0.0, 3)).run([3], lambda result: None)
+        nodes.actor_pool(doubling, (0.0, 3)).run([3], lambda result: None)
 
 
 @pytest.mark.parametrize("code, what", [(errno.ENOSPC, "The disk is full"), (errno.EROFS, "Read-only file system")])
@@ -185,19 +184,19 @@ def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr(datasets, "_actor", partial(unwritable, node, code, tmp_path / "tried"))
         with pytest.raises(MachineError, match=f"On node .*: .*{what}"):
-            generate(run, 700, out, seed=3, cluster=nodes)
+            generate(run, 700, out, seed=3, workers=nodes)
     generate(run, 700, tmp_path / "alone", seed=3)
     shown = {name: data for name, data in contents(out).items() if not name.startswith(".")}
     assert shown.items() <= contents(tmp_path / "alone").items()  # whole or absent
-    generate(run, 700, out, seed=3, cluster=nodes)
+    generate(run, 700, out, seed=3, workers=nodes)
     assert contents(out) == contents(tmp_path / "alone")
 
 
 def test_other_versions_are_refused(nodes, monkeypatch):
-    here = crews.versions()
-    monkeypatch.setattr(crews, "versions", lambda: {**here, "torch": "1.0"})
+    here = actor_pool.versions()
+    monkeypatch.setattr(actor_pool, "versions", lambda: {**here, "torch": "1.0"})
     with pytest.raises(ProbsceneError, match="expected torch 1.0 on node .*, as on this machine, got 2"):
-        nodes.crew(doubling, ()).run([1], lambda result: None)
+        nodes.actor_pool(doubling, ()).run([1], lambda result: None)
 
 
 def test_the_last_node_is_lost(simulated, nodes):
@@ -206,7 +205,7 @@ def test_the_last_node_is_lost(simulated, nodes):
             simulated.kill()
 
     with pytest.raises(MachineError, match="expected a node with 1 cores .*, got .*goes on where it stopped"):
-        nodes.crew(doubling, (0.1,)).run(range(1000), done)
+        nodes.actor_pool(doubling, (0.1,)).run(range(1000), done)
 
 
 def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
@@ -214,7 +213,8 @@ def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
     assert run.guide_hash() and run.guide  # as of another machine's disk, which nodes do not have
     run.path = tmp_path / "elsewhere"
     with pytest.raises(ProbsceneError, match="On node .*: expected a run folder .*elsewhere.*by the same paths"):
-        nodes.crew(_actor, (run.path, 10, tmp_path / "out", 0, ("coco",), 0.0, False)).run([0], lambda result: None)
+        arguments = run.path, 10, tmp_path / "out", 0, ("coco",), DatasetOptions()
+        nodes.actor_pool(_actor, arguments).run([0], lambda result: None)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "nowhere", "nowhere.invalid:6379"])
@@ -234,7 +234,7 @@ def test_a_fit_without_its_cluster_leaves_no_run(call, discs, target, tmp_path):
 
 
 def test_what_is_not_ray_is_told_in_time(call, fitted, tmp_path, monkeypatch):
-    monkeypatch.setattr(clusters, "ANSWER", 2.0)
+    monkeypatch.setattr(clusters, "ANSWER_TIMEOUT", 2.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         address = f"127.0.0.1:{listening.getsockname()[1]}"
         result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
@@ -249,7 +249,7 @@ def test_another_version_of_ray_is_no_missing_cluster(monkeypatch):
         raise RuntimeError(f"Version mismatch: {there}{here}")
 
     monkeypatch.setattr("ray.init", mismatched)
-    monkeypatch.setattr(clusters, "_knocked", lambda address: address)
+    monkeypatch.setattr(clusters, "_checked_address", lambda address: address)
     with pytest.raises(MachineError, match="got Ray 2.1.0 and Python 3.9.1; install the same versions"):
         Cluster("10.0.0.1:6379")
 
@@ -258,10 +258,11 @@ def test_auto_starts_one_where_what_ray_remembers_is_gone(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     found = []
     with Cluster("auto") as cluster:
-        cluster.crew(doubling, ()).run([1, 2], found.append)
+        cluster.actor_pool(doubling, ()).run([1, 2], found.append)
     assert sorted(found) == [(1, 2), (2, 4)]
 
 
-def test_workers_or_a_cluster(fitted, tmp_path):
+def test_workers_or_a_cluster(nodes):
+    assert workers_or_cluster(2, None) == 2 and workers_or_cluster(1, nodes) is nodes
     with pytest.raises(ProbsceneError, match="expected workers or a cluster"):
-        generate(RunFolder.at(fitted), 4, tmp_path / "out", workers=2, cluster=SimpleNamespace())
+        workers_or_cluster(2, nodes)

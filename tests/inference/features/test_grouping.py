@@ -56,7 +56,7 @@ def shelves():
 
 def test_a_node_belongs_to_the_nearest_group_above_it():
     rules = torch.tensor([[0, 1, 3, 4, 6, 5, 1, 3, 4, 6, 5, 2]])
-    derivation = Derivation.of(ROADS, rules)
+    derivation = Derivation.from_rules(ROADS, rules)
     assert [ROADS.kinds[k] for k in derivation.kind[0].tolist()] == ["sky", "road", "car", "dog", "road", "car", "dog"]
     of_road = group_of(derivation.kind, derivation.parent, ROADS.kind("road"))
     assert of_road.tolist() == [[-1, 1, 1, 1, 4, 4, 4]]

@@ -12,7 +12,7 @@ import torch
 from probscene.batch import RenderBatch, SceneGeometry
 from probscene.world import World
 
-from .photo import photographed
+from .camera_effects import apply_camera_effects
 from .rays import meet, sample
 from .scenes import SceneReference
 
@@ -68,7 +68,7 @@ class MeshReference:
     def _image(self, scene: "_Scene", u, v) -> np.ndarray:
         shifts = [(0.0, 0.0)] if self.samples == 1 else [(a, b) for a in (-0.25, 0.25) for b in (-0.25, 0.25)]
         colours = np.mean([scene.colours(u + a, v + b) for a, b in shifts], 0).reshape(*self.canvas, 3)
-        return photographed(colours, scene.world.photo, 0).image
+        return apply_camera_effects(colours, scene.world.photo, 0).image
 
 
 class _Scene(SceneReference):

@@ -7,7 +7,7 @@ import torch
 from scipy.fft import dctn, idctn
 from scipy.ndimage import binary_dilation
 
-from probscene.photo import Photo
+from probscene.camera_effects import CameraEffects
 
 from .rays import noise
 
@@ -38,12 +38,12 @@ class Coded(NamedTuple):
     doubtful: np.ndarray
 
 
-def values_of(photo: Photo, n: int) -> dict[str, float]:
+def values_of(photo: CameraEffects, n: int) -> dict[str, float]:
     """A scene's values."""
     return {name: float(value[n]) for name, value in vars(photo).items()}
 
 
-def photographed(colours: np.ndarray, photo: Photo, n: int) -> Coded:
+def apply_camera_effects(colours: np.ndarray, photo: CameraEffects, n: int) -> Coded:
     """Bytes of the colours ``(H, W, 3)`` in 0..1 of scene ``n``."""
     value, seed = values_of(photo, n), int(photo.seed[n])
     image = toned(colours, value)

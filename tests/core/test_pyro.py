@@ -36,7 +36,7 @@ PRIOR = StructurePrior(GRAMMAR, Plates=counts(1, 1, 1, 1))
 OTHER = StructurePrior(Grammar("Sky -> sun | moon"))
 MAX_STEPS, N, MAX_NODES = 6, 4, 5
 TRUE = 1.5
-GIVEN = Derivation.of(GRAMMAR, torch.tensor([[0, 1, 1, 2]] * N))
+GIVEN = Derivation.from_rules(GRAMMAR, torch.tensor([[0, 1, 1, 2]] * N))
 
 
 def structure(num_scenes=N, static=False):

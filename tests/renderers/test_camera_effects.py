@@ -10,12 +10,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.photo import photographed
+from reference.camera_effects import apply_camera_effects
 
+from probscene.camera_effects import CameraEffects
 from probscene.drawing import Atlas, Drawing, Sprites, resolve
 from probscene.errors import ModelError
-from probscene.photo import Photo
-from probscene.renderers.camera import effects as photo_module
+from probscene.renderers.camera import effects as effects_module
 from probscene.renderers.mesh.renderer import MeshRenderer
 from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.world import Camera, Light, Meshes, resolve_scene
@@ -24,7 +24,7 @@ SEED = st.integers(0, 2**32 - 1)
 SIZE = st.integers(1, 45)
 
 
-def drawing_of(images: np.ndarray, photo: Photo | None = None) -> Drawing:
+def drawing_of(images: np.ndarray, photo: CameraEffects | None = None) -> Drawing:
     """Scenes of which each shows an image ``(N, H, W, 3)`` to the byte, as the sprite of its one node."""
     number, height, width = images.shape[:3]
     opaque = np.concatenate([images, np.full_like(images[..., :1], 255)], 3)
@@ -36,7 +36,7 @@ def drawing_of(images: np.ndarray, photo: Photo | None = None) -> Drawing:
 
 def photos_of(images: np.ndarray, **values) -> np.ndarray:
     """Photos ``(N, H, W, 3)`` of images."""
-    batch = SpriteRenderer(images.shape[1:3], threads=1)(drawing_of(images, Photo(**values)))
+    batch = SpriteRenderer(images.shape[1:3], threads=1)(drawing_of(images, CameraEffects(**values)))
     return batch.image.permute(0, 2, 3, 1).numpy()
 
 
@@ -49,7 +49,7 @@ def noise_of(seed: int, *shape: int, smooth: float = 0.0) -> np.ndarray:
     return images
 
 
-def random_photo(seed: int, number: int) -> Photo:
+def random_effects(seed: int, number: int) -> CameraEffects:
     """Some of the effects, of other strength in each scene."""
     generator = np.random.default_rng(seed)
     ranges = {
@@ -58,32 +58,32 @@ def random_photo(seed: int, number: int) -> Photo:
     }  # fmt: skip
     chosen = {name: ends for name, ends in ranges.items() if generator.random() < 0.4}
     values = {name: torch.from_numpy(generator.uniform(*ends, (number, 1))) for name, ends in chosen.items()}
-    return Photo(**values, seed=torch.from_numpy(generator.integers(0, 2**31, (number, 1))))
+    return CameraEffects(**values, seed=torch.from_numpy(generator.integers(0, 2**31, (number, 1))))
 
 
 @settings(max_examples=60)
 @given(SEED, SIZE, SIZE)
 def test_agrees_with_the_numpy_twin(seed, height, width):
     images = noise_of(seed, 2, height, width, smooth=2.0 * (seed % 2))
-    photo = resolve_scene(random_photo(seed, 2), 2)
+    photo = resolve_scene(random_effects(seed, 2), 2)
     found = SpriteRenderer((height, width), threads=1)(replace(drawing_of(images), photo=photo))
     for n in range(2):
         before = replace(photo, jpeg_quality=torch.full((2,), torch.inf))
         ours = SpriteRenderer((height, width), threads=1)(replace(drawing_of(images), photo=before))
         ours = ours.image[n].permute(1, 2, 0).numpy()
-        twin = photographed(images[n] / 255, before, n)
+        twin = apply_camera_effects(images[n] / 255, before, n)
         assert np.abs(ours.astype(int) - twin.image).max() <= 1  # each stage rounds
         # What is coded is our own bytes: a byte that rounds the other way would change whole blocks.
-        plain = replace(resolve_scene(Photo(), 2), jpeg_quality=photo.jpeg_quality)
-        twin = photographed(ours / 255, plain, n)
+        plain = replace(resolve_scene(CameraEffects(), 2), jpeg_quality=photo.jpeg_quality)
+        twin = apply_camera_effects(ours / 255, plain, n)
         apart = np.abs(found.image[n].permute(1, 2, 0).numpy().astype(int) - twin.image).max(2)
         assert (apart[~twin.doubtful] <= 2).all()
 
 
 def test_hardly_any_pixel_is_doubtful_to_the_twin():
     images = noise_of(0, 4, 200, 300, smooth=2.0)
-    photo = resolve_scene(Photo(jpeg_quality=torch.tensor([[10.0], [40.0], [75.0], [93.0]])), 4)
-    assert np.mean([photographed(images[n] / 255, photo, n).doubtful for n in range(4)]) < 0.5
+    photo = resolve_scene(CameraEffects(jpeg_quality=torch.tensor([[10.0], [40.0], [75.0], [93.0]])), 4)
+    assert np.mean([apply_camera_effects(images[n] / 255, photo, n).doubtful for n in range(4)]) < 0.5
 
 
 @given(SEED, st.integers(0, 3), SIZE, SIZE)
@@ -93,7 +93,7 @@ def test_the_default_photo_keeps_every_byte(seed, number, height, width):
         np.testing.assert_array_equal(photos_of(images), images)
     renderer = SpriteRenderer((height, width), threads=1)
     empty = Drawing(torch.zeros(number, 0, dtype=torch.int64), ("a",), (), (0.2, 0.4, 0.6))
-    shown = renderer(replace(empty, photo=resolve_scene(Photo(), number)))
+    shown = renderer(replace(empty, photo=resolve_scene(CameraEffects(), number)))
     assert torch.equal(shown.image, renderer(empty).image)
 
 
@@ -101,13 +101,13 @@ def test_the_default_photo_keeps_every_byte(seed, number, height, width):
 def test_labels_are_those_without_a_photo(seed, height, width):
     images = noise_of(seed, 3, height, width)
     renderer = SpriteRenderer((height, width), threads=1)
-    with_photo, without = renderer(drawing_of(images, random_photo(seed, 3))), renderer(drawing_of(images))
+    with_photo, without = renderer(drawing_of(images, random_effects(seed, 3))), renderer(drawing_of(images))
     assert all(torch.equal(a, b) for a, b in zip(with_photo[1:7], without[1:7], strict=True))
 
 
 @given(SEED, st.integers(0, 4), SIZE, SIZE)
 def test_same_bytes_for_any_threads_and_any_batch(seed, cut, height, width):
-    drawing = drawing_of(noise_of(seed, 4, height, width), random_photo(seed, 4))
+    drawing = drawing_of(noise_of(seed, 4, height, width), random_effects(seed, 4))
     renderer = SpriteRenderer((height, width), threads=1)
     image = renderer(drawing).image
     assert torch.equal(image, SpriteRenderer((height, width), threads=2)(drawing).image)
@@ -116,9 +116,9 @@ def test_same_bytes_for_any_threads_and_any_batch(seed, cut, height, width):
 
 
 def test_same_bytes_for_several_launches(monkeypatch):
-    drawing = drawing_of(noise_of(0, 21, 7, 9), random_photo(6, 21))
+    drawing = drawing_of(noise_of(0, 21, 7, 9), random_effects(6, 21))
     image = SpriteRenderer((7, 9), threads=1)(drawing).image
-    monkeypatch.setattr(photo_module, "_CHUNK", 1)
+    monkeypatch.setattr(effects_module, "_CHUNK", 1)
     assert torch.equal(image, SpriteRenderer((7, 9), threads=2)(drawing).image)
     assert not torch.equal(image, SpriteRenderer((7, 9), threads=1)(replace(drawing, photo=None)).image)
 
@@ -226,7 +226,7 @@ def test_a_world_and_a_drawing_that_show_the_same_give_the_same_photo(shapes):
     """Blur, noise and JPEG of a render are those of an image with its bytes."""
     car = Meshes("car", (shapes.box(4, 2, 2, (200, 40, 60)),), 0, torch.tensor([[9.0], [14.0], [20.0]]), 0.0, yaw=0.6)
     camera, renderer = Camera(100.0, 50.0, 20.0), MeshRenderer((45, 101), threads=2)
-    late = Photo(blur=torch.tensor([[0.0], [1.0], [2.5]]), noise=6.0, jpeg_quality=60.0, seed=9)
+    late = CameraEffects(blur=torch.tensor([[0.0], [1.0], [2.5]]), noise=6.0, jpeg_quality=60.0, seed=9)
     parts = {"kind": torch.zeros(3, 1, dtype=torch.int64), "camera": camera, "light": Light(), "ground": shapes.road()}
     plain, found = (renderer(shapes.world(car, photo=photo, **parts)) for photo in (None, late))
     images = plain.image.permute(0, 2, 3, 1).numpy()
@@ -239,37 +239,40 @@ def test_a_world_and_a_drawing_that_show_the_same_give_the_same_photo(shapes):
 
 @given(SEED, st.integers(0, 3), SIZE, SIZE)
 def test_renderers_of_ones_own_get_the_same(seed, number, height, width):
-    drawing = drawing_of(noise_of(seed, max(1, number), height, width), random_photo(seed, max(1, number)))[:number]
+    drawing = drawing_of(noise_of(seed, max(1, number), height, width), random_effects(seed, max(1, number)))[:number]
     renderer = SpriteRenderer((height, width), threads=1)
     plain = renderer(replace(drawing, photo=None)).image
-    assert torch.equal(photo_module.photographed(drawing.photo, plain.contiguous()), renderer(drawing).image)
+    assert torch.equal(effects_module.apply_camera_effects(drawing.photo, plain.contiguous()), renderer(drawing).image)
 
 
 def test_a_photo_of_other_scenes_is_named():
     drawing = drawing_of(noise_of(0, 2, 5, 6))
     with pytest.raises(ModelError, match=r"uint8 \(N, 3, H, W\), got torch.uint8 \(2, 5, 6, 3\)"):
-        photo_module.photographed(resolve_scene(Photo(), 2), torch.zeros(2, 5, 6, 3, dtype=torch.uint8))
+        effects_module.apply_camera_effects(
+            resolve_scene(CameraEffects(), 2), torch.zeros(2, 5, 6, 3, dtype=torch.uint8)
+        )
     renderer = SpriteRenderer((5, 6), threads=1)
-    for photo in (Photo(), resolve_scene(Photo(), 1), resolve_scene(Photo(), 3)):
+    for photo in (CameraEffects(), resolve_scene(CameraEffects(), 1), resolve_scene(CameraEffects(), 3)):
         with pytest.raises(ModelError, match="one value for each of 2 scenes.*resolve_scene"):
             renderer(replace(drawing, photo=photo))
-    wrong = replace(resolve_scene(Photo(), 2), blur=torch.tensor([0.0, torch.nan]))
-    with pytest.raises(ModelError, match="Photo.blur within 0..64, got nan"):
+    wrong = replace(resolve_scene(CameraEffects(), 2), blur=torch.tensor([0.0, torch.nan]))
+    with pytest.raises(ModelError, match="CameraEffects.blur within 0..64, got nan"):
         renderer(replace(drawing, photo=wrong))
 
 
 OWN = """
 import hashlib, sys
 import torch
-from probscene.photo import Photo
+from probscene.camera_effects import CameraEffects
 from probscene.renderers import engine
-from probscene.renderers.camera.effects import photographed
+from probscene.renderers.camera.effects import apply_camera_effects
 from probscene.world import resolve_scene
 if sys.argv[1] == "own":
     engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)
 image = torch.randint(0, 256, (2, 3, 37, 53), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-photo = Photo(1.2, 0.8, 0.7, 1.1, 0.9, 0.3, torch.tensor([[0.0], [1.5]]), 5.0, torch.tensor([[60.0], [torch.inf]]))
-found = photographed(resolve_scene(photo, 2), image)
+blur, quality = torch.tensor([[0.0], [1.5]]), torch.tensor([[60.0], [torch.inf]])
+photo = CameraEffects(1.2, 0.8, 0.7, 1.1, 0.9, 0.3, blur, 5.0, quality)
+found = apply_camera_effects(resolve_scene(photo, 2), image)
 print(hashlib.sha256(found.contiguous().numpy().tobytes()).hexdigest())
 """
 

@@ -21,8 +21,7 @@ from probscene.lists import (
     share_from,
 )
 from probscene.reach import Reach
-from probscene.structure import StructurePrior, counts, ranked, weights
-from probscene.support import Support
+from probscene.structure import StructurePrior, counts, ranked, support_of_policies, weights
 
 NESTED = Grammar("Scene -> bg Items | bg\nItems -> Item Items | ε\nItem -> x(Things) | y\nThings -> z Things | ε")
 TWINS = Grammar("Scene -> As Bs\nAs -> a As | a\nBs -> b b Bs | ε\n")
@@ -57,7 +56,7 @@ def test_reach_is_what_enumeration_finds(pair, data):
     grammar, prior = pair
     found, every = enumerated(grammar, prior)
     assume(len(found))
-    reach = Reach(grammar, Support.of(grammar, [prior]), STEPS, [[kind] for kind in range(len(grammar.kinds))])
+    reach = Reach(grammar, support_of_policies(grammar, [prior]), STEPS, [[kind] for kind in range(len(grammar.kinds))])
     for kind in range(len(grammar.kinds)):
         assert (reach.least(kind), reach.most(kind)) == (every[:, kind].min(), every[:, kind].max())
     rules = found.lengths.numpy()
@@ -74,7 +73,7 @@ def test_reach_is_what_enumeration_finds(pair, data):
 def test_what_hangs_together_with_nothing_does_not_count():
     """A list without an end of its own below an object that is not there could feed itself."""
     grammar = Grammar("Scene -> x | y(Loop)\nLoop -> z Loop | ε")
-    support = Support.of(grammar, [StructurePrior(grammar, Loop=weights(1, 1))])
+    support = support_of_policies(grammar, [StructurePrior(grammar, Loop=weights(1, 1))])
     reach = Reach(grammar, support, 20, [[grammar.kind(name)] for name in "xyz"])
     assert reach.fewest_rules(np.array([1, 0, 3])) == np.inf and len(reach.cuts)
     assert reach.fewest_rules(np.array([0, 1, 3])) == 5
@@ -88,22 +87,22 @@ def test_list_bounds_are_those_of_the_lists_that_are_derived(pair):
     every = enumerate_derivations(grammar, 16)
     found = every[prior.log_prob(every) > -torch.inf]
     assume(len(found) and Branching(grammar, prior.table).longest() <= 16)
-    for bounds in bounded_lists(grammar, prior, Support.of(grammar, [prior])):
-        own = lengths(grammar, found, bounds.symbol).of(bounds, prior.table.shape[1])
+    for bounds in bounded_lists(grammar, prior, support_of_policies(grammar, [prior])):
+        own = lengths(grammar, found, bounds.symbol).select(bounds, prior.table.shape[1])
         assert (own.min(), own.max()) == (bounds.shortest, bounds.prior) and bounds.prior == bounds.longest
 
 
 def test_shares_of_lengths_are_those_of_samples():
     prior = StructurePrior(NESTED, Items=counts(1, 2, 3), Things=ranked(counts(1, 1), counts(1, 0, 3)))
-    support = Support.of(NESTED, [prior])
+    support = support_of_policies(NESTED, [prior])
     torch.manual_seed(0)
     drawn, _ = derive_complete(NESTED, prior, 4000, 40)
     every = bounded_lists(NESTED, prior, support)
-    assert [(NESTED.nonterminals[b.symbol], b.rank, b.longest) for b in every] == [
+    assert [(NESTED.nonterminals[b.symbol], b.parent_list_index, b.longest) for b in every] == [
         ("Items", None, 2), ("Things", 0, 1), ("Things", 1, 2),
     ]  # fmt: skip
     for bounds in every:
-        found = lengths(NESTED, drawn, bounds.symbol).of(bounds, 2)
+        found = lengths(NESTED, drawn, bounds.symbol).select(bounds, 2)
         share = share_from(Branching(NESTED, prior.table), bounds, bounds.longest)
         assert abs((found >= bounds.longest).mean() - share) < 5 * (share * (1 - share) / len(found)) ** 0.5
 
@@ -112,7 +111,7 @@ def test_pretraining_may_have_longer_lists_and_weights_have_no_longest():
     grammar = Grammar("Scene -> As Bs\nAs -> a As | ε\nBs -> b Bs | ε")
     prior = StructurePrior(grammar, As=counts(0, 1, 1), Bs=weights(1, 2))
     more = StructurePrior(grammar, As=counts(1, 1, 1, 0, 1), Bs=weights(1, 2))
-    assert bounded_lists(grammar, prior, Support.of(grammar, [prior, more])) == [ListBounds(1, None, 1, 2, 4)]
+    assert bounded_lists(grammar, prior, support_of_policies(grammar, [prior, more])) == [ListBounds(1, None, 1, 2, 4)]
 
 
 @pytest.mark.parametrize(

@@ -97,11 +97,11 @@ def test_counts_of_every_small_scene_with_roads():
     cars = torch.zeros(len(derivations), dtype=torch.int64).index_add_(0, found.scene, found.count)
     assert torch.equal(cars, derivations.counts(2)[:, 1])
     assert torch.equal(torch.bincount(found.scene, minlength=len(derivations)), derivations.counts(2)[:, 0])
-    two = Derivation.of(ROADS, torch.tensor([[0, 1, 3, 4, 4, 5, 1, 3, 4, 5, 2]]))
+    two = Derivation.from_rules(ROADS, torch.tensor([[0, 1, 3, 4, 4, 5, 1, 3, 4, 5, 2]]))
     assert [x.tolist() for x in per_parent(two, 0, 1)] == [[0, 0], [0, 1], [2, 1]]
 
 
 def test_no_scenes_and_no_such_node():
-    one = Derivation.of(ROADS, torch.tensor([[0, 2]]))
+    one = Derivation.from_rules(ROADS, torch.tensor([[0, 2]]))
     for derivation in (one, one[:0]):
         assert all(len(x) == 0 and x.dtype == torch.int64 for x in per_parent(derivation, 0, 1))

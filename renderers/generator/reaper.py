@@ -1,7 +1,7 @@
-"""A process that outlives a pool whose own was killed, and does what this had no time for: it ends the workers, also
-those that never called, and removes the pool's folder.
+"""A process that cleans up after a pool whose own process was killed: it ends the workers, also those that never
+connected, and removes the pool's folder.
 
-It is this file run as a script, in the standard library alone.
+It is this file run as a script, and needs the standard library alone.
 """
 
 import os
@@ -16,11 +16,11 @@ from pathlib import Path
 END = "end"
 
 
-class Guard:
-    """Knows which workers run.
+class Reaper:
+    """The cleaning process, which is told of each worker.
 
     Args:
-        folder: removed when the guard ends.
+        folder: removed when it ends.
 
     Raises:
         OSError: it cannot be started.
@@ -38,23 +38,23 @@ class Guard:
         )
 
     def started(self, pid: int) -> None:
-        """A worker, the first of its process group, is to be ended as well."""
-        self._tell(f"+{pid}")
+        """Register a worker, the leader of its process group."""
+        self._send(f"+{pid}")
 
     def ended(self, pid: int) -> None:
-        """A worker need not be ended any more."""
-        self._tell(f"-{pid}")
+        """Remove a worker that has ended."""
+        self._send(f"-{pid}")
 
     def close(self) -> None:
         """End the workers that run, and remove the folder."""
-        self._tell(END)  # a fork of this process may hold the pipe open
+        self._send(END)  # a fork of this process may hold the pipe open
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()
         self._process.wait()
-        shutil.rmtree(self._folder, ignore_errors=True)  # where the guard was killed
+        shutil.rmtree(self._folder, ignore_errors=True)  # where the reaper was killed
 
-    def _tell(self, line: str) -> None:
+    def _send(self, line: str) -> None:
         assert self._process.stdin is not None
         with suppress(OSError, ValueError):  # it is gone, or closed: the pool ends its workers itself
             print(line, file=self._process.stdin, flush=True)
@@ -70,7 +70,7 @@ def kill_group(pid: int) -> None:
 
 
 def watch(folder: str, lines: Iterable[str]) -> None:
-    """Know which workers run until ``END``, or until the process that writes the lines has ended; then end these."""
+    """Follow which workers run until ``END``, or until the process that writes the lines has ended; then end them."""
     running = set()
     for line in lines:
         if line.strip() == END:

@@ -89,7 +89,7 @@ ROADS = Grammar("Scene -> sky Roads\nRoads -> Road Roads | ε\nRoad -> road(Cars
 
 def two_roads():
     rules = torch.tensor([[0, 1, 3, 4, 5, 6, 1, 3, 4, 6, 2], [0, 2, *[-1] * 9]])  # a road of car bus, one of car
-    return SceneGraph(ROADS, Derivation.of(ROADS, rules))
+    return SceneGraph(ROADS, Derivation.from_rules(ROADS, rules))
 
 
 def test_a_scene_by_hand():

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
+from probscene.derivation import Frontier
 from probscene.grammar import Grammar, Node, Rule
 from probscene.policy import Policy
 from probscene.structure import StructurePrior, counts, ranked, weights
@@ -34,26 +35,26 @@ def named(symbols):
 def expand(grammar, choices, choose=None):
     """Expand the start symbol by recursive descent.
 
-    ``choices`` are the rules, leftmost first; ``choose(step, symbol, repeat, around, previous)`` gives them instead.
-    Returns nodes, steps ``(symbol, repeat, around)``, and the rules; None if the choices do not last.
+    ``choices`` are the rules, leftmost first; ``choose(step, symbol, index, parent_index, previous)`` gives them
+    instead. Returns nodes, steps ``(symbol, index, parent_index)``, and the rules; None if the choices do not last.
     """
     nodes, steps, rules = [], [], []
     lists = {rule.lhs for rule in grammar.rules if rule.lhs in named(rule.rhs)}
 
-    def grow(name, owner, repeat, around):
+    def grow(name, owner, index, parent_index):
         previous = rules[-1] if rules else -1
-        k = choose(len(rules), name, repeat, around, previous) if choose else choices[len(rules)]
+        k = choose(len(rules), name, index, parent_index, previous) if choose else choices[len(rules)]
         rule = grammar.rules[k]
         assert rule.lhs == name
         rules.append(k)
-        steps.append((name, repeat, around))
+        steps.append((name, index, parent_index))
         pending = []
         place(rule.rhs, owner, nodes, pending)
         for child, below in pending:
             if child == name:
-                grow(child, below, repeat + 1, around)
+                grow(child, below, index + 1, parent_index)
             else:
-                grow(child, below, 0, repeat if name in lists else around)
+                grow(child, below, 0, index if name in lists else parent_index)
 
     try:
         grow(grammar.rules[0].lhs, -1, 0, 0)
@@ -66,10 +67,9 @@ def log_probability(grammar, policy, choices):
     """The product of the probabilities of the rules, one scene, one step after the other, over the legal rules only."""
     total, memory = 0.0, policy.start(1)
     tree = expand(grammar, choices)
-    for t, (symbol, repeat, around) in enumerate(tree.steps):
-        state = [torch.tensor([x]) for x in (grammar.nonterminals.index(symbol), repeat, around)]
-        logits, memory = policy.step(memory, SimpleNamespace(symbol=state[0], repeat=state[1], parent_repeat=state[2]),
-                                     torch.tensor([choices[t - 1] if t else -1]))  # fmt: skip
+    for t, (symbol, index, parent_index) in enumerate(tree.steps):
+        state = [torch.tensor([x]) for x in (grammar.nonterminals.index(symbol), index, parent_index)]
+        logits, memory = policy.step(memory, Frontier(*state), torch.tensor([choices[t - 1] if t else -1]))
         logits = logits[0].double().tolist()
         legal = [k for k, rule in enumerate(grammar.rules) if rule.lhs == symbol]
         total += logits[choices[t]] - math.log(sum(math.exp(logits[k]) for k in legal))
@@ -98,7 +98,12 @@ class RandomPolicy(Policy):
         return torch.zeros(num_scenes, len(self.grammar.rules))
 
     def step(self, memory, frontier, previous_rule):
-        index = (frontier.symbol, frontier.repeat.clamp(max=2), frontier.parent_repeat.clamp(max=2), previous_rule + 1)
+        index = (
+            frontier.symbol,
+            frontier.list_index.clamp(max=2),
+            frontier.parent_list_index.clamp(max=2),
+            previous_rule + 1,
+        )
         logits = memory + sum(table[i] for table, i in zip(self.tables, index, strict=True))
         return logits, torch.tanh(logits @ self.past)
 

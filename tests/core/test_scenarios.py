@@ -90,7 +90,7 @@ def test_the_joint_grammar_spells_every_parts_derivations_and_no_others():
             own_grammar = (DISCS, BOXES)[number]
             again = enumerate_derivations(own_grammar, 6)
             assert sorted(map(str, rules_of(own.rules))) == sorted(map(str, rules_of(again.rules)))
-            again = type(own).of(own_grammar, own.rules)
+            again = type(own).from_rules(own_grammar, own.rules)
             M = again.kind.shape[1]
             assert torch.equal(again.kind, own.kind[:, :M]) and torch.equal(again.parent, own.parent[:, :M])
             for mine, theirs in zip(own.frontier, again.frontier, strict=True):
@@ -110,7 +110,7 @@ def test_log_prob_is_the_scenarios_weight_and_its_own_policys(drawn):
     derivation = enumerate_derivations(JOINT, 7)
     found = policy.log_prob(derivation)
     for i, number in enumerate(JOINT.scenario(derivation).tolist()):
-        own = type(derivation).of((DISCS, BOXES)[number], JOINT.own(derivation[i : i + 1], number).rules)
+        own = type(derivation).from_rules((DISCS, BOXES)[number], JOINT.own(derivation[i : i + 1], number).rules)
         weight = math.log((share or [1.0, 1.0])[number] / sum(share or [1.0, 1.0]))
         assert found[i].item() == pytest.approx(weight + parts[number].log_prob(own).item(), abs=1e-4)
 
@@ -158,7 +158,9 @@ def test_scenes_of_the_joint_model_are_those_of_the_scenarios():
     assert set(scenario.tolist()) == {0, 1}
     for number, (name, model) in enumerate(MODELS.items()):
         rows = (scenario == number).nonzero().flatten()
-        own = type(scenes.derivation).of(model.grammar, MODEL.grammar.own(scenes.derivation[rows], number).rules)
+        own = type(scenes.derivation).from_rules(
+            model.grammar, MODEL.grammar.own(scenes.derivation[rows], number).rules
+        )
         M = own.kind.shape[1]
         sites = [site for site in scenes.parameters if site.startswith(f"{name}/")]
         assert len(sites) == len(model.grammar.kinds)
@@ -237,7 +239,7 @@ def test_scenes_may_be_longer_than_a_scenarios_own_max_steps():
     short = replace(MODELS["discs"], max_steps=4)
     joint = join("both", {"discs": short, "boxes": MODELS["boxes"]})
     rows = torch.tensor([[0, *[2 + k for k in (0, 1, 1, 1, 1, 1, 1, 1, 1, 1, 2)]]])
-    derivation = type(enumerate_derivations(JOINT, 4)).of(joint.grammar, rows)
+    derivation = type(enumerate_derivations(JOINT, 4)).from_rules(joint.grammar, rows)
     scenes = run_program(joint, derivation)
     assert derivation.complete.all() and int(scenes.drawing.layers[1].present.sum()) == 9
 

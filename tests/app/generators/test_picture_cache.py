@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probscene.errors import GeneratorError, MachineError
-from probscene.renderers.generator.kept import Kept
+from probscene.renderers.generator.picture_cache import PictureCache
 from probscene.renderers.generator.pool import pool_for
 from probscene.renderers.generator.reply import Picture
 
@@ -40,7 +40,7 @@ def test_a_damaged_picture_is_taken_as_none_or_as_it_was(command, tmp_path):
         draw.random((16, 20), np.float32),
         draw.random((2, 4), np.float32),
     )
-    kept = Kept(tmp_path, command())
+    kept = PictureCache(tmp_path, command())
     kept.save(record, picture)
     file = kept.file(record)
     whole = file.read_bytes()
@@ -71,7 +71,7 @@ def test_a_damaged_picture_is_taken_as_none_or_as_it_was(command, tmp_path):
 )
 def test_a_picture_that_is_kept_has_the_shape_of_its_scene(command, tmp_path, changed, taken):
     record = {"height": 4, "width": 4, "seed": 1, "values": {}, "nodes": [{"id": 1, "kind": "mug", "values": {}}]}
-    kept = Kept(tmp_path, command())
+    kept = PictureCache(tmp_path, command())
     picture = Picture(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.int16), None, np.zeros((1, 4), np.float32))
     kept.save(record, picture._replace(**changed))
     assert (kept.load(record) is not None) == taken

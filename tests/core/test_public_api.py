@@ -83,7 +83,7 @@ def test_derive_is_the_function(order):
 
 
 def test_modules_of_other_names_are_there():
-    """A name of the face that is a module's, too, is the object; any other module is one."""
+    """A public name that is also a module's is the object; any other module is one."""
     import probscene.grammar
     import probscene.scene
 

@@ -1,4 +1,4 @@
-"""What a camera makes of an image, in 2D and in 3D: the values, where they may lie, and the sites they are drawn at.
+"""Camera effects on an image, in 2D and in 3D: their values, the limits of these, and the sites they are drawn at.
 
 Axis letter: N scenes.
 """
@@ -16,26 +16,25 @@ from .scene_sites import scene_site, seed_site
 MAX_BLUR = 64.0  # pixels
 CALL = "scene.photo(...)"
 
-Look = Tensor | float | tuple[float, float] | dist.Distribution
-"""A value, ``(N, 1)`` or a number; or what it is drawn from: the two ends of a uniform prior, or a distribution."""
+EffectValue = Tensor | float | tuple[float, float] | dist.Distribution
+"""A value, ``(N, 1)`` or a number; or its prior: the two ends of a uniform one, or a distribution."""
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
-    """What a camera makes of an image; all are numbers or broadcast to ``(N, 1)``. The defaults leave every byte as it
-    is; labels, and depth in 3D, never change.
+class CameraEffects:
+    """Camera effects on an image; all are numbers or broadcast to ``(N, 1)``. The defaults leave every byte as it is;
+    labels, and depth in 3D, never change.
 
-    The effects come in this order: vignette, exposure, gains, saturation and contrast, on sRGB in 0..1; blur; noise;
-    JPEG. What they are given and what they leave are bytes; only colours and noise without a blur between them are
-    rounded once.
+    The effects are applied in this order: vignette, exposure, gains, saturation and contrast, on sRGB in 0..1; blur;
+    noise; JPEG. Each reads and writes bytes, but colours and noise without a blur between them are rounded once.
 
     Args:
         exposure: factor of all light, 1 for as it is.
-        contrast: about the middle grey 0.5, 1 for as it is.
+        contrast: around the middle grey 0.5, 1 for as it is.
         saturation: 0 for grey, 1 for as it is; grey pixels stay as they are.
         red_gain, blue_gain: white balance, factors of red and of blue; that of green is the exposure's.
-        vignette: share of the light that is missing in the image's corners, 0..1, by the square of the distance from
-            the middle.
+        vignette: share of the light that is missing in the image's corners, 0..1; it grows with the square of the
+            distance from the middle.
         blur: standard deviation of a Gaussian, pixels, 0..64; the image's border is continued outward.
         noise: standard deviation, of 255, in each channel of each pixel for itself.
         jpeg_quality: 1..100, as of libjpeg, rounded; infinity for no JPEG. Colour is kept at half of the resolution.
@@ -54,18 +53,18 @@ class Photo:
     seed: Tensor | int = 0
 
 
-LIMITS = {field.name: (0.0, torch.inf) for field in fields(Photo) if field.name != "seed"} | {
+LIMITS = {field.name: (0.0, torch.inf) for field in fields(CameraEffects) if field.name != "seed"} | {
     "vignette": (0.0, 1.0),
     "blur": (0.0, MAX_BLUR),
     "jpeg_quality": (1.0, 100.0),
 }
 
 
-def check_photo(values: dict[str, Tensor]) -> None:
-    """See that the values of a ``Photo`` lie where they may.
+def check_camera_effects(values: dict[str, Tensor]) -> None:
+    """Check that the values of ``CameraEffects`` are within ``LIMITS``.
 
     Raises:
-        ModelError: one does not.
+        ModelError: one is not.
     """
     for name, (low, high) in LIMITS.items():
         value = values[name]
@@ -74,31 +73,31 @@ def check_photo(values: dict[str, Tensor]) -> None:
         if not ((value >= low) & (value <= high)).all():  # also where it is NaN
             worst = value[~((value >= low) & (value <= high))][0]
             raise ModelError(
-                f"expected Photo.{name} {_within(name)}, got {float(worst):g}; give scene.photo(...) a range or a "
-                "distribution that stays there."
+                f"expected CameraEffects.{name} {_within(name)}, got {float(worst):g}; give scene.photo(...) a range "
+                "or a distribution that stays there."
             )
 
 
-def sample_photo(num_scenes: int, looks: dict[str, Look | None]) -> Photo:
-    """A ``Photo`` whose values are sites ``photo.exposure`` and so on, one value a scene.
+def sample_camera_effects(num_scenes: int, given: dict[str, EffectValue | None]) -> CameraEffects:
+    """``CameraEffects`` whose values are sites ``photo.exposure`` and so on, one value a scene.
 
     Args:
-        looks: by name; those that are None keep the image as it is and have no site.
+        given: values and priors by name; those that are None keep the default and have no site.
 
     Raises:
-        ModelError: a range that is none or not within the limits, or a site whose shape is not ``(N, 1)``.
+        ModelError: something that is no range or not within the limits, or a site whose shape is not ``(N, 1)``.
     """
     values: dict[str, Any] = {}
     for name in LIMITS:  # the program's order of sites does not depend on the caller's
-        look = looks.get(name)
-        if isinstance(look, tuple | list | dist.Distribution):
-            prior = look if isinstance(look, dist.Distribution) else _uniform(name, look)
+        value = given.get(name)
+        if isinstance(value, tuple | list | dist.Distribution):
+            prior = value if isinstance(value, dist.Distribution) else _uniform(name, value)
             values[name] = scene_site(f"photo.{name}", num_scenes, prior, CALL)
-        elif look is not None:
-            values[name] = look
+        elif value is not None:
+            values[name] = value
     if "noise" in values:
         values["seed"] = seed_site("photo.seed", num_scenes, CALL)
-    return Photo(**values)
+    return CameraEffects(**values)
 
 
 def _uniform(name: str, ends: tuple[float, float] | list[float]) -> Any:

@@ -1,4 +1,4 @@
-"""What a program asks for while it runs: with which ``max_steps`` it derives, and whether the parents that it looks up
+"""What a program calls while it runs: the ``max_steps`` that it derives with, and parents that it reads and that do not
 exist.
 """
 
@@ -13,18 +13,18 @@ from probscene.relations import relations
 from probscene.sampling import Scenes
 
 
-class Watch(Messenger):
-    """An effect handler that notes what a program asks for.
+class CallRecorder(Messenger):
+    """An effect handler that records what a program calls.
 
     Attributes:
-        max_steps: that it derives the grammar with.
-        asked: whether it looks up values of parents.
-        found: whether any node has had one then.
+        max_steps: those that it derives the grammar with.
+        reads_parents: whether it reads values of parents.
+        has_parents: whether any node had a parent then.
     """
 
     def __init__(self, grammar: Grammar):
         super().__init__()
-        self.grammar, self.asked, self.found = grammar, False, False
+        self.grammar, self.reads_parents, self.has_parents = grammar, False, False
         self.max_steps: set[int] = set()
 
     def _pyro_derive(self, msg) -> None:
@@ -34,43 +34,43 @@ class Watch(Messenger):
 
     def _pyro_of_parent(self, msg) -> None:
         _, parent, _ = msg["args"]
-        self.asked = True
-        self.found |= bool((parent >= 0).any())
+        self.reads_parents = True
+        self.has_parents |= bool((parent >= 0).any())
 
 
-def watched(model: SceneModel, watch: Watch) -> SceneModel:
-    """The same model; what its program asks for is noted."""
+def recorded(model: SceneModel, recorder: CallRecorder) -> SceneModel:
+    """The same model; what its program calls is recorded."""
 
     @functools.wraps(model.program)
     def program(num_scenes, structure):
-        with watch:
+        with recorder:
             return model.program(num_scenes, structure)
 
     return replace(model, program=program)
 
 
-def shorter(model: SceneModel, watch: Watch) -> list[str]:
-    """The fault of a program that derives with a smaller ``max_steps`` than its model's."""
+def short_max_steps(model: SceneModel, recorder: CallRecorder) -> list[str]:
+    """Faults of a program that derives with a smaller ``max_steps`` than its model's."""
     return [
         f"The program derives with max_steps = {other} and the model says max_steps = {model.max_steps}: longer scenes "
         "would be cut short; give derive(...) the model's, or say it once with scene_model."
-        for other in sorted(watch.max_steps)
+        for other in sorted(recorder.max_steps)
         if other < model.max_steps
     ]
 
 
-def longer(model: SceneModel, watch: Watch) -> list[str]:
-    """What should be known of a program that derives with a larger ``max_steps`` than its model's."""
+def long_max_steps(model: SceneModel, recorder: CallRecorder) -> list[str]:
+    """Warnings of a program that derives with a larger ``max_steps`` than its model's."""
     return [
         f"The program derives with max_steps = {other} and the model says max_steps = {model.max_steps}, which counts; "
         "give derive(...) the model's, or say it once with scene_model."
-        for other in sorted(watch.max_steps)
+        for other in sorted(recorder.max_steps)
         if other > model.max_steps
     ]
 
 
-def lookups(model: SceneModel, watch: Watch, scenes: Scenes) -> list[str]:
-    """What a program reads of parents that its grammar does not give; ``scenes`` are some of it."""
+def missing_parents(model: SceneModel, recorder: CallRecorder, scenes: Scenes) -> list[str]:
+    """Warnings of parents' values that a program reads and its grammar does not give; ``scenes`` are some of its."""
     grammar = model.grammar
     parents = {parent for parent, _ in relations(grammar)}
     for rule in grammar.rules:
@@ -81,14 +81,17 @@ def lookups(model: SceneModel, watch: Watch, scenes: Scenes) -> list[str]:
                 continue
             is_list = bool(grammar.recursive[grammar.nonterminals.index(after)])
             grouped = model.groups is not None and model.groups.kind == symbol
-            if grouped or (watch.asked and (not watch.found or (is_list and _has_sites(grammar, scenes, symbol)))):
+            if grouped or (
+                recorder.reads_parents
+                and (not recorder.has_parents or (is_list and _has_sites(grammar, scenes, symbol)))
+            ):
                 right = " ".join(map(str, (*rule.rhs[:i], Node(symbol, (after,)), *rule.rhs[i + 2 :])))
                 who = "groups are counted by it" if grouped else "scene.of_parent finds no parent there"
                 return [
                     f"In '{rule}' what {after} derives stands beside {symbol!r} and not below it, and {who}; if it "
                     f"belongs to {symbol!r}, write '{rule.lhs} -> {right}'."
                 ]
-    if watch.asked and not watch.found:
+    if recorder.reads_parents and not recorder.has_parents:
         return [
             "The program reads values of parents (scene.of_parent), and no object has a parent; make children with "
             "brackets, such as 'Plate -> plate(Mugs)'."

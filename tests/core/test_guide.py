@@ -95,7 +95,7 @@ def test_log_prob_is_the_mean_over_the_latent_vectors_of_a_plain_lstm(reference,
 @given(guides(LISTS))
 def test_what_q_lacks_to_one_is_not_complete_after_max_steps(guide):
     every = enumerate_derivations(LISTS, 7)
-    unfinished = Derivation.of(LISTS, torch.tensor(prefixes(LISTS, 7)))
+    unfinished = Derivation.from_rules(LISTS, torch.tensor(prefixes(LISTS, 7)))
     assert every.complete.all() and not unfinished.complete.any()
     ended, rest = (guide.log_prob(d).double().exp().sum().item() for d in (every, unfinished))
     assert ended + rest == pytest.approx(1, abs=1e-5)

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyro import poutine
 
+from probscene.camera_effects import LIMITS, CameraEffects
 from probscene.derivation import Derivation
 from probscene.drawing import Sprites
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.joining import join_drawings
 from probscene.model import scene_model
-from probscene.photo import LIMITS, Photo
 from probscene.sampling import run_program, sample
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts
@@ -33,7 +33,7 @@ NAMES = st.lists(st.sampled_from(sorted(RANGES)), unique=True)
 
 
 def scene_of(N=3):
-    return SceneGraph(DISCS, Derivation.of(DISCS, torch.tensor([[0, 1, 1, 2]] * N)))
+    return SceneGraph(DISCS, Derivation.from_rules(DISCS, torch.tensor([[0, 1, 1, 2]] * N)))
 
 
 def traced(N=3, **looks):
@@ -59,7 +59,7 @@ def test_what_is_asked_for_and_nothing_else_has_a_site(names):
             assert value.shape == (4, 1) and torch.equal(value, sites[f"photo.{name}"]["value"])
             assert ((value >= RANGES[name][0]) & (value <= RANGES[name][1])).all()
         else:
-            assert value == getattr(Photo(), name)
+            assert value == getattr(CameraEffects(), name)
 
 
 def test_sites_come_in_one_order():
@@ -80,36 +80,36 @@ def test_numbers_and_tensors_have_no_site_and_distributions_have():
 
 
 def test_the_default_photo_has_every_value_once_a_scene():
-    photo = resolve_scene(Photo(), 5)
+    photo = resolve_scene(CameraEffects(), 5)
     assert all(getattr(photo, field.name).shape == (5,) for field in fields(photo))
     assert photo.seed.dtype == torch.int64 and (photo.jpeg_quality == torch.inf).all()
-    assert set(LIMITS) == {field.name for field in fields(Photo)} - {"seed"}
+    assert set(LIMITS) == {field.name for field in fields(CameraEffects)} - {"seed"}
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"blur": -1.0}, r"Photo.blur within 0..64, got -1;"),
-        ({"blur": 65.0}, "Photo.blur within 0..64, got 65;"),
-        ({"blur": float("nan")}, "finite values in Photo.blur"),
-        ({"jpeg_quality": 0.0}, "Photo.jpeg_quality within 1..100, or infinity for no JPEG, got 0;"),
+        ({"blur": -1.0}, r"CameraEffects.blur within 0..64, got -1;"),
+        ({"blur": 65.0}, "CameraEffects.blur within 0..64, got 65;"),
+        ({"blur": float("nan")}, "finite values in CameraEffects.blur"),
+        ({"jpeg_quality": 0.0}, "CameraEffects.jpeg_quality within 1..100, or infinity for no JPEG, got 0;"),
         ({"jpeg_quality": 101.0}, "jpeg_quality within 1..100.*got 101;"),
         ({"jpeg_quality": float("nan")}, "jpeg_quality within 1..100.*got nan;"),
         ({"jpeg_quality": -torch.inf}, "jpeg_quality within 1..100.*got -inf;"),
-        ({"exposure": -0.5}, "Photo.exposure of at least 0, got -0.5;"),
-        ({"noise": float("inf")}, "finite values in Photo.noise"),
-        ({"vignette": 1.5}, "Photo.vignette within 0..1, got 1.5;"),
-        ({"contrast": torch.ones(2, 4)}, r"Photo.contrast to broadcast to \(2, 1\), got shape \(2, 4\)"),
-        ({"seed": torch.zeros(3, 1)}, r"Photo.seed to broadcast to \(2, 1\)"),
-        ({"red_gain": torch.tensor([[1.0], [-1.0]])}, "Photo.red_gain of at least 0, got -1;"),
+        ({"exposure": -0.5}, "CameraEffects.exposure of at least 0, got -0.5;"),
+        ({"noise": float("inf")}, "finite values in CameraEffects.noise"),
+        ({"vignette": 1.5}, "CameraEffects.vignette within 0..1, got 1.5;"),
+        ({"contrast": torch.ones(2, 4)}, r"CameraEffects.contrast to broadcast to \(2, 1\), got shape \(2, 4\)"),
+        ({"seed": torch.zeros(3, 1)}, r"CameraEffects.seed to broadcast to \(2, 1\)"),
+        ({"red_gain": torch.tensor([[1.0], [-1.0]])}, "CameraEffects.red_gain of at least 0, got -1;"),
     ],
 )
 def test_photos_that_cannot_be(values, message):
     scene = scene_of(2)
     with pytest.raises(ModelError, match=message):
-        scene.draw(Sprites.disc("disc", 1.0, 1.0, 1.0), photo=Photo(**values))
+        scene.draw(Sprites.disc("disc", 1.0, 1.0, 1.0), photo=CameraEffects(**values))
     with pytest.raises(ModelError, match=message):
-        scene.build(camera=Camera(), photo=Photo(**values))
+        scene.build(camera=Camera(), photo=CameraEffects(**values))
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_a_drawing_carries_its_photo_through_programs_and_slices():
     assert torch.equal(photo.exposure, scenes.parameters["photo.exposure"][:, 0])
     again = run_program(discs, scenes.derivation, scenes.parameters).drawing.photo
     some = scenes.drawing[2:5].photo
-    for field in fields(Photo):
+    for field in fields(CameraEffects):
         value = getattr(photo, field.name)
         assert torch.equal(getattr(again, field.name), value) and torch.equal(getattr(some, field.name), value[2:5])
     plain = replace(scenes.drawing, photo=None)
@@ -169,7 +169,7 @@ def test_joined_drawings_keep_their_photos():
     with_photo, plain = scenes.drawing, replace(scenes.drawing, photo=None)
     kind = with_photo.kind
     joined = join_drawings(kind, DISCS.kinds, [(own, with_photo), (~own, plain)]).photo
-    for field in fields(Photo):
-        value, default = getattr(with_photo.photo, field.name), getattr(Photo(), field.name)
+    for field in fields(CameraEffects):
+        value, default = getattr(with_photo.photo, field.name), getattr(CameraEffects(), field.name)
         assert torch.equal(getattr(joined, field.name), torch.where(own, value, default))
     assert join_drawings(kind, DISCS.kinds, [(own, plain), (~own, plain)]).photo is None

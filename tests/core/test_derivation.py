@@ -14,7 +14,7 @@ from probscene.derive import derive, derive_complete
 from probscene.errors import GrammarError, ModelError, SamplingError
 from probscene.grammar import Grammar
 from probscene.policy import Policy, cumulative, rule_log_probs
-from probscene.rules import Inverse, drawn
+from probscene.rules import InverseCDF, drawn
 from probscene.structure import StructurePrior, counts, weights
 
 N, T = 16, 24
@@ -120,7 +120,7 @@ def test_a_rule_that_is_looked_up_in_a_table_is_the_one_that_its_row_draws(prior
     pyro.set_rng_seed(seed)
     expected = drawn(shares[row])
     pyro.set_rng_seed(seed)
-    assert Inverse.of(prior).drawn(row.numpy()).tolist() == expected.tolist()
+    assert InverseCDF.from_prior(prior).drawn(row.numpy()).tolist() == expected.tolist()
 
 
 def test_more_steps_than_a_stack_can_count_are_refused():
@@ -145,12 +145,12 @@ def test_replay_and_condition_give_the_same_scenes(policy, seed):
 @given(ANY_POLICY, SEED)
 def test_a_scene_does_not_depend_on_its_batch(policy, seed):
     grammar, (_, derivation) = policy.grammar, traced(policy, seed)
-    assert same(Derivation.of(grammar, derivation.rules), derivation)
+    assert same(Derivation.from_rules(grammar, derivation.rules), derivation)
     for i in range(0, N, 5):
-        alone = Derivation.of(grammar, torch.tensor([own(derivation.rules[i])]))
+        alone = Derivation.from_rules(grammar, torch.tensor([own(derivation.rules[i])]))
         assert same(alone, derivation[i : i + 1])
     order = torch.arange(N).flip(0)
-    assert same(Derivation.of(grammar, derivation.rules[order]), derivation[order])
+    assert same(Derivation.from_rules(grammar, derivation.rules[order]), derivation[order])
 
 
 @given(ANY_POLICY, SEED)
@@ -162,21 +162,21 @@ LIST = Grammar("Scene -> Items\nItems -> x Items | ε")
 
 
 def test_derivation_of_refuses_rules_that_do_not_fit():
-    fine = Derivation.of(LIST, torch.tensor([[0, 1, 2], [0, 2, -1]]))
+    fine = Derivation.from_rules(LIST, torch.tensor([[0, 1, 2], [0, 2, -1]]))
     assert fine.complete.all() and fine.kind.tolist() == [[0], [-1]]
     with pytest.raises(GrammarError, match="rule of Items at step 1 of scene 1, got 0"):
-        Derivation.of(LIST, torch.tensor([[0, 2], [0, 0]]))
+        Derivation.from_rules(LIST, torch.tensor([[0, 2], [0, 0]]))
     with pytest.raises(GrammarError, match="end of the derivation at step 2"):
-        Derivation.of(LIST, torch.tensor([[0, 2, 2], [0, 1, 2]]))
+        Derivation.from_rules(LIST, torch.tensor([[0, 2, 2], [0, 1, 2]]))
 
 
 def test_derivation_of_refuses_rules_after_padding_and_rules_that_are_none():
     with pytest.raises(GrammarError, match="padding"):
-        Derivation.of(LIST, torch.tensor([[0, -1, 2]]))
+        Derivation.from_rules(LIST, torch.tensor([[0, -1, 2]]))
     with pytest.raises(GrammarError, match="among 0..2"):
-        Derivation.of(LIST, torch.tensor([[0, 3]]))
+        Derivation.from_rules(LIST, torch.tensor([[0, 3]]))
     with pytest.raises(GrammarError, match="among 0..2"):
-        Derivation.of(LIST, torch.tensor([[0, -2]]))
+        Derivation.from_rules(LIST, torch.tensor([[0, -2]]))
 
 
 def test_logits_that_are_not_finite_are_named():
@@ -193,18 +193,18 @@ def test_logits_that_are_not_finite_are_named():
 
 def test_rules_that_stop_early_derive_no_more():
     grammar = Grammar("Scene -> sky Plates\nPlates -> plate Plates | ε")
-    derivation = Derivation.of(grammar, torch.tensor([[0, 1, -1, -1], [0, 1, 1, 2]]))
+    derivation = Derivation.from_rules(grammar, torch.tensor([[0, 1, -1, -1], [0, 1, 1, 2]]))
     assert derivation.complete.tolist() == [False, True]
     assert derivation.kind.tolist() == [[0, 1, -1], [0, 1, 1]]
 
 
 def test_incomplete_derivations_say_so():
-    derivation = Derivation.of(LIST, torch.tensor([[0, 1, 1, 2], [0, 1, 1, 1], [0, 2, -1, -1], [0, 1, -1, -1]]))
+    derivation = Derivation.from_rules(LIST, torch.tensor([[0, 1, 1, 2], [0, 1, 1, 1], [0, 2, -1, -1], [0, 1, -1, -1]]))
     assert derivation.complete.tolist() == [True, False, True, False]
     assert derivation.lengths.tolist() == [4, 4, 2, 2]
     finished, left = len(LIST.nonterminals), LIST.nonterminals.index("Items")
     assert derivation.frontier.symbol[2:].tolist() == [[0, left, finished, finished], [0, left, left, left]]
-    assert derivation.frontier.repeat[2:].tolist() == [[0, 0, 0, 0], [0, 0, 1, 1]]
+    assert derivation.frontier.list_index[2:].tolist() == [[0, 0, 0, 0], [0, 0, 1, 1]]
 
 
 def test_derive_complete_redraws_what_is_too_long():

@@ -6,11 +6,11 @@ import pyro.distributions as dist
 import pytest
 import torch
 
+from probscene.camera_effects import CameraEffects
 from probscene.derive import derive
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.mesh import Mesh, Surface
-from probscene.photo import Photo
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts
 from probscene.world import KITTI_FOCAL, Camera, Ground, Light, Meshes
@@ -134,7 +134,7 @@ def test_grounds_that_cannot_be():
         build([[-1.0, 0.0, 1.0]], [[0, 0, 0]])
     with pytest.raises(ModelError, match=r"surface in 0..0, got 0..1"):
         build([[-1.0, 1.0]], [[0, 1, 0]])
-    assert Light().sun > 0 and Photo().noise == 0
+    assert Light().sun > 0 and CameraEffects().noise == 0
 
 
 def test_surfaces_that_are_none():

@@ -1,4 +1,4 @@
-"""Structure priors: length distributions exactly, by enumeration; ranks of the list around; errors."""
+"""Structure priors: length distributions exactly, by enumeration; parent list indices; errors."""
 
 import pytest
 import torch
@@ -10,8 +10,7 @@ from probscene.enumeration import enumerate_derivations
 from probscene.errors import GrammarError
 from probscene.grammar import Grammar
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.structure import StructurePrior, counts, hazards, ranked, weights
-from probscene.support import Support
+from probscene.structure import StructurePrior, counts, hazards, ranked, support_of_policies, weights
 
 LIST = Grammar("Scene -> bg Items\nItems -> x Items | y Items | ε")
 ROADS = Grammar("Scene -> Roads\nRoads -> Road Roads | ε\nRoad -> road(Cars)\nCars -> car Cars | ε")
@@ -129,7 +128,7 @@ def test_what_is_not_named_is_uniform():
 def test_beyond_the_last_length_a_list_stops():
     grammar = Grammar("Scene -> A B\nA -> x A | ε\nB -> y B | ε")
     prior = StructurePrior(grammar, A=counts(0, 1), B=counts(0, 0, 0, 1))
-    too_long = Derivation.of(grammar, torch.tensor([[0, 1, 1, 2, 3, 3, 3, 4], [0, 1, 2, 3, 3, 3, 4, -1]]))
+    too_long = Derivation.from_rules(grammar, torch.tensor([[0, 1, 1, 2, 3, 3, 3, 4], [0, 1, 2, 3, 3, 3, 4, -1]]))
     assert prior.log_prob(too_long).tolist() == [-torch.inf, 0.0]
 
 
@@ -185,30 +184,32 @@ def enumerate_derivations_or_skip(grammar):
 
 
 def test_a_production_may_depend_on_how_far_its_list_is():
-    """No two of a kind in a row, by whether the repeat is even: exactly the derivations that a person would list."""
+    """No two of a kind in a row, by whether the list index is even: exactly the derivations a person would list."""
     prior = StructurePrior(LIST, Items=counts(1, 1, 1, 1))
 
-    def legal(production, repeat, rank):
-        return production != ("Items -> y Items" if repeat % 2 == 0 else "Items -> x Items")
+    def legal(production, index, parent_index):
+        return production != ("Items -> y Items" if index % 2 == 0 else "Items -> x Items")
 
     x, y = LIST.kind("x"), LIST.kind("y")
     found = distribution(
-        prior.where(legal, repeats=4), 6, lambda some, i: tuple(some.kind[i][some.kind[i] > 0].tolist())
+        prior.where(legal, list_indices=4), 6, lambda some, i: tuple(some.kind[i][some.kind[i] > 0].tolist())
     )
     assert found == pytest.approx({(x, y, x)[:n]: 0.25 for n in range(4)}, abs=1e-6)
 
 
-def test_a_production_may_depend_on_the_rank_around():
+def test_a_production_may_depend_on_the_parent_list_index():
     prior = StructurePrior(ROADS, Roads=counts(0, 0, 1), Cars=counts(1, 1))
-    no_first = prior.where(lambda production, _, rank: rank > 0 or production != "Cars -> car Cars", ranks=2)
+    no_first = prior.where(
+        lambda production, _, parent_index: parent_index > 0 or production != "Cars -> car Cars", parent_list_indices=2
+    )
     assert distribution(no_first, 12, times(ROADS.kind("car"))) == pytest.approx({0: 0.5, 1: 0.5}, abs=1e-6)
     assert (distribution(prior, 12, times(ROADS.kind("car")))).keys() == {0, 1, 2}
 
 
 def test_a_guide_keeps_to_what_is_legal():
     prior = StructurePrior(LIST, Items=counts(1, 1, 1))
-    first_is_x = prior.where(lambda production, repeat, _: repeat > 0 or "y" not in production, repeats=2)
-    support = Support.of(LIST, [first_is_x])
+    first_is_x = prior.where(lambda production, index, _: index > 0 or "y" not in production, list_indices=2)
+    support = support_of_policies(LIST, [first_is_x])
     guide = LSTMGuide(LIST, 6)
     guide.support = support
     every = enumerate_derivations(LIST, 6)
@@ -221,9 +222,9 @@ def test_a_guide_keeps_to_what_is_legal():
 
 def test_what_leaves_nothing_or_says_nothing_is_named():
     prior = StructurePrior(LIST, Items=counts(1, 1))
-    with pytest.raises(GrammarError, match="of Items that is legal after 1 repeats at rank 0"):
-        prior.where(lambda production, repeat, _: repeat < 1 or "ε" not in production, repeats=2)
-    with pytest.raises(GrammarError, match="not legal somewhere, got all legal up to repeat 0"):
+    with pytest.raises(GrammarError, match="of Items that is legal at list index 1 and parent list index 0"):
+        prior.where(lambda production, index, _: index < 1 or "ε" not in production, list_indices=2)
+    with pytest.raises(GrammarError, match="not legal somewhere, got all legal up to list index 0"):
         prior.where(lambda *_: True)
 
 
@@ -235,7 +236,7 @@ def test_a_list_stays_as_long_where_one_production_that_goes_on_is_left(probs, s
     assume(not keep.all())
     names = ("Items -> x Items", "Items -> y Items")
     legal = {name: keep[:, i].tolist() for i, name in enumerate(names)}
-    made = prior.where(lambda production, repeat, _: legal.get(production, [True] * 9)[repeat], repeats=len(probs))
+    made = prior.where(lambda production, index, _: legal.get(production, [True] * 9)[index], list_indices=len(probs))
 
     def length(some, i):
         return int((some.kind[i] > 0).sum())

@@ -206,7 +206,7 @@ def test_complete_derivations_are_those_that_their_rules_spell(seed, num_scenes,
     seed_everything(seed)
     derivation, failures = derive_complete(GRAMMAR, PRIOR, num_scenes, max_steps)
     for some in (derivation, derivation[failures == 0].trimmed(), derivation[:1].trimmed()):
-        spelt = Derivation.of(GRAMMAR, some.rules)
+        spelt = Derivation.from_rules(GRAMMAR, some.rules)
         for name in ("rules", "complete", "kind", "parent"):
             assert torch.equal(getattr(some, name), getattr(spelt, name))
         assert all(map(torch.equal, some.frontier, spelt.frontier))

@@ -1,4 +1,4 @@
-"""The house rules: who imports whom, what is installed, what no file may name."""
+"""The layers: who imports whom, what is installed, what no file may name."""
 
 import ast
 import importlib
@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from graphlib import TopologicalSorter
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -35,17 +35,18 @@ def library() -> dict[str, Path]:
     return modules
 
 
-def imported(path: Path, package: str = "") -> set[str]:
-    """Dotted names that a file imports anywhere in it, but for type checking; ``from a import b`` counts as ``a.b``.
+def imported(path: Path, package: str = "", type_checking: bool = False) -> set[str]:
+    """Dotted names that a file imports anywhere in it; ``from a import b`` counts as ``a.b``.
 
     Args:
         package: the installed name of the package that the file is in, from which its relative imports count.
+        type_checking: whether imports for type checkers alone count, too.
     """
     names, todo = set(), [ast.parse(path.read_text(encoding="utf-8"))]
     while todo:
         node = todo.pop()
         if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            todo += node.orelse
+            todo += ast.iter_child_nodes(node) if type_checking else node.orelse
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -59,8 +60,8 @@ def imported(path: Path, package: str = "") -> set[str]:
     return names
 
 
-def graph() -> dict[str, set[str]]:
-    """The library's modules, each with those that it imports."""
+def graph(type_checking: bool = False) -> dict[str, set[str]]:
+    """The library's modules, each with those that it imports; see ``imported``."""
     modules = library()
 
     def module(name):
@@ -68,7 +69,10 @@ def graph() -> dict[str, set[str]]:
             name = name.rpartition(".")[0]
         return name
 
-    return {name: {module(x) for x in imported(path, package_of(name, path))} - {""} for name, path in modules.items()}
+    return {
+        name: {module(x) for x in imported(path, package_of(name, path), type_checking)} - {"", name}
+        for name, path in modules.items()
+    }
 
 
 def package_of(module: str, path: Path) -> str:
@@ -76,21 +80,46 @@ def package_of(module: str, path: Path) -> str:
     return module if path.name == "__init__.py" else module.rpartition(".")[0]
 
 
-def floor(module: str) -> str:
-    """The folder that a module belongs to: probscene.app, a spoke, or the hub."""
-    rooms = [room for room in ("probscene.app", *PACKAGES) if f"{module}.".startswith(f"{room}.")]
-    return max(rooms, key=len)
+def layer(module: str) -> str:
+    """The package that a module belongs to: the application, models, renderers, inference, or the core."""
+    packages = [package for package in ("probscene.app", *PACKAGES) if f"{module}.".startswith(f"{package}.")]
+    return max(packages, key=len)
 
 
-def test_no_import_circle():
-    TopologicalSorter(graph()).prepare()
+def circle(graph: dict[str, set[str]]) -> list[str]:
+    """A circle of a graph; empty where there is none."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def without_entry_points(graph: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Without the public API, which names all layers, and the start of the command line."""
+    entry_points = {"probscene", "probscene.__main__"}
+    return {name: used - entry_points for name, used in graph.items() if name not in entry_points}
+
+
+def test_no_circle_of_files():
+    assert not circle(graph())
+    assert not circle(without_entry_points(graph(type_checking=True)))
+
+
+def test_no_circle_of_folders():
+    """A folder and its subfolders are two."""
+    modules, folders = library(), {}
+    for name, used in without_entry_points(graph()).items():
+        folder = modules[name].parent
+        folders.setdefault(folder, set()).update({modules[one].parent for one in used} - {folder})
+    assert not circle(folders)
 
 
 def test_imports_only_go_down():
     for module, uses in graph().items():
-        is_roof = floor(module) == "probscene.app" or module == "probscene.__main__"  # which starts the command line
-        allowed = {"probscene.app", *PACKAGES} if is_roof else {"probscene", floor(module)}
-        assert {floor(used) for used in uses} <= allowed, module
+        is_top = layer(module) == "probscene.app" or module == "probscene.__main__"  # which starts the command line
+        allowed = {"probscene.app", *PACKAGES} if is_top else {"probscene", layer(module)}
+        assert {layer(used) for used in uses} <= allowed, module
 
 
 def test_imports_inside_a_folder_are_relative_and_all_others_are_not():
@@ -99,10 +128,10 @@ def test_imports_inside_a_folder_are_relative_and_all_others_are_not():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.level:
                 stem = package_of(module, path).split(".")
-                assert floor(".".join(stem[: len(stem) - node.level + 1])) == floor(module), (module, ast.unparse(node))
+                assert layer(".".join(stem[: len(stem) - node.level + 1])) == layer(module), (module, ast.unparse(node))
             elif isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "probscene":
                 names = {f"{node.module}.{alias.name}" for alias in node.names} - {"probscene.__version__"}
-                assert floor(module) not in {floor(name) for name in names}, (module, ast.unparse(node))
+                assert layer(module) not in {layer(name) for name in names}, (module, ast.unparse(node))
             elif isinstance(node, ast.Import | ast.ImportFrom):
                 first = {alias.name for alias in node.names} if isinstance(node, ast.Import) else {node.module}
                 assert not {name.split(".")[0] for name in first} & {"models", "renderers", "inference"}, module

@@ -17,7 +17,7 @@ from probscene.drawing import Atlas, Sprites, disc, resolve
 from probscene.errors import GrammarError, ModelError
 from probscene.grammar import Grammar
 from probscene.model import SceneModel, SceneProgram, scene_model
-from probscene.program_errors import LONGEST, useful_text
+from probscene.program_errors import MAX_MESSAGE_LENGTH, useful_text
 from probscene.sampling import run_program, sample
 from probscene.scenarios import join
 from probscene.structure import StructurePrior, counts, ranked, weights
@@ -138,7 +138,7 @@ def test_a_bug_of_probscene_stays_one(monkeypatch):
 @given(st.text(max_size=1000))
 def test_useful_text_is_one_short_line(text):
     told = useful_text(ValueError(f"{text}\nTrace Shapes:\n  x | 4 5"))
-    assert told and len(told.splitlines()) == 1 and len(told) <= LONGEST + 3 and "4 5" not in told
+    assert told and len(told.splitlines()) == 1 and len(told) <= MAX_MESSAGE_LENGTH + 3 and "4 5" not in told
 
 
 SPRITE = disc(8)
