@@ -34,8 +34,8 @@ from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.inference.guides.base import Guide
 from probscene.inference.guides.scenario import guide_of
-from probscene.inference.learn import Trainer
 from probscene.inference.pretrain import pretrain
+from probscene.inference.structure_training import StructureTraining
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.policy import Policy
@@ -79,7 +79,7 @@ def learn(model: SceneModel, channel: Channel, real: Tensor, chosen: Preset, see
     pretrain(guide, start, chosen.pretrain_derivations, chosen.pretrain_epochs, learning_rate=chosen.pretrain_rate)
     scenes, images, rate = chosen.num_scenes, chosen.num_real, chosen.learning_rate
     seeds = batch_seed(seed, 3)
-    Trainer(model, guide, objective, real, chosen.batches, scenes, images, rate, chosen.cosine, seeds).run()
+    StructureTraining(model, guide, objective, real, chosen.batches, scenes, images, rate, chosen.cosine, seeds).run()
     return guide
 
 

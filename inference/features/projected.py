@@ -13,12 +13,12 @@ from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 
 from ..divergence import self_share
-from ..training import Report, batch_seed
+from ..training import Callback, batch_seed
 from .base import Features, Photographs, Renders, slow_settings
 from .names import network_name
 from .projection import Projected, discriminant
 
-DRAWN_AT_ONCE = 64  # structures
+STRUCTURES_PER_CALL = 64
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ class ProjectedFeatures(Features):
 
 
 class ProjectionTraining:
-    """Finds the projection from two renders of each of some structures; what is interrupted begins again.
+    """A ``Training`` that finds the projection from two renders of each of some structures. There is nothing to resume:
+    one that was interrupted begins again.
 
     Args:
         net: its projection is set.
@@ -91,8 +92,8 @@ class ProjectionTraining:
         self.directions, self.scenes, self.done = directions, scenes, 0
         self._line: dict[str, Any] = {}
 
-    def run(self, each: Report | None = None) -> None:
-        """Draw, look, and find the projection; ``each`` hears its variance over noise at the end.
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``; the callback is given the variance over noise at the end.
 
         Raises:
             ProbsceneError: see ``discriminant``.
@@ -101,18 +102,19 @@ class ProjectionTraining:
             return
         seed_everything(self.seed)
         parts, self.done = [], 0
-        for first in range(0, self.total, DRAWN_AT_ONCE):
+        for first in range(0, self.total, STRUCTURES_PER_CALL):
             self.done = first
-            if each is not None:
-                each(self, {})
-            parts.append(self.renders.embed_twice(min(DRAWN_AT_ONCE, self.total - first), self.net.pretrained))
+            if callback is not None:
+                callback(self, {})
+            number = min(STRUCTURES_PER_CALL, self.total - first)
+            parts.append(self.renders.embed_twice(number, self.net.pretrained))
         one, other = (torch.cat(part) for part in zip(*parts, strict=True))
         self.net.projection = discriminant(one, other, self.directions, self.scenes)
         share = self_share(self.net.projection(other[: self.scenes]))
         ratio = self.net.ratio.tolist()
         self.done, self._line = self.total, {"stage": "projection", "ratio": ratio, "self_share": share}
-        if each is not None:
-            each(self, {"largest variance over noise": ratio[0], "least": ratio[-1], "own kernel's share": share})
+        if callback is not None:
+            callback(self, {"largest variance over noise": ratio[0], "least": ratio[-1], "own kernel's share": share})
 
     def summary(self) -> dict[str, Any]:
         """For the log: the variance over noise of each direction, and the share of a scene's own kernel."""

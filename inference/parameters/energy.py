@@ -26,7 +26,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from ..steps import StepTraining
+from ..training import AdamTraining
 from .graph import Graph
 from .likelihood import Values
 from .net import ParameterNet, begin, gathered
@@ -53,7 +53,7 @@ class OwnReadings(NamedTuple):
     which: Tensor
 
 
-class EnergyDistance(StepTraining):
+class EnergyDistance(AdamTraining):
     """Resumable training of a ``ParameterNet``; its loss is the squared energy distance.
 
     Args:
@@ -67,7 +67,7 @@ class EnergyDistance(StepTraining):
         seed: of everything random.
     """
 
-    what = "the parameters"
+    subject = "the parameters"
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class EnergyDistance(StepTraining):
         self.net, self.values, self.draw, self.scenes = net, values, draw, scenes
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         target = self.values.of(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
         own = self.draw(self.scenes)
         with _only(self.net, self.module):
@@ -95,7 +95,7 @@ class EnergyDistance(StepTraining):
         return found + 0 * sum(weight.sum() for weight in self.module.parameters())  # where nothing can be compared
 
 
-class WeightedEnergyDistance(StepTraining):
+class WeightedEnergyDistance(AdamTraining):
     """Resumable training of the last layers of some sites of scenes, from the prior.
 
     Its loss is the squared energy distance of each site's weighted readings from what is read in the target, each
@@ -112,7 +112,7 @@ class WeightedEnergyDistance(StepTraining):
         seed: of everything random.
     """
 
-    what = "the parameters"
+    subject = "the parameters"
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class WeightedEnergyDistance(StepTraining):
         self.sites = {g: WeightedRows.of(own.read, values, g) for g in sites}
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         with _only(self.net, self.module):
             return torch.stack([self._distance(g, rows) for g, rows in self.sites.items()]).sum()
 

@@ -26,7 +26,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
-from ..training import Report, Training, batch_seed, of_prefix
+from ..training import Callback, Training, batch_seed, of_prefix
 from .backbone import Backbone
 from .calibration import CalibratedReader
 from .checkpoint_selection import CheckpointSelector, HeldOutSet
@@ -108,12 +108,8 @@ class ParameterLearning:
         """The sites that can be read, in the order of the program; none before the reader was tried."""
         return tuple(site for site in self.sites if site in self.tried.good_sites)
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the steps that are left.
-
-        Raises:
-            ProbsceneError: a loss is no longer finite.
-        """
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``."""
         while self.phase < len(self.lengths):
             if self.tried.skill is None and self.phases[self.phase] == LIKELIHOOD:
                 self._try()
@@ -121,21 +117,21 @@ class ParameterLearning:
                 self.phase, self.done = len(self.lengths), self.total
                 return
             if not self._idle:
-                self._run_phase(each)
+                self._run_phase(callback)
             self.phase += 1
             self.done = sum(self.lengths[: self.phase])
 
-    def _run_phase(self, each: Report | None) -> None:
+    def _run_phase(self, callback: Callback | None) -> None:
         if self.phases[self.phase] == UNCLEAR and self.settled is None:
             self.settled = frozenset(self.settle(self, True))
         self.inner = self.inner or self._begun()
 
-        def heard(training: Training, told: dict[str, float]) -> None:
+        def relay(training: Training, report: dict[str, float]) -> None:
             self.done = sum(self.lengths[: self.phase]) + training.done
-            if each is not None:
-                each(self, told)
+            if callback is not None:
+                callback(self, report)
 
-        self.inner.run(heard)
+        self.inner.run(relay)
         self.inner = self.missing = None
         if self.phases[self.phase] in OF_GUIDE and self.best is not None and self.guide is not None:
             self.best.after(self.guide, frozenset((*self.settle(self, False), *self._unclear)))

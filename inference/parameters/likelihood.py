@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..steps import StepTraining
+from ..training import AdamTraining
 from .graph import Graph
 from .net import Conditioning, NodeSubset, ParameterNet
 from .reader import cut_draw
@@ -160,7 +160,7 @@ class _Sites:
         return self.net.given(self.graph, scene, nodes, s, some, self.ties)
 
 
-class MaximumLikelihood(StepTraining):
+class MaximumLikelihood(AdamTraining):
     """Resumable training of a ``ParameterNet``; its loss is in nats an image.
 
     Args:
@@ -172,7 +172,7 @@ class MaximumLikelihood(StepTraining):
         seed: of everything random.
     """
 
-    what = "the parameters"
+    subject = "the parameters"
 
     def __init__(
         self,
@@ -187,7 +187,7 @@ class MaximumLikelihood(StepTraining):
         self.net, self.values, self.images = net, values, images
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         some = self.values.of(torch.randperm(len(self.values.kind))[: self._number()])
         drawn, candidates = some.drawn(), 0 if self.done < ALONE * self.total else CANDIDATES
         others = [some.drawn() for _ in range(candidates)]

@@ -17,8 +17,7 @@ from probscene.sampling import seed_everything
 from ..features.base import Examples
 from ..features.counting.batches import STRIDE as CELL
 from ..features.counting.batches import cells, shares
-from ..steps import StepTraining
-from ..training import batch_seed
+from ..training import AdamTraining, batch_seed
 from .global_head import NUMBERS, GlobalHead, looks
 from .reader import Reader, value_loss
 from .schedule import EACH
@@ -54,7 +53,7 @@ class SupervisedBatch(NamedTuple):
         return SupervisedBatch(drawn, *(part[rows] for part in self[1:]))
 
 
-class ReaderTraining(StepTraining):
+class ReaderTraining(AdamTraining):
     """Resumable training.
 
     Args:
@@ -66,7 +65,7 @@ class ReaderTraining(StepTraining):
         seed: of everything random.
     """
 
-    what = "the reader"
+    subject = "the reader"
 
     def __init__(
         self,
@@ -85,11 +84,11 @@ class ReaderTraining(StepTraining):
         self.reader, self.draw, self.images = reader, draw, reader.eye.images_a_step(images)
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         return reader_loss(self.reader, self.draw(self.images))
 
 
-class GlobalHeadTraining(StepTraining):
+class GlobalHeadTraining(AdamTraining):
     """Resumable training of an ``GlobalHead``. In its first half renders are drawn, from all of which it learns.
 
     Args:
@@ -100,7 +99,7 @@ class GlobalHeadTraining(StepTraining):
         seed: of everything random.
     """
 
-    what = "the reader of scenes"
+    subject = "the reader of scenes"
 
     def __init__(
         self,
@@ -116,7 +115,7 @@ class GlobalHeadTraining(StepTraining):
         self.looks, self.u = torch.empty(renders, NUMBERS), torch.empty(renders, overall.sites)
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         state = torch.get_rng_state()
         while self.drawn < min(len(self.u), TOGETHER * (1 + self.done // APART)):  # again where it has been resumed
             self._draw()

@@ -8,7 +8,7 @@ from probscene.model import SceneModel
 
 from ...divergence import Blockwise, Divergence
 from ...training import Training, batch_seed
-from ..base import FeatureNet, Features, Photographs, Renders, Seen
+from ..base import FeatureNet, Features, ImageCallback, Photographs, Renders
 
 if TYPE_CHECKING:
     from .heads import PretrainedCountNet
@@ -62,11 +62,11 @@ class PretrainedCountFeatures(Features):
             heads, draw, self.pairs, self.epochs, photographs=images, seed=batch_seed(seed, 1)
         )
 
-    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
+    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], callback: ImageCallback) -> dict[str, Any]:
         """Choose how each class is read."""
         from .adapting import adapt
 
-        return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, each)
+        return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, callback)
 
     def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
         """Of things as chosen, of stuff none."""

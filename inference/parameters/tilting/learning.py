@@ -30,21 +30,20 @@ References:
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import root_scalar
 from scipy.spatial.distance import cdist
 from scipy.stats import chi2, false_discovery_control
-from torch import Tensor
+from torch import Tensor, nn
 
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
 from ...statistics.two_sample import Features
-from ...training import Report, batch_seed, check_finite, of_prefix
+from ...training import Callback, TrainingLoop, batch_seed, of_prefix
 from ..guide import ParameterGuide
 from ..likelihood import MaximumLikelihood, Values, log_density
 from ..net import ParameterNet
@@ -61,7 +60,7 @@ EXACT = 1e-6  # standard deviation of u that is known
 Look = Callable[[Tensor], Tensor]
 
 
-class TiltingLearning:
+class TiltingLearning(TrainingLoop):
     """A ``Training`` of a ``ParameterGuide``.
 
     Args:
@@ -83,6 +82,8 @@ class TiltingLearning:
     """
 
     unit = "rounds"
+    subject = "the parameters"
+    seed_path = (1,)
 
     def __init__(
         self,
@@ -94,7 +95,7 @@ class TiltingLearning:
         schedule: TiltingSchedule,
         seed: int = 0,
     ):
-        self.model, self.structure, self.looks, self.schedule, self.seed = model, structure, looks, schedule, seed
+        self.model, self.structure, self.looks, self.schedule = model, structure, looks, schedule
         self.real = [features.double().numpy() for features in real]
         seed_everything(batch_seed(seed, 0))
         self.sites = find_sites(model)
@@ -103,49 +104,36 @@ class TiltingLearning:
         self.guide = ParameterGuide(model, self.open_to, structure) if self.open_to else None
         self.dependence = torch.zeros(len(self.open_to), 2)
         self.chosen = torch.zeros(len(self.open_to), dtype=torch.bool)
-        self.total, self.done = schedule.rounds if self.open_to else 0, 0
+        net = nn.Module() if self.guide is None else self.guide.net
+        super().__init__(net, {}, schedule.rounds if self.open_to else 0, seed)
 
     @property
     def learnt(self) -> tuple[Site, ...]:
         """The sites that are chosen, in the order of the program."""
         return tuple(site for site, chosen in zip(self.open_to, self.chosen.tolist(), strict=True) if chosen)
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the rounds that are left; ``each`` hears the energy distance after every one.
-
-        Raises:
-            ProbsceneError: the loss is no longer finite.
-        """
-        self._pass()
-        while self.done < self.total:
-            assert self.guide is not None
-            seed_everything(batch_seed(self.seed, 1, self.done))
-            apart = self._round(self.guide)
-            self.done += 1
-            where = f"in round {self.done}"
-            check_finite(apart, self.guide.net.parameters(), "the parameters", where, "begin again with a lower rate")
-            if each is not None:
-                each(self, {"loss": apart})
-
-    def summary(self) -> dict[str, Any]:
-        """Nothing more for the log."""
-        return {}
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``."""
+        self._set_prior_sites()
+        super().run(callback)
 
     def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
-        net = {} if self.guide is None else self.guide.net.state_dict()
+        """See ``Training``."""
         own = {"done": torch.tensor(self.done), "chosen": self.chosen, "dependence": self.dependence}
-        return {key: value.clone() for key, value in (own | {f"guide.{key}": net[key] for key in net}).items()}
+        net = {f"guide.{key}": value for key, value in self.module.state_dict().items()}
+        return {key: value.clone() for key, value in (own | net).items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
+        """See ``Training``."""
         self.done, self.chosen = int(tensors["done"]), tensors["chosen"].clone()
         self.dependence = tensors["dependence"].clone()
-        if self.guide is not None:
-            self.guide.net.load_state_dict(of_prefix(tensors, "guide."))
+        self.module.load_state_dict(of_prefix(tensors, "guide."))
 
-    def _round(self, guide: ParameterGuide) -> float:
-        """The sum of the squared energy distances of the renders that were drawn, in units of the target's spread."""
+    def step(self) -> float:
+        """A round. Its loss is the sum of the squared energy distances of the renders that were drawn, in units of the
+        target's spread."""
+        guide = self.guide
+        assert guide is not None
         features, values = self._drawn(guide, self.schedule.scenes if self.done else self.schedule.first)
         each = [witness(own, real) for own, real in zip(features, self.real, strict=True)]
         freed = [beside_structure(values.kind, w) for w, _ in each]
@@ -153,7 +141,7 @@ class TiltingLearning:
         self.dependence += dependence(values.scene, w).where(~self.chosen.unsqueeze(1), 0.0)
         p = chi2.sf(self.dependence[:, 0].numpy(), self.dependence[:, 1].numpy().clip(min=1))
         self.chosen |= torch.from_numpy(false_discovery_control(p) < CHANCE)
-        self._pass()
+        self._set_prior_sites()
         if self.chosen.any():
             of = values.scene[:, self.chosen]
             v, sure = explained(of, together(of, freed))
@@ -161,7 +149,7 @@ class TiltingLearning:
             _Weighted(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
         return sum(apart for _, apart in each)
 
-    def _pass(self) -> None:
+    def _set_prior_sites(self) -> None:
         if self.guide is not None:
             self.guide.passed = frozenset(site.name for site in self.open_to if site not in self.learnt)
 
@@ -189,7 +177,7 @@ class _Weighted(MaximumLikelihood):
         self.weight, self.chosen = torch.from_numpy(weight), chosen
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         rows = torch.multinomial(self.weight, self._number(), replacement=True)
         return -log_density(self.net, self.values.of(rows))[:, self.chosen].sum(1).mean()
 

@@ -62,8 +62,8 @@ class Preset:
         pretrain_derivations, pretrain_epochs, pretrain_rate: maximum likelihood on the prior.
         on_prior: guides are pretrained on the prior itself and may take whatever the grammar has, as in the paper; else
             on the policy that the model names for it, within its support.
-        batches, num_scenes, num_real, updates, learning_rate, cosine: see ``Trainer`` and ``ScoreFunction``. With 0
-            batches structures stay those that guides are pretrained on, and parameters alone are learnt.
+        batches, num_scenes, num_real, updates, learning_rate, cosine: see ``StructureTraining`` and ``ScoreFunction``.
+            With 0 batches structures stay those that guides are pretrained on, and parameters alone are learnt.
         draws_per_structure: drawings of each structure, of which the clearest is looked at.
         reuse: renders of scenes of equal counts before one of them, at random, is taken again instead of a new one,
             for renderers that are slow; every scene is rendered where 0. See ``RenderCache``.

@@ -17,12 +17,12 @@ from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.guides.base import Guide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.parameters.reader_counts import ReaderCounts
 from probscene.inference.pretrain import pretrain
 from probscene.inference.render_cache import RenderCache
 from probscene.inference.statistics.bootstrap_test import bootstrap_test
+from probscene.inference.structure_training import StructureTraining
 from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
@@ -198,8 +198,8 @@ def _objective(
     pool: RenderCache | None,
 ) -> ScoreFunction:
     held = PriorCountPenalty(model, {*run.unread, *(model.stuff if run.readings else ())}, run.preset.num_scenes)
-    observe = held.beside(observe if pool is None else pool.around(observe))
-    return score_function(run.preset, model, observe, held.added_to(run.divergence(inner(net))), guide)
+    observe = held.append_counts(observe if pool is None else pool.wrap(observe))
+    return score_function(run.preset, model, observe, held.add_to(run.divergence(inner(net))), guide)
 
 
 def score_function(
@@ -234,13 +234,15 @@ def _trainer(
     rate: float,
     seed: int,
     pool: RenderCache | None,
-) -> Trainer:
+) -> StructureTraining:
     preset = run.preset
     scenes, images = preset.num_scenes, preset.num_real
-    return Trainer(model, guide, objective, real, batches, scenes, images, rate, preset.cosine, seed, pool)
+    return StructureTraining(model, guide, objective, real, batches, scenes, images, rate, preset.cosine, seed, pool)
 
 
-def _run(trainer: Trainer, keep: Checkpointer, stage: str, progress: Progress, crew: ActorPool | None) -> None:
+def _run(
+    trainer: StructureTraining, keep: Checkpointer, stage: str, progress: Progress, crew: ActorPool | None
+) -> None:
     def each(trainer: Training, diagnostics: dict[str, float]) -> None:
         keep({"stage": stage, **diagnostics})
         progress(stage, trainer.done, trainer.total, f"cost {diagnostics['cost']:.3f}")

@@ -104,9 +104,9 @@ def interrupted_at(training, stop):
     """A training's ``run`` that is interrupted after so many steps."""
     run = training.run
 
-    def interrupted(self, each=None):
+    def interrupted(self, callback=None):
         def heard(training, line):
-            each(training, line)
+            callback(training, line)
             if training.done >= stop:
                 raise KeyboardInterrupt
 
@@ -126,10 +126,10 @@ def test_a_fit_goes_on_to_the_same_bytes(both, of, stop, call, discs, target, tm
     anything_is_read(monkeypatch)
     with monkeypatch.context() as patch:
         if of == "Again":
-            trainer = structure.Trainer
+            trainer = structure.StructureTraining
             again = type("Again", (trainer,), {"run": interrupted_at(trainer, stop)})
             first = iter((trainer, again))
-            patch.setattr(structure, "Trainer", lambda *args, **named: next(first)(*args, **named))
+            patch.setattr(structure, "StructureTraining", lambda *args, **named: next(first)(*args, **named))
         else:
             patch.setattr(parameters.ParameterLearning, "run", interrupted_at(parameters.ParameterLearning, stop))
         assert call(*words).code != 0

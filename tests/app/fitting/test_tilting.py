@@ -84,9 +84,9 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, lit, discs, target, tmp_p
     monkeypatch.setattr(storage, "SAVE_EVERY", 0)
     run, out = learning.TiltingLearning.run, tmp_path / "run"
 
-    def interrupted(self, each=None):
+    def interrupted(self, callback=None):
         def heard(training, line):
-            each(training, line)
+            callback(training, line)
             if training.done == 2:
                 raise KeyboardInterrupt
 
