@@ -112,7 +112,7 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
     }
     row["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
     panels, tensors = [], run.read_tensors(NAME)
-    suits = learnt_by(run, run.guide, beside(tensors)).suited if tensors else None
+    suits = learnt_by(run, run.guide, beside(tensors)).with_parameters if tensors else None
     for source in SOURCES:
         policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
         policy.suits = suits if source in ("parameters", "both") else None

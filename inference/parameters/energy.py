@@ -27,15 +27,15 @@ import torch
 from torch import Tensor, nn
 
 from ..training import AdamTraining
-from .graph import Graph
+from .graph import SceneGraph
 from .likelihood import Values
-from .net import ParameterNet, begin, gathered
+from .net import ParameterNet, gather_nodes, init_to_prior
 
 ROWS = 400, 1600  # of the guide's and of the target's objects of a kind that are compared in a step, at most
 PLACE, NUMBER = 2.0, 4.0  # what one place among siblings and one object more count, in u
 
 
-class OwnReadings(NamedTuple):
+class GuideReadings(NamedTuple):
     """Scenes of a guide and what is read in their renders.
 
     Attributes:
@@ -73,7 +73,7 @@ class EnergyDistance(AdamTraining):
         self,
         net: ParameterNet,
         values: Values,
-        draw: Callable[[int], OwnReadings],
+        draw: Callable[[int], GuideReadings],
         noisy: Tensor,
         steps: int = 40,
         scenes: int = 100,
@@ -88,7 +88,7 @@ class EnergyDistance(AdamTraining):
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
-        target = self.values.of(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
+        target = self.values.select(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
         own = self.draw(self.scenes)
         with _only(self.net, self.module):
             found = energy_distance(moving(self.net, own, self.trained), target)
@@ -118,7 +118,7 @@ class WeightedEnergyDistance(AdamTraining):
         self,
         net: ParameterNet,
         values: Values,
-        own: OwnReadings,
+        own: GuideReadings,
         sites: list[int],
         steps: int = 300,
         learning_rate: float = 5e-3,
@@ -126,10 +126,10 @@ class WeightedEnergyDistance(AdamTraining):
     ):
         trained = nn.ModuleList(net.scene_out[g] for g in sites)
         for layer in trained:
-            begin(cast(nn.Linear, layer))
+            init_to_prior(cast(nn.Linear, layer))
         super().__init__(trained, torch.optim.Adam(trained.parameters(), lr=learning_rate), steps, seed)
-        self.net, self.own, self.graph = net, own, Graph.of(own.kind, own.parent)
-        self.sites = {g: WeightedRows.of(own.read, values, g) for g in sites}
+        self.net, self.own, self.graph = net, own, SceneGraph.from_nodes(own.kind, own.parent)
+        self.sites = {g: WeightedRows.from_readings(own.read, values, g) for g in sites}
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
@@ -156,7 +156,7 @@ class WeightedRows(NamedTuple):
     target: float
 
     @staticmethod
-    def of(own: Values, target: Values, g: int) -> "WeightedRows":
+    def from_readings(own: Values, target: Values, g: int) -> "WeightedRows":
         """Of a scene's site."""
         turns = own.turns[own.nodes.shape[2] :][g : g + 1]
         rows, others = (_placed(values.scene[:, g : g + 1].double(), turns) for values in (own, target))
@@ -182,11 +182,11 @@ def _only(net: nn.Module, part: nn.Module) -> Iterator[None]:
             weight.requires_grad_(had)
 
 
-def moving(net: ParameterNet, own: OwnReadings, trained: Sequence[bool]) -> Values:
+def moving(net: ParameterNet, own: GuideReadings, trained: Sequence[bool]) -> Values:
     """What is read, moving with what was drawn of the sites that are trained, see ``ParameterNet.moving``."""
-    scene, nodes = net.moving(Graph.of(own.kind, own.parent), own.scene, own.nodes, trained)
+    scene, nodes = net.reparameterise(SceneGraph.from_nodes(own.kind, own.parent), own.scene, own.nodes, trained)
     moved = (nodes - own.nodes).nan_to_num(0.0)
-    moved = gathered(moved, own.which).nan_to_num(0.0)
+    moved = gather_nodes(moved, own.which).nan_to_num(0.0)
     of_scene = (scene - own.scene).nan_to_num(0.0)
     return own.read._replace(nodes=own.read.nodes + moved, scene=own.read.scene + of_scene)
 
@@ -222,9 +222,9 @@ def site_rows(values: Values) -> tuple[Tensor, Tensor]:
 
 def _rows(values: Values) -> Tensor:
     """``(N, M, D)`` each object with its sibling before it, its place and their number."""
-    graph = Graph.of(values.kind, values.parent)
+    graph = SceneGraph.from_nodes(values.kind, values.parent)
     own = _placed(values.nodes, values.turns[: values.nodes.shape[2]])
-    before = gathered(own, graph.before).nan_to_num(0.0)
+    before = gather_nodes(own, graph.before).nan_to_num(0.0)
     place = torch.stack([PLACE * graph.rank, NUMBER * graph.number], -1).to(own.dtype)
     return torch.cat([own, before, place], -1)
 

@@ -20,9 +20,11 @@ from .graph import class_of
 from .reader import Detections
 from .reader_training import SupervisedBatch
 
-FEWEST = 20  # objects of a class that are found, and that are not, by which it is told
-TOLD = 0.03  # least Wasserstein-1 distance between u of what is found and of all by which finding goes by a site
-MOST = 4.0  # weight
+MIN_OBJECTS = 20  # objects of a class that are found, and that are not, by which it is told
+MIN_DISTANCE = (
+    0.03  # least Wasserstein-1 distance between u of what is found and of all by which finding goes by a site
+)
+MAX_WEIGHT = 4.0  # weight
 
 
 class MissedObjects(NamedTuple):
@@ -46,7 +48,7 @@ class MissedObjects(NamedTuple):
     rate: Tensor
 
     @staticmethod
-    def of(valued: SupervisedBatch, kinds: Tensor, found: Tensor, sites: Tensor) -> "MissedObjects":
+    def from_renders(valued: SupervisedBatch, kinds: Tensor, found: Tensor, sites: Tensor) -> "MissedObjects":
         """Of renders.
 
         Args:
@@ -58,7 +60,7 @@ class MissedObjects(NamedTuple):
         u, counts = valued.u[..., sites], torch.zeros(len(kinds), len(sites), dtype=torch.bool)
         for c in range(len(kinds)):
             of_class, here = label == c, found & (label == c)
-            if FEWEST <= int(here.sum()) <= int(of_class.sum()) - FEWEST:
+            if MIN_OBJECTS <= int(here.sum()) <= int(of_class.sum()) - MIN_OBJECTS:
                 counts[c] = torch.tensor([_told(u[..., s][here], u[..., s][of_class]) for s in range(len(sites))])
         n, m = ((label >= 0) & ~found & counts.any(1)[label]).nonzero(as_tuple=True)
         centre, above = valued.drawn.centre, valued.parent[n, m].clamp(min=0)
@@ -72,7 +74,7 @@ class MissedObjects(NamedTuple):
             label[found & (label >= 0)].bincount(minlength=len(kinds)) / len(found),
         )
 
-    def beside(self, found: Detections, number: int) -> tuple[Detections, Tensor, Tensor]:
+    def impute(self, found: Detections, number: int) -> tuple[Detections, Tensor, Tensor]:
         """With what was found in so many images, each has the objects that were not found in one of the renders.
 
         Returns:
@@ -80,13 +82,13 @@ class MissedObjects(NamedTuple):
             those that were found. Another counts as often as its class is found in the images for once in the renders.
         """
         rate = found.label.bincount(minlength=len(self.rate)) / max(number, 1)
-        weight = (rate / self.rate.clamp(min=1e-6)).clamp(max=MOST)
+        weight = (rate / self.rate.clamp(min=1e-6)).clamp(max=MAX_WEIGHT)
         render = torch.randint(max(int(self.renders), 1), (number,))
         image, which = (self.image == render[:, None]).nonzero(as_tuple=True)
         return (
             Detections(
                 torch.cat([found.image, image]),
-                torch.cat([found.mass, found.mass.new_zeros(len(which))]),
+                torch.cat([found.score, found.score.new_zeros(len(which))]),
                 torch.cat([found.label, self.label[which]]),
                 torch.cat([found.centre, self.centre[which]]),
                 torch.cat([found.parent, self.parent[which]]),
@@ -102,4 +104,4 @@ def _told(found: Tensor, every: Tensor) -> bool:
     """Whether finding goes by a site of a class, by u ``(K,)``."""
     if found.isnan().any():
         return False
-    return float(wasserstein_distance(found.numpy(), every.numpy())) > TOLD
+    return float(wasserstein_distance(found.numpy(), every.numpy())) > MIN_DISTANCE

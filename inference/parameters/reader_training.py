@@ -18,9 +18,9 @@ from ..features.base import Examples
 from ..features.counting.batches import STRIDE as CELL
 from ..features.counting.batches import cells, shares
 from ..training import AdamTraining, batch_seed
-from .global_head import NUMBERS, GlobalHead, looks
+from .global_head import NUM_FEATURES, GlobalHead, global_features
 from .reader import Reader, value_loss
-from .schedule import EACH
+from .schedule import RENDERS_PER_STEP
 
 MIN_VISIBLE = 0.25
 KEPT = 0.25  # of the rate, for convolutions that know the classes already
@@ -47,7 +47,7 @@ class SupervisedBatch(NamedTuple):
     u: Tensor
     overall: Tensor
 
-    def of(self, rows: slice) -> "SupervisedBatch":
+    def select(self, rows: slice) -> "SupervisedBatch":
         """Some of the scenes."""
         drawn = self.drawn._replace(**{name: part[rows] for name, part in self.drawn._asdict().items()})
         return SupervisedBatch(drawn, *(part[rows] for part in self[1:]))
@@ -60,7 +60,7 @@ class ReaderTraining(AdamTraining):
         reader: trained in place.
         draw: so many valued renders.
         steps: of AdamW.
-        images: a step, at most; see ``Backbone.images_a_step``.
+        images: a step, at most; see ``Backbone.images_per_step``.
         learning_rate: the largest.
         seed: of everything random.
     """
@@ -76,12 +76,17 @@ class ReaderTraining(AdamTraining):
         learning_rate: float = 4e-3,
         seed: int = 0,
     ):
-        knowing = [parameter for part in reader.eye.knowing for parameter in part.parameters()]
-        rest = [parameter for parameter in reader.parameters() if not any(parameter is other for other in knowing)]
-        groups = [{"params": rest}, *([{"params": knowing, "lr": KEPT * learning_rate}] if knowing else [])]
+        pretrained_parts = [parameter for part in reader.eye.pretrained_parts for parameter in part.parameters()]
+        rest = [
+            parameter for parameter in reader.parameters() if not any(parameter is other for other in pretrained_parts)
+        ]
+        groups = [
+            {"params": rest},
+            *([{"params": pretrained_parts, "lr": KEPT * learning_rate}] if pretrained_parts else []),
+        ]
         adam = torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
         super().__init__(reader, adam, steps, seed, warmup_steps=30)
-        self.reader, self.draw, self.images = reader, draw, reader.eye.images_a_step(images)
+        self.reader, self.draw, self.images = reader, draw, reader.eye.images_per_step(images)
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
@@ -110,9 +115,9 @@ class GlobalHeadTraining(AdamTraining):
         seed: int = 0,
     ):
         adam = torch.optim.AdamW(overall.parameters(), lr=learning_rate, weight_decay=1e-2)
-        super().__init__(overall, adam, -(-renders // EACH), seed, warmup_steps=30)
+        super().__init__(overall, adam, -(-renders // RENDERS_PER_STEP), seed, warmup_steps=30)
         self.overall, self.draw, self.drawn = overall, draw, 0
-        self.looks, self.u = torch.empty(renders, NUMBERS), torch.empty(renders, overall.sites)
+        self.looks, self.u = torch.empty(renders, NUM_FEATURES), torch.empty(renders, overall.sites)
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
@@ -122,16 +127,21 @@ class GlobalHeadTraining(AdamTraining):
         torch.set_rng_state(state)
         rows = torch.randint(self.drawn, (SCENE_IMAGES,))
         u = self.u[rows]
-        return value_loss(self.overall.said(self.looks[rows]), u.nan_to_num(0.5)).where(~u.isnan(), 0.0).sum(1).mean()
+        return (
+            value_loss(self.overall.from_features(self.looks[rows]), u.nan_to_num(0.5))
+            .where(~u.isnan(), 0.0)
+            .sum(1)
+            .mean()
+        )
 
     @torch.no_grad()
     def _draw(self) -> None:
         seed_everything(batch_seed(self.seed, self.total, self.drawn))
         rows = slice(self.drawn, min(self.drawn + TOGETHER, len(self.u)))
         images, self.u[rows] = self.draw(rows.stop - rows.start)
-        self.looks[rows] = looks(images)
+        self.looks[rows] = global_features(images)
         if not self.drawn:
-            self.overall.follow(self.looks[rows])
+            self.overall.fit_normalisation(self.looks[rows])
         self.drawn = rows.stop
 
 

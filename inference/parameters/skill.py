@@ -10,15 +10,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .reader import cut_mean, normal
+from .reader import normal, truncated_mean
 
 LINE, CIRCLE, TWICE = range(3)
-READABLE = 0.2  # least skill of a site that is learnt
-CLEARLY = 0.05, 0.15  # by how much a circle, and one gone round twice, must explain more than what is simpler
-ENOUGH = 20  # objects, or readings of a site in the target, from which something is concluded
-LEAST_SD = 2e-3
-GUESSES = 41  # values that a guess may have
-SURE = 2.0  # standard errors between a share as it was found and the least that it may be
+MIN_SKILL = 0.2  # of a site that is learnt
+GEOMETRY_MARGINS = 0.05, 0.15  # by how much a circle, and one gone round twice, must explain more than what is simpler
+MIN_OBJECTS = 20  # objects, or readings of a site in the target, from which something is concluded
+MIN_SD = 2e-3
+NUM_GUESSES = 41  # values that a guess may have
+STANDARD_ERRORS = 2.0  # standard errors between a share as it was found and the least that it may be
 
 
 class Skill(NamedTuple):
@@ -41,10 +41,10 @@ class Skill(NamedTuple):
     @property
     def readable(self) -> Tensor:
         """``(S,)`` bool."""
-        return self.share > READABLE
+        return self.share > MIN_SKILL
 
     @staticmethod
-    def of(raw: Tensor, u: Tensor) -> "Skill":
+    def from_readings(raw: Tensor, u: Tensor) -> "Skill":
         """Of objects ``(K, S, ...)`` that the reader found, whose u ``(K, S)`` is known; NaN where there is none."""
         ways, shares = [], []
         for s in range(u.shape[1]):
@@ -55,31 +55,31 @@ class Skill(NamedTuple):
                 shares.append(torch.nan)
                 continue
             found = [
-                _explained(cut_mean(*normal(said)), true, 0),
+                _explained(truncated_mean(*normal(said)), true, 0),
                 _explained(_turned(said, 1), true, 1),
                 _explained(_turned(said, 2), true, 2),
             ]
             each = [share for share, _ in found]
-            way = CIRCLE if each[1] > each[0] + CLEARLY[0] else LINE
-            way = TWICE if each[2] > each[way] + CLEARLY[1] else way
+            way = CIRCLE if each[1] > each[0] + GEOMETRY_MARGINS[0] else LINE
+            way = TWICE if each[2] > each[way] + GEOMETRY_MARGINS[1] else way
             ways.append(way)
-            shares.append(each[way] - SURE * found[way][1])
+            shares.append(each[way] - STANDARD_ERRORS * found[way][1])
         return Skill(torch.tensor(ways), torch.tensor(shares))
 
-    def told(self, raw: Tensor, u: Tensor) -> Tensor:
+    def explained_variance(self, raw: Tensor, u: Tensor) -> Tensor:
         """``(S,)`` the share of u's variance that the readings of other objects ``(K, S, ...)`` tell, each in its way,
         by linear regression: as a reader that has since learnt to expect some values guesses toward them. NaN of a site
-        that fewer than ``ENOUGH`` of the objects have."""
+        that fewer than ``MIN_OBJECTS`` of the objects have."""
         shares = []
         for s, way in enumerate(self.way.tolist()):
             there = ~u[:, s].isnan()
             true, said = u[there, s], raw[there, s]
-            if len(true) < ENOUGH:
+            if len(true) < MIN_OBJECTS:
                 shares.append(torch.nan)
                 continue
             turned = slice(2 * way, 2 * way + 2)
             y = _direction(way * true) if way else true.unsqueeze(1)
-            x = said[:, turned] if way else cut_mean(*normal(said)).unsqueeze(1)
+            x = said[:, turned] if way else truncated_mean(*normal(said)).unsqueeze(1)
             x, y = x - x.mean(0), y - y.mean(0)
             left = y - x @ torch.linalg.lstsq(x, y, driver="gelsd").solution
             shares.append(1 - float(left.square().sum() / y.square().sum()))
@@ -98,7 +98,7 @@ class Skill(NamedTuple):
                 toward = (raw[:, s, 2:4] * _direction(half)).sum(-1)  # -1 for the other one, 1 for this
                 other = torch.rand(len(raw)) > (1 + toward.clamp(-1, 1)) / 2
                 mean[:, s], sd[:, s] = half + 0.5 * other, _spread(raw[:, s, 4:6], 2)
-        return mean, sd.clamp(min=LEAST_SD)
+        return mean, sd.clamp(min=MIN_SD)
 
 
 def _turned(said: Tensor, times: int) -> Tensor:
@@ -111,7 +111,7 @@ def _explained(read: Tensor, true: Tensor, times: int) -> tuple[float, float]:
     """The share of u's variance that a reading explains, against the best guess without one, and its standard error, by
     the delta method; on a line, or on a circle that u goes round so many times."""
     whole = 1 / max(times, 1)
-    guess = torch.linspace(0, whole, GUESSES).unsqueeze(1)
+    guess = torch.linspace(0, whole, NUM_GUESSES).unsqueeze(1)
 
     def squared(said: Tensor) -> Tensor:
         return (_apart(said, true, whole) if times else said - true).square()

@@ -20,7 +20,7 @@ from probscene.sampling import seed_everything
 
 from ...training import TrainingLoop, batch_seed
 from ..sites import Site, find_sites
-from .differences import Differences, Drawn, Embed
+from .differences import Differences, Embed, SampledScenes
 from .discrepancy import Discrepancy
 from .schedule import MetaSimSchedule
 from .transform import ParameterTransform
@@ -78,7 +78,7 @@ class MetaSimLearning(TrainingLoop):
         assert guide is not None
         for group in self.optimiser.param_groups:
             group["lr"] = self.schedule.rate * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
-        drawn = Drawn.of(self.model, self.structure, self.learnt, self.schedule.scenes)
+        drawn = SampledScenes.sample(self.model, self.structure, self.learnt, self.schedule.scenes)
         scene, nodes = (logit.sigmoid() for logit in guide.net(drawn.graph, drawn.of_scene, drawn.of_nodes))
         features = self.differences.features(drawn, scene.detach(), nodes.detach()).requires_grad_()
         loss = self.discrepancy(features)

@@ -22,7 +22,7 @@ from torch import Tensor
 from probscene.sampling import Scenes
 
 from ...training import TrainingLoop
-from .differences import Drawn, with_values
+from .differences import SampledScenes, with_values
 from .transform import ParameterTransform
 
 BASELINE_DECAY = 0.8
@@ -69,7 +69,7 @@ class TaskLearning(TrainingLoop):
     def step(self) -> float:
         """See ``TrainingLoop``; the loss is minus the score."""
         guide = self.guide
-        drawn = Drawn.of(guide.model, guide.structure, guide.sites, self.scenes)
+        drawn = SampledScenes.sample(guide.model, guide.structure, guide.sites, self.scenes)
         means = guide.net(drawn.graph, drawn.of_scene, drawn.of_nodes)
         logits = [mean.detach() + self.spread * torch.randn_like(mean) for mean in means]
         with torch.no_grad():

@@ -47,8 +47,8 @@ from ...training import Callback, TrainingLoop, batch_seed, of_prefix
 from ..guide import ParameterGuide
 from ..likelihood import MaximumLikelihood, Values, log_density
 from ..net import ParameterNet
-from ..sites import NEAR, Site, find_sites
-from ..supervised_renders import Label, SupervisedRenders, joined
+from ..sites import U_EPS, Site, find_sites
+from ..supervised_renders import Label, SupervisedRenders, concatenate
 from .schedule import TiltingSchedule
 
 AT_ONCE = 100  # scenes that are drawn and rendered together
@@ -151,18 +151,18 @@ class TiltingLearning(TrainingLoop):
 
     def _set_prior_sites(self) -> None:
         if self.guide is not None:
-            self.guide.passed = frozenset(site.name for site in self.open_to if site not in self.learnt)
+            self.guide.prior_sites = frozenset(site.name for site in self.open_to if site not in self.learnt)
 
     @torch.no_grad()
     def _drawn(self, guide: ParameterGuide, num: int) -> tuple[list[Features], Values]:
         """Features ``(N, D)`` of the guide's renders by each look, and their scenes' values of all sites."""
-        model, features, parts = guide.suited(self.model), [], []
+        model, features, parts = guide.with_parameters(self.model), [], []
         for first in range(0, num, AT_ONCE):
             some = self.renders.draw(min(AT_ONCE, num - first), self.structure, model)
             features.append([look(some.drawn.image) for look in self.looks])
             parts.append(some._replace(drawn=some.drawn._replace(image=some.drawn.image[..., :0])))  # to save memory
-        of, turns = joined(parts), torch.zeros(len(self.chosen), dtype=torch.bool)
-        scene, none = of.overall.clamp(NEAR, 1 - NEAR), of.u
+        of, turns = concatenate(parts), torch.zeros(len(self.chosen), dtype=torch.bool)
+        scene, none = of.overall.clamp(U_EPS, 1 - U_EPS), of.u
         values = Values(of.kind, of.parent, none, none, scene, torch.full_like(scene, EXACT), turns)
         return [torch.cat(part).double().numpy() for part in zip(*features, strict=True)], values
 
@@ -179,7 +179,7 @@ class _Weighted(MaximumLikelihood):
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
         rows = torch.multinomial(self.weight, self._number(), replacement=True)
-        return -log_density(self.net, self.values.of(rows))[:, self.chosen].sum(1).mean()
+        return -log_density(self.net, self.values.select(rows))[:, self.chosen].sum(1).mean()
 
 
 def witness(own: Features, real: Features) -> tuple[Features, float]:

@@ -18,7 +18,7 @@ from probscene.inference.parameters.backbone import Backbone, RenderBackbone
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
-from probscene.inference.parameters.reader_counts import of_counts
+from probscene.inference.parameters.reader_counts import counting_state
 from probscene.inference.parameters.sites import Site
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
@@ -63,7 +63,7 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     seed_everything(batch_seed(run.record["seed"], 5))
-    eye, method = Backbone.of(inner(net)), run.preset.parameter_method
+    eye, method = Backbone.from_feature_net(inner(net)), run.preset.parameter_method
     by_reading, joint = method == LIKELIHOOD, method == META_SIM and isinstance(run.model.grammar, JointGrammar)
     if joint or (by_reading and eye is None):
         who = "models of several scenarios are" if joint else f"{run.features.name} features are"
@@ -98,7 +98,7 @@ def learn_parameters(
         learning.run(each)
         keep.finish()
         if isinstance(learning, ParameterLearning) and isinstance(eye, RenderBackbone):
-            run.write_tensors(READER, of_counts(learning.tried.reader))
+            run.write_tensors(READER, counting_state(learning.calibrated.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
         judges = _some(target, held, JUDGED), lambda: _some(target, held, DOUBTFUL)
         run.write_parameters(_record(run, guide, learning, *judges))
@@ -122,7 +122,7 @@ def apart(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tens
 def with_parameters(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> Policy:
     """A policy whose scenes have the run's learnt parameters, in place; as it is where none are kept."""
     if tensors and run.parameters.get("kept") == "learnt":
-        policy.suits = learnt_by(run, policy, tensors).suited
+        policy.suits = learnt_by(run, policy, tensors).with_parameters
     return policy
 
 
@@ -140,7 +140,7 @@ def learnt_by(run: "RunFolder", policy: Policy, tensors: dict[str, Tensor]) -> P
         guide = ParameterTransform(run.model, sites, policy, schedule.hidden, schedule.rounds)
     else:
         guide = ParameterGuide(run.model, sites, policy)
-        guide.passed = frozenset(site["name"] for site in fitted if not site["learnt"])
+        guide.prior_sites = frozenset(site["name"] for site in fitted if not site["learnt"])
     guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
     return guide.eval()
 
@@ -163,15 +163,15 @@ def _record(
     method = {"method": run.preset.parameter_method}
     if not isinstance(learning, ParameterLearning):
         return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held, more).distances}
-    assert learning.tried.skill is not None
-    shares = learning.tried.skill.share.tolist()
+    assert learning.calibrated.skill is not None
+    shares = learning.calibrated.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
     found = select_sites(run, guide, learning, held, more)
-    passed = frozenset() if learning.guide is None else learning.guide.passed
+    passed = frozenset() if learning.guide is None else learning.guide.prior_sites
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
         share, fitted = skill.get(site, torch.nan), site in learning.learnt
-        because = site.keeps or learning.tried.why_not(site)
+        because = site.keeps or learning.calibrated.why_not(site)
         if site.name in passed:
             because = found.because.get(site.name, "scenes come no nearer to held-out images by it")
         about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}

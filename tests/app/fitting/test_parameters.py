@@ -32,12 +32,12 @@ PRIOR = StructurePrior(ROW, Dots=counts(0, 1, 1, 1))
 
 def anything_is_read(patch):
     """Also what a reader of six steps says; and it is kept."""
-    patch.setattr(skill, "READABLE", -1e9)
-    patch.setattr(reader, "LEAST_MASS", (1e-3,))
+    patch.setattr(skill, "MIN_SKILL", -1e9)
+    patch.setattr(reader, "SCORE_THRESHOLDS", (1e-3,))
     patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(select_sites, "passed", lambda *_: frozenset())
     patch.setattr(select_sites, "of_unclear", lambda *_: (frozenset(), {}))
-    for renders in ("TRIED", "ASSEMBLED", "MISSED"):
+    for renders in ("CALIBRATION_RENDERS", "BUILDER_RENDERS", "MISSED_RENDERS"):
         patch.setattr(learning, renders, 40)
 
 

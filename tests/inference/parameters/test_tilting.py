@@ -11,7 +11,7 @@ from pyro.poutine.messenger import Messenger
 from scipy.stats import chi2, kstest
 
 from probscene.inference.features.base import class_table, examples
-from probscene.inference.parameters.sites import within
+from probscene.inference.parameters.sites import with_handlers
 from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import (
     TiltingLearning,
@@ -172,7 +172,7 @@ def learning(trays):
                 msg["value"] = 0.85 + 0.1 * torch.rand(msg["fn"].batch_shape)
 
     seed_everything(3)
-    real = look(label(sample(within(trays, Bright()), trays.prior, 150)).image)
+    real = look(label(sample(with_handlers(trays, Bright()), trays.prior, 150)).image)
     schedule = TiltingSchedule(rounds=8, first=300, scenes=120, steps=30, rate=0.02)
     return lambda: TiltingLearning(trays, trays.prior, label, (look,), (real,), schedule)
 
@@ -183,10 +183,10 @@ def test_what_images_show_is_learnt_and_what_they_do_not_show_is_not(learning, t
     assert apart[-1] < 0.5 * apart[0]
     assert [site.name for site in whole.learnt] == ["scene.bright"]
     seed_everything(0)
-    bright = sample(whole.guide.suited(trays), trays.prior, 200).parameters["scene.bright"]
+    bright = sample(whole.guide.with_parameters(trays), trays.prior, 200).parameters["scene.bright"]
     assert 0.79 < float(bright.mean()) < 0.98  # 0.7 in the prior, 0.9 in the target
     turns = []
-    for model in (whole.guide.suited(trays), trays):
+    for model in (whole.guide.with_parameters(trays), trays):
         seed_everything(0)
         turns.append(sample(model, trays.prior, 20).parameters["floor.turn"])
     assert torch.equal(*turns)
