@@ -21,8 +21,8 @@ from ..training import Callback, TrainingLoop, batch_seed
 from .base import Draw, Examples, Features, Photographs, Renders
 
 PRESENCE, PRESENCE_COUNTS = "presence", "presence=counts"
-WAYS = 25  # of the paper's counts
-LAST = torch.channels_last  # in memory; half as fast again on a CPU
+NUM_COUNTS = 25  # of the paper's counts
+NHWC = torch.channels_last  # in memory; half as fast again on a CPU
 
 
 class PresenceNet(nn.Module):
@@ -50,7 +50,7 @@ class PresenceNet(nn.Module):
     def layers(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Features ``(N, D)`` and logits, ``(N, classes)`` or ``(N, classes, ways)``, of uint8 images ``(N, 1 or 3, H,
         W)``."""
-        pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous(memory_format=LAST).float() / 255).mean((2, 3))
+        pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous(memory_format=NHWC).float() / 255).mean((2, 3))
         first = F.leaky_relu(self.fc1(pool), 0.01)
         second = F.leaky_relu(self.fc2(first), 0.01)
         logits = self.out(second)
@@ -75,7 +75,7 @@ class _Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = F.leaky_relu(self.na(self.a(x)), 0.01)
         # Not a stride in the convolution: with 3 channels, last in memory, torch 2.14 then writes outside its buffers.
-        return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x[..., ::2, ::2].contiguous(memory_format=LAST)), 0.01)
+        return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x[..., ::2, ::2].contiguous(memory_format=NHWC)), 0.01)
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class PresenceFeatures(Features):
 
     def build(self, model: SceneModel) -> PresenceNet:
         """Untrained. Counts go to 24, as in the paper, or to as many as a derivation has rules, where that is more."""
-        ways = max(WAYS, model.max_steps + 1) if self.counts else 0
+        ways = max(NUM_COUNTS, model.max_steps + 1) if self.counts else 0
         return PresenceNet(model.classes, self.width, self.hidden, ways)
 
     def training(

@@ -17,7 +17,7 @@ from ..features.counting.batches import images_per_step
 from ..features.counting.net import CountNet, conv, layers
 
 if TYPE_CHECKING:
-    from ..features.photographs.heads import PretrainedCountNet
+    from ..features.photographs.net import PretrainedCountNet
 
 WIDTH = 64  # channels
 STRIDE = 4  # pixels of a reduced image a cell
@@ -49,7 +49,7 @@ class Backbone(nn.Module):
         """That which suits what structure was learnt by; None where nothing does."""
         if isinstance(net, CountNet):
             return RenderBackbone(net)
-        if hasattr(net, "look"):  # torchvision takes seconds to import
+        if hasattr(net, "compute_maps"):  # torchvision takes seconds to import
             return PhotographBackbone(cast("PretrainedCountNet", net))
         return None
 
@@ -106,7 +106,7 @@ class PhotographBackbone(Backbone):
     def forward(self, x: Tensor) -> Tensor:
         """See ``Backbone``."""
         net = self.net[0]
-        maps, size = net.normal(net.look(x)), net.places(FINEST)
+        maps, size = net.normalise(net.compute_maps(x)), net.places(FINEST)
         if self.training:
             shifted = (some + SHIFT * torch.randn(*some.shape[:2], 1, 1) for some in maps)
             maps = [F.dropout2d(some, DROPPED) for some in shifted]

@@ -1,4 +1,4 @@
-"""A reader, what it can read, and what it reads in images.
+"""A reader, which sites it can read, and its readings of images.
 
 Axis letters: L images, M nodes, K objects, S sites of nodes, G sites of scenes.
 """
@@ -22,13 +22,13 @@ from .scene_graph_builder import SceneGraphBuilder, fit_scene_graph_builder
 from .sites import Site, site_mask
 from .skill import MIN_OBJECTS, MIN_SD, Skill
 
-LOW_SKILL = 0.5  # share of a site's variance up to which it is doubtful whether it can be read in the target
-HIGH_SKILL = 0.9  # share of a site's variance from which on it is read sharply
-MAX_MATCH_DISTANCE = 12.0  # pixels from an object that is found to that which it is
+LOW_SKILL = 0.5  # below it, it is doubtful whether a site can be read in the target
+HIGH_SKILL = 0.9  # from it on, the error of readings needs no correction
+MAX_MATCH_DISTANCE = 12.0  # pixels from a detection to its object
 
 
 class CalibratedReader:
-    """A reader of a model's sites; it is tried once, and reads from then on those of them that it can read.
+    """A reader of a model's sites. It is calibrated once; from then on it reads those sites that it can read.
 
     Args:
         model: the scene model.
@@ -36,20 +36,20 @@ class CalibratedReader:
         node_sites, scene_sites: that are not kept.
 
     Attributes:
-        skill: of the reader, for the sites of nodes and then of scenes; None before it was tried.
-        readings_of: ``(S + G,)`` how many readings of each there are in the target.
+        skill: of the reader, for the sites of nodes and then of scenes; None before it is calibrated.
+        num_readings: ``(S + G,)`` how many readings of each there are in the target.
     """
 
     def __init__(self, model: SceneModel, reader: Reader, node_sites: tuple[Site, ...], scene_sites: tuple[Site, ...]):
         self.model, self.reader, self.node_sites, self.scene_sites = model, reader, node_sites, scene_sites
         self.skill: Skill | None = None
-        self.readings_of = torch.zeros(0, dtype=torch.int64)
+        self.num_readings = torch.zeros(0, dtype=torch.int64)
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
         tensors = {f"reader.{key}": value for key, value in self.reader.state_dict().items()}
         if self.skill is not None:
-            tensors |= {"skill.way": self.skill.way, "skill.share": self.skill.share, "readings": self.readings_of}
+            tensors |= {"skill.way": self.skill.way, "skill.share": self.skill.share, "readings": self.num_readings}
         return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -58,30 +58,30 @@ class CalibratedReader:
         self.reader.eval()
         if "skill.way" in tensors:
             self.skill = Skill(tensors["skill.way"], tensors["skill.share"])
-            self.readings_of = tensors["readings"]
+            self.num_readings = tensors["readings"]
 
     def choose_threshold(self, valued: SupervisedBatch) -> tuple[Detections, Tensor]:
-        """Settle how much of an object's unit has to be found: so little that in some renders the fewest objects are
-        missed, found twice or found where there is none; up to chance, as of a target's objects less is found.
+        """Choose the score from which on detections count: the lowest with the fewest errors in some renders (objects
+        that are missed, detected twice or detected where there is none), up to chance, as scores are lower in a target.
 
         Returns:
-            what is found in the renders then, and the node that each is, see ``matched``.
+            the detections in the renders then, and the node that each is, see ``matched``.
         """
         found, drawn = self.reader.detect_all(valued.drawn.image), valued.drawn
         which, mistakes = matched(found, valued), []
         node, number = found.image * drawn.label.shape[1] + which, int(visible(valued).sum())
-        for least in self.reader.thresholds:
-            enough = found.score > least
+        for threshold in self.reader.thresholds:
+            enough = found.score > threshold
             hit = len(node[enough & (which >= 0)].unique())
             mistakes.append(number + int(enough.sum()) - 2 * hit)
         most = min(mistakes) + math.sqrt(min(mistakes))
-        as_good = [least for least, some in zip(self.reader.thresholds, mistakes, strict=True) if some <= most]
+        as_good = [threshold for threshold, some in zip(self.reader.thresholds, mistakes, strict=True) if some <= most]
         self.reader.least.fill_(as_good[0])
         enough = found.score > self.reader.least
         return found.select(enough), which[enough]
 
     def calibrate(self, valued: SupervisedBatch, images: Tensor) -> None:
-        """Try it on renders of the prior, and see how often it finds each class in the target's images."""
+        """Measure its skill on renders of the prior, and how often it detects each class in the target's images."""
         found, which = self.choose_threshold(valued)
         of_nodes = Skill.from_readings(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
         of_scenes = Skill.from_readings(found.overall, valued.overall)
@@ -89,14 +89,14 @@ class CalibratedReader:
         objects = self.reader.detect(images).label.bincount(minlength=len(self.model.classes))
         of_class = dict(zip(self.model.classes, objects.tolist(), strict=True))
         number = [sum(of_class.get(kind, 0) for kind in site.kinds) for site in self.node_sites]
-        self.readings_of = torch.tensor([*number, *(len(images) for _ in self.scene_sites)], dtype=torch.int64)
+        self.num_readings = torch.tensor([*number, *(len(images) for _ in self.scene_sites)], dtype=torch.int64)
 
     @property
     def good(self) -> Tensor:
-        """``(S + G,)`` bool, which are learnt; none before it was tried."""
+        """``(S + G,)`` bool, which are learnt; none before it is calibrated."""
         if self.skill is None:
             return torch.zeros(len(self.node_sites) + len(self.scene_sites), dtype=torch.bool)
-        return self.skill.readable & (self.readings_of >= MIN_OBJECTS)
+        return self.skill.readable & (self.num_readings >= MIN_OBJECTS)
 
     @property
     def good_sites(self) -> frozenset[Site]:
@@ -124,15 +124,15 @@ class CalibratedReader:
         return frozenset(site.name for site, share in each if site in self.good_sites and share < LOW_SKILL)
 
     def use_refit_head(self) -> GlobalHead:
-        """The network that unclear sites of scenes are read by from now on."""
+        """The head that sites of scenes with low skill are read by from now on."""
         anew = [site.name in self.low_skill_sites for site in self.scene_sites]
         self.reader.anew.copy_(torch.tensor(anew))
         return self.reader.again
 
     def unidentifiable_sites(self, valued: SupervisedBatch) -> dict[str, float]:
-        """Which of these cannot be read in renders that look like the target, but have the prior's values of them: what
-        the prior's renders show may be hidden there, as a sun behind clouds. By name, the share of its variance that is
-        read."""
+        """Which low-skill sites cannot be read in renders that look like the target, but have the prior's values of
+        these sites: what the prior's renders show may be hidden there, as a sun behind clouds. By name, the share of
+        the variance that is explained."""
         assert self.skill is not None
         found = self.reader.detect(valued.drawn.image)
         which, (nodes, scenes) = matched(found, valued), self._skills()
@@ -150,7 +150,7 @@ class CalibratedReader:
         number = [*self.node_sites, *self.scene_sites].index(site)
         if not self.skill.readable[number]:
             return "it cannot be read in renders"
-        return f"it was read {int(self.readings_of[number])} times in the target, of {MIN_OBJECTS} that it takes"
+        return f"it was read {int(self.num_readings[number])} times in the target, of {MIN_OBJECTS} that it takes"
 
     def readings(self, images: Tensor) -> dict[str, Tensor]:
         """u of each learnt site as it is read in ``(L, C, H, W)`` uint8 images, of all objects that have it or of all
@@ -171,8 +171,8 @@ class CalibratedReader:
         of: Tensor | None = None,
         missed: MissedObjects | None = None,
     ) -> tuple[Values, Tensor]:
-        """Scene graphs of what was found in so many images, with the learnt sites, and of what is missing there; and
-        what ``of (K,)`` says of each object, ``(L, M)`` int64, -1 where there is none."""
+        """Scene graphs of the detections in so many images and of imputed missed objects, with the learnt sites; and
+        ``of (K,)`` of each object, ``(L, M)`` int64, -1 where there is none."""
         skills, (node, scene) = self._skills(), self.columns
         mean, sd = (part[:, node] for part in skills[0].read(found.raw))
         scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
@@ -189,22 +189,22 @@ class CalibratedReader:
         values = Values(kind, parent, mean, sd, scene_mean, scene_sd, turns, both[..., -1].nan_to_num(0.0))
         return values, both[..., -2].nan_to_num(-1).long()
 
-    def own(self, builder: SceneGraphBuilder, valued: SupervisedBatch) -> GuideReadings:
-        """What it reads in renders, with what they show."""
+    def guide_readings(self, builder: SceneGraphBuilder, valued: SupervisedBatch) -> GuideReadings:
+        """Its readings of renders, with the true values."""
         found = self.reader.detect(valued.drawn.image)
         read, which = self.values(builder, found, len(valued.kind), matched(found, valued))
         node, scene = self.columns
         return GuideReadings(valued.kind, valued.parent, valued.u[..., node], valued.overall[:, scene], read, which)
 
     def scene_graph_builder(self, valued: SupervisedBatch) -> SceneGraphBuilder:
-        """What some scenes of the prior have in common."""
+        """Fitted to some scenes of the prior."""
         label, kind = valued.drawn.label, kinds_of(self.model, valued.drawn.label)
         centre = valued.drawn.centre.where((label >= 0).unsqueeze(-1), torch.nan)
         graph = SceneGraph.from_nodes(kind, valued.parent)
         return fit_scene_graph_builder(self.model.grammar, self.model.classes, graph, centre, valued.group)
 
     def missed_objects(self, valued: SupervisedBatch) -> MissedObjects:
-        """Objects that it does not find in some renders; by these is settled first how much has to be found."""
+        """Objects that it does not detect in some renders, after ``choose_threshold`` by these renders."""
         found, which = self.choose_threshold(valued)
         there = torch.zeros_like(valued.kind, dtype=torch.bool)
         is_it = (which >= 0) & (found.label == valued.drawn.label[found.image, which])

@@ -13,7 +13,7 @@ from .guide import ParameterGuide
 
 
 class HeldOutSet(NamedTuple):
-    """What judges.
+    """Held-out images that guides are compared with.
 
     Attributes:
         look: gives features of a guide's renders, ``(N, D)``, under one seed.
@@ -32,7 +32,7 @@ class HeldOutSet(NamedTuple):
 
 
 class CheckpointSelector:
-    """Goes back to the best state where training has made a guide's scenes surely farther from the images.
+    """Goes back to the best state where training made a guide's scenes significantly farther from held-out images.
 
     Attributes:
         weights: of the best guide's network so far; empty before the first one.
@@ -44,7 +44,7 @@ class CheckpointSelector:
         self.looks: Features | None = None
 
     def update(self, guide: ParameterGuide, prior_sites: frozenset[str] = frozenset()) -> None:
-        """Judge a guide after a training of it; in place.
+        """Compare a guide with the best so far, after a training of it; in place.
 
         Args:
             prior_sites: names of sites that have their prior in the renders that are compared, as they would keep it in

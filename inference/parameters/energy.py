@@ -3,8 +3,8 @@
 Maximum likelihood takes a reader at its word. Where a reading is off by nature, as of an angle that is read as too
 upright, so is what is learnt. Here one reader reads both sides, and its errors with them. The gradient of the energy
 distance [1] by a reading goes on to the value that was drawn, as if what is read moved with it one to one, and from
-there through the quantile of its mixture to the guide's weights (``ParameterNet.moving``). Only the last layers of the
-sites that are read with an error of some size are trained: what is read sharply, likelihood learns better.
+there through the quantile of its mixture to the guide's weights (``ParameterNet.reparameterise``). Only the last layers
+of the sites that are read with an error of some size are trained: what is read sharply, likelihood learns better.
 
 Objects are compared kind by kind, each with its sibling before it, its place among its siblings and their number; so
 are scenes.
@@ -31,8 +31,8 @@ from .graph import SceneGraph
 from .likelihood import Values
 from .net import ParameterNet, gather_nodes, init_to_prior
 
-ROWS = 400, 1600  # of the guide's and of the target's objects of a kind that are compared in a step, at most
-PLACE, NUMBER = 2.0, 4.0  # what one place among siblings and one object more count, in u
+MAX_ROWS = 400, 1600  # of the guide's and of the target's objects of a kind that are compared in a step, at most
+RANK_UNIT, NUMBER_UNIT = 2.0, 4.0  # what one place among siblings and one object more count, in u
 
 
 class GuideReadings(NamedTuple):
@@ -91,7 +91,7 @@ class EnergyDistance(AdamTraining):
         target = self.values.select(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
         own = self.draw(self.scenes)
         with _only(self.net, self.module):
-            found = energy_distance(moving(self.net, own, self.trained), target)
+            found = energy_distance(reparameterised_readings(self.net, own, self.trained), target)
         return found + 0 * sum(weight.sum() for weight in self.module.parameters())  # where nothing can be compared
 
 
@@ -182,8 +182,8 @@ def _only(net: nn.Module, part: nn.Module) -> Iterator[None]:
             weight.requires_grad_(had)
 
 
-def moving(net: ParameterNet, own: GuideReadings, trained: Sequence[bool]) -> Values:
-    """What is read, moving with what was drawn of the sites that are trained, see ``ParameterNet.moving``."""
+def reparameterised_readings(net: ParameterNet, own: GuideReadings, trained: Sequence[bool]) -> Values:
+    """What is read, moving with what was drawn of the sites that are trained, see ``ParameterNet.reparameterise``."""
     scene, nodes = net.reparameterise(SceneGraph.from_nodes(own.kind, own.parent), own.scene, own.nodes, trained)
     moved = (nodes - own.nodes).nan_to_num(0.0)
     moved = gather_nodes(moved, own.which).nan_to_num(0.0)
@@ -199,7 +199,7 @@ def energy_distance(one: Values, other: Values) -> Tensor:
     read, also = ~one.nodes.isnan().all(2), ~other.nodes.isnan().all(2)
     for kind in other.kind[also].unique().tolist():
         mine, theirs = read & (one.kind == kind), also & (other.kind == kind)
-        here, there = rows[mine][: ROWS[0]], others[theirs][: ROWS[1]]
+        here, there = rows[mine][: MAX_ROWS[0]], others[theirs][: MAX_ROWS[1]]
         if len(here) > 1 and len(there) > 1:
             number = float(theirs.sum()) * other.nodes.shape[2]
             total, weight = total + number * _energy(here, there), weight + number
@@ -225,7 +225,7 @@ def _rows(values: Values) -> Tensor:
     graph = SceneGraph.from_nodes(values.kind, values.parent)
     own = _placed(values.nodes, values.turns[: values.nodes.shape[2]])
     before = gather_nodes(own, graph.before).nan_to_num(0.0)
-    place = torch.stack([PLACE * graph.rank, NUMBER * graph.number], -1).to(own.dtype)
+    place = torch.stack([RANK_UNIT * graph.rank, NUMBER_UNIT * graph.number], -1).to(own.dtype)
     return torch.cat([own, before, place], -1)
 
 

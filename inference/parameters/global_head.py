@@ -16,11 +16,11 @@ MAX_DEVIATIONS = 5.0  # deviations that enter, at most
 
 
 class GlobalHead(nn.Module):
-    """What is said of the scenes' sites.
+    """A head for the scenes' sites.
 
     Args:
         sites: G.
-        outputs: how many numbers are said of a site.
+        outputs: numbers a site.
         dropout: share of what enters that is left out in training.
     """
 
@@ -41,9 +41,8 @@ class GlobalHead(nn.Module):
     def from_features(self, x: Tensor) -> Tensor:
         """``(N, G, outputs)`` of ``global_features``."""
         x = (x - self.mean) / (self.deviation + 1e-4)
-        return self.out(F.relu(self.join(self.drop(x.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS))))).unflatten(
-            1, (-1, self.outputs)
-        )
+        hidden = F.relu(self.join(self.drop(x.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS))))
+        return self.out(hidden).unflatten(1, (-1, self.outputs))
 
     def fit_normalisation(self, x: Tensor) -> None:
         """Take the mean and the deviation of numbers that enter from these, if from none before."""

@@ -1,4 +1,4 @@
-"""Scene graphs as a parameter guide sees them. Axis letters: N scenes, M nodes."""
+"""Scene graphs of parameter guides. Axis letters: N scenes, M nodes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from probscene.grammar import Grammar
 
 
 class SceneGraph(NamedTuple):
-    """What a scene's structure says of its nodes.
+    """Relations of the nodes of scenes.
 
     Attributes:
         kind: ``(N, M)`` int64; -1 pads.
@@ -31,7 +31,7 @@ class SceneGraph(NamedTuple):
 
     @property
     def siblings(self) -> Tensor:
-        """``(N, M, M)`` bool, who is whose sibling, itself included."""
+        """``(N, M, M)`` bool, which nodes are siblings; each is its own."""
         parent = self.parent.where(self.kind >= 0, -2)
         return (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & (parent > -2).unsqueeze(-1)
 

@@ -298,7 +298,7 @@ class ParameterLearning:
     @torch.no_grad()
     def _guide_readings(self, builder: SceneGraphBuilder, num: int, kept: Collection[str] = ()) -> GuideReadings:
         """Readings of renders of the guide, see ``guide_scenes``."""
-        return self.calibrated.own(builder, self.guide_scenes(kept, num))
+        return self.calibrated.guide_readings(builder, self.guide_scenes(kept, num))
 
     @cached_property
     def _builder(self) -> SceneGraphBuilder:

@@ -1,4 +1,4 @@
-"""Objects that are not found in an image: what is far, small or behind something is found less often.
+"""Objects that the reader misses: what is far, small or behind something is detected less often.
 
 What is read in a target is of the objects that are found there, which are not a fair sample. So each scene graph that
 was read gets, beside its own objects, those that were not found in a render of the guide. That is the expectation step
@@ -61,7 +61,8 @@ class MissedObjects(NamedTuple):
         for c in range(len(kinds)):
             of_class, here = label == c, found & (label == c)
             if MIN_OBJECTS <= int(here.sum()) <= int(of_class.sum()) - MIN_OBJECTS:
-                counts[c] = torch.tensor([_told(u[..., s][here], u[..., s][of_class]) for s in range(len(sites))])
+                sides = zip(u[here].unbind(1), u[of_class].unbind(1), strict=True)
+                counts[c] = torch.tensor([_detection_depends_on(*pair) for pair in sides])
         n, m = ((label >= 0) & ~found & counts.any(1)[label]).nonzero(as_tuple=True)
         centre, above = valued.drawn.centre, valued.parent[n, m].clamp(min=0)
         return MissedObjects(
@@ -75,7 +76,7 @@ class MissedObjects(NamedTuple):
         )
 
     def impute(self, found: Detections, number: int) -> tuple[Detections, Tensor, Tensor]:
-        """With what was found in so many images, each has the objects that were not found in one of the renders.
+        """Add to the detections in each of so many images the objects that were missed in one of the renders.
 
         Returns:
             all objects, those that were found first; u of the others; and how much each of all counts, which is 1 for
@@ -100,7 +101,7 @@ class MissedObjects(NamedTuple):
         )
 
 
-def _told(found: Tensor, every: Tensor) -> bool:
+def _detection_depends_on(found: Tensor, every: Tensor) -> bool:
     """Whether finding goes by a site of a class, by u ``(K,)``."""
     if found.isnan().any():
         return False

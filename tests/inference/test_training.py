@@ -16,11 +16,10 @@ from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.features.counting.training import CountTraining
-from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.photographs.net import PretrainedCountNet
 from probscene.inference.features.photographs.training import PretrainedCountTraining
 from probscene.inference.features.presence import PresenceNet, PresenceTraining
-from probscene.inference.features.projected import ProjectionTraining
-from probscene.inference.features.projection import Projected
+from probscene.inference.features.projection import Projected, ProjectionTraining
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.structure_training import StructureTraining

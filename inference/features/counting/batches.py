@@ -20,8 +20,8 @@ from ..base import Draw, Examples
 from .net import BORDER, STRIDE, CountNet
 
 STEPS_A_DRAW = 16
-FULL = 128**2  # pixels of a reduced image of which a step takes as many as the schedule says
-FEWEST = 4  # images a step, however large
+FULL_AREA = 128**2  # pixels of a reduced image of which a step takes as many as the schedule says
+MIN_IMAGES = 4  # images a step, however large
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class CountBatch(NamedTuple):
 def images_per_step(most: int, area: float) -> int:
     """``most``, of images of up to 128 x 128 pixels when reduced; of images of a larger ``area``, which hold more
     objects, as many as have those pixels together, but at least 4."""
-    return min(most, max(FEWEST, round(most * FULL / area)))
+    return min(most, max(MIN_IMAGES, round(most * FULL_AREA / area)))
 
 
 class CountBatches:

@@ -1,4 +1,4 @@
-"""Training the count network on prior renders with their free labels.
+"""Features that count by a network of the fit's own, trained on prior renders with their free labels.
 
 The loss is the cross-entropy of the cells and the squared error of the soft counts, and the error of the votes where
 objects are counted by groups. What the steps look at is drawn ahead in a thread of its own: the network is so small
@@ -9,23 +9,63 @@ Reference:
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.model import SceneModel
+from probscene.sampling import seed_everything
 from probscene.threads import threads
 
-from ...training import Callback, TrainingLoop
-from ..base import Draw
+from ...training import Callback, TrainingLoop, batch_seed
+from ..base import Draw, Features, Photographs, Renders
 from .batches import STEPS_A_DRAW, CountBatch, CountBatches, CountSchedule, Votes
 from .muon import Muon
 from .net import CountNet
 
 WARMUP_STEPS, MAX_GRAD_NORM = 50, 5.0
+
+
+@dataclass(frozen=True)
+class CountFeatures(Features):
+    """``CountNet``, trained on renders of the prior, or of what guides are pretrained on.
+
+    Args:
+        schedule: of its training.
+        width, blocks: its size, see ``CountNet``.
+    """
+
+    schedule: CountSchedule = field(default_factory=CountSchedule)
+    width: tuple[int, int, int] = (16, 32, 64)
+    blocks: tuple[int, int] = (1, 1)
+
+    name = "count"
+    resolution = 0.5  # of a count
+
+    @property
+    def images(self) -> int:
+        """See ``Features``; fewer of a canvas above 128 x 128 pixels."""
+        return self.schedule.steps * self.schedule.images
+
+    def build(self, model: SceneModel) -> CountNet:
+        """Untrained."""
+        rounding = self.schedule.rounding
+        return CountNet(model.classes, model.channels, model.canvas, self.width, self.blocks, model.groups, rounding)
+
+    def training(
+        self, net: CountNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
+    ) -> "CountTraining":
+        """On renders alone, reduced no more than the model's small objects bear."""
+        seed_everything(0)  # how large objects are is the model's, and the same for all seeds
+        net.fit_to(renders.object_size())
+        draw = partial(renders.draw, beyond_prior=self.schedule.beyond_prior)
+        return CountTraining(net, draw, self.schedule, seed=batch_seed(seed, 1))
 
 
 class CountTraining(TrainingLoop):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..base import ImageCallback, Photographs
-from .heads import SMALLEST, PretrainedCountNet
+from .net import MIN_PIXELS, PretrainedCountNet
 from .readability import Read, Reading, rules_for_renders, with_labels, without_labels
 from .reading import RULES, SCOPES
 
@@ -40,7 +40,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
             found = without_labels(read, c)
             because = f"{found.mean:.1f} an image, not compared: stuff has no definite number"
             found = found._replace(readable=True, because=because)
-        elif net.size[c] < SMALLEST:
+        elif net.size[c] < MIN_PIXELS:
             found = without_labels(read, c)._replace(readable=False, because=_too_small(net, c))
         elif name in counts:
             found = with_labels(read, c, counts[name])
@@ -56,7 +56,7 @@ def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, callba
     """Readings ``(L, S, R, C)``."""
     parts = []
     for some in images.split(LOOKED_AT_ONCE):
-        parts.append(net.readings(net.look(some))[0])
+        parts.append(net.readings(net.compute_maps(some))[0])
         done += len(some)
         callback(done, total)
     return torch.cat(parts)
@@ -94,7 +94,7 @@ def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:
 
 
 def _too_small(net: PretrainedCountNet, c: int) -> str:
-    pixels, needed = float(net.size[c]), SMALLEST
+    pixels, needed = float(net.size[c]), MIN_PIXELS
     height, width = net.canvas
     entering = net.frozen[0].entering(height, width)
     scale = needed / pixels * 1.1

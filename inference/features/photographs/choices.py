@@ -11,7 +11,7 @@ from ...training import Training, batch_seed
 from ..base import FeatureNet, Features, ImageCallback, Photographs, Renders
 
 if TYPE_CHECKING:
-    from .heads import PretrainedCountNet
+    from .net import PretrainedCountNet
 
 COUNT_ON_PRETRAINED = "count=efficientnet"
 
@@ -44,7 +44,7 @@ class PretrainedCountFeatures(Features):
 
     def build(self, model: SceneModel) -> FeatureNet:
         """Pretrained, with untrained heads."""
-        from .heads import PretrainedCountNet  # torchvision takes seconds to import
+        from .net import PretrainedCountNet  # torchvision takes seconds to import
 
         return PretrainedCountNet(model.classes, model.canvas, model.stuff, self.scenes)
 

@@ -28,9 +28,8 @@ from ...training import Callback, TrainingLoop, batch_seed
 from ..base import Draw, Examples
 from ..counting.batches import STRIDE, cells
 from ..counting.training import relative_count_loss
-from .head import KINDS, Kind, Maps
-from .heads import PretrainedCountNet
-from .looks import photographed
+from .augmentation import augment
+from .net import KINDS, Kind, Maps, PretrainedCountNet
 from .readability import disagreement
 from .reading import SCOPES, SMALL
 
@@ -93,13 +92,13 @@ class PretrainedCountTraining(TrainingLoop):
             self.photograph_maps = self._embed_photographs(callback)
         if self.done == 0:
             some = slice(0, n, max(1, n // 512))
-            self.net.begin([part[some] for part in maps], [target[some] for target in targets])
+            self.net.initialise([part[some] for part in maps], [target[some] for target in targets])
         super().run(callback)
         self.maps, self.targets, self.photograph_maps = [], [], None
         self.net.eval()
         held_out = [part[n:] for part in maps]
         median = torch.stack([some.median() if len(some) else torch.tensor(math.inf) for some in sizes])
-        self.net.finish(self.net.readings(held_out)[0], true_counts[n:], median)
+        self.net.calibrate(self.net.readings(held_out)[0], true_counts[n:], median)
         scope, rule, classes = self.net.scope, self.net.rules[0].int().argmax(1), torch.arange(len(self.net.scope))
         predicted, known = self.net.held_read[:, scope, rule, classes], self.net.held_true[:, scope, classes]
         each_class = zip(predicted.T, known.T, strict=True)
@@ -144,7 +143,7 @@ class PretrainedCountTraining(TrainingLoop):
         while done < total:
             number = min(DRAWN_AT_ONCE, total - done, self.pairs - done if done < self.pairs else total)
             drawn = self.draw_twice(number)
-            maps = self.net.look(photographed(drawn.image, rng))
+            maps = self.net.compute_maps(augment(drawn.image, rng))
             targets = [self._target(drawn, kind).half() for kind in KINDS]
             parts.append([*(some.half() for some in maps), *targets, self.net.true_counts(drawn)])
             shown = drawn.label.masked_fill(drawn.visible < SCOPES[SMALL].visible, -1)
@@ -162,22 +161,24 @@ class PretrainedCountTraining(TrainingLoop):
         places = drawn.centre * self.net.scale() / kind.stride
         size, number = self.net.places(kind.stride), len(self.net.classes)
         return torch.stack(
-            [cells(places * STRIDE, self.net.seen(drawn, SCOPES[s]), number, *size) for s in kind.scopes], 1
+            [cells(places * STRIDE, self.net.counted_labels(drawn, SCOPES[s]), number, *size) for s in kind.scopes], 1
         )
 
     def _embed_photographs(self, callback: Callback | None) -> Maps:
         """Maps, float16."""
         parts, done = [], 2 * self._structures
         for some in self.photographs:
-            parts.append([part.half() for part in self.net.look(some)])
+            parts.append([part.half() for part in self.net.compute_maps(some)])
             done += len(some)
             if callback is not None:
                 callback(self, {"images": done, "of": self._images})
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
     def _pseudo_labels(self, photographs: Maps) -> list[Tensor]:
-        """What their places hold as the heads read them, see ``PretrainedCountNet.believed``."""
-        parts = [self.net.believed(list(some)) for some in zip(*(part.split(64) for part in photographs), strict=True)]
+        """What their places hold as the heads read them, see ``PretrainedCountNet.pseudo_labels``."""
+        parts = [
+            self.net.pseudo_labels(list(some)) for some in zip(*(part.split(64) for part in photographs), strict=True)
+        ]
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
     def _update(self, rows: Tensor, part: float, photographs: tuple[Maps, list[Tensor]] | None) -> float:
@@ -199,10 +200,10 @@ class PretrainedCountTraining(TrainingLoop):
     def _loss(self, maps: Maps, targets: list[Tensor], self_training: bool = False) -> Tensor:
         """Of all heads, or of those alone that teach themselves."""
         flipped = torch.rand(len(maps[0])) < 0.5
-        seen = [torch.where(flipped[:, None, None, None], some.flip(3), some) for some in self.net.normal(maps)]
+        seen = [torch.where(flipped[:, None, None, None], some.flip(3), some) for some in self.net.normalise(maps)]
         loss = torch.zeros(())
         for kind, heads, target in zip(KINDS, self.net.heads, targets, strict=True):
-            if self_training and not kind.teaches:
+            if self_training and not kind.self_training:
                 continue
             target = torch.where(flipped[:, None, None, None, None], target.flip(4), target).float()
             shifted = [some + kind.shift * torch.randn(*some.shape[:2], 1, 1) for some in seen]

@@ -18,7 +18,7 @@ from probscene.inference.statistics.residual import Grade, ResidualRatio, Sample
 from probscene.inference.statistics.trust import Trust
 from probscene.inference.statistics.verdict import Verdict
 
-from ..fitting.outcome import compared
+from ..fitting.outcome import feature_mask
 from ..fitting.preset import BOTH
 from ..fitting.run import RunFolder
 from .advice import of_structure, remedy
@@ -177,7 +177,7 @@ def called(word: Grade | None, verdict: Verdict) -> Grade | None:
 
 def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: int) -> VerdictComponent:
     net = run.network()
-    which = None if net is None else compared(net)
+    which = None if net is None else feature_mask(net)
     sides = {name: Sample(_some(each if which is None else each[:, which])) for name, each in features.items()}
     figures = residual_ratio(sides[TARGET], sides[LEARNT], {PRIOR: sides[PRIOR]}, seed=seed)
     word = called(None if figures is None else figures.word, found.verdict)

@@ -27,7 +27,7 @@ from ..labels.partial_labels import PartialLabels, PartlyLabelled
 from ..progress import Progress
 from ..workers.cluster import Cluster
 from .cache import NetworkCache
-from .outcome import compared, conclude, give_up
+from .outcome import conclude, feature_mask, give_up
 from .parameter_stage import READER, learn_parameters
 from .plugins import inner
 from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
@@ -80,7 +80,7 @@ def fit(
         net.finish(cache_in, use_cache, say or (lambda text: None))
         run.keep_network(net.net)
         real = _real_features(run, net.net, progress, images)
-    which = compared(net.net)
+    which = feature_mask(net.net)
     with threads(1):  # the guide's tensors are tiny: a second thread only waits
         if which is not None and not which.any():
             said = give_up(run)
@@ -205,7 +205,7 @@ def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: 
     features, *others = (
         embed_all(net, images.batches(RENDERED_AT_ONCE, view), each, real=True) for view in range(views)
     )
-    which = compared(net)
+    which = feature_mask(net)
     if which is None or which.any():
         check_features(features)
     kept = {"features": features, "fingerprint": fingerprint(images)}

@@ -30,7 +30,7 @@ from probscene.sampling import sample, seed_everything
 from ..progress import Progress
 from ..workers.actor_pool import ActorPool
 from ..workers.cluster import Cluster
-from .outcome import compared
+from .outcome import feature_mask
 from .parameter_stage import NAME, READER, beside, with_parameters
 from .plugins import inner
 from .preset import Preset
@@ -127,7 +127,7 @@ def learn_structure_again(
     trainer = _trainer(run, model, guide, objective, real, preset.batches_again, rate, seeds, pool)
     seen = _seen(run, observer, net, guide)
     _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
-    which = compared(net)
+    which = feature_mask(net)
     which = slice(None) if which is None else which
     now, then, target = (part[:, which].double().numpy() for part in (_seen(run, observer, net, guide), seen, real))
     if bootstrap_test(now, then, target).sure:

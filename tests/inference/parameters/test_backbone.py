@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.photographs.net import PretrainedCountNet
 from probscene.inference.features.presence import PresenceNet
 from probscene.inference.parameters.backbone import WIDTH, Backbone, RenderBackbone, cell_colours
 from probscene.inference.parameters.reader import Reader

@@ -71,7 +71,7 @@ def test_sites_that_are_read_with_an_error_are_refined(smeared):
     of_nodes = tuple(Site(name, ("cell",)) for name in ("sharp", "poor", "never", "turn"))
     tried = CalibratedReader(smeared, SimpleNamespace(), of_nodes, (Site("sun", ()), Site("cloud", ())))
     tried.skill = Skill(torch.zeros(6, dtype=torch.int64), torch.tensor([0.95, 0.1, 0.5, 0.6, 0.5, 0.95]))
-    tried.readings_of = torch.tensor([100, 100, 3, 100, 100, 100])
+    tried.num_readings = torch.tensor([100, 100, 3, 100, 100, 100])
     assert tried.good.tolist() == [True, False, False, True, True, True]
     assert tried.noisy.tolist() == [False, True, True, False]
 

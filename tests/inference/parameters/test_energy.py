@@ -13,7 +13,7 @@ from probscene.inference.parameters.energy import (
     WeightedEnergyDistance,
     WeightedRows,
     energy_distance,
-    moving,
+    reparameterised_readings,
 )
 from probscene.inference.parameters.graph import SceneGraph
 from probscene.inference.parameters.likelihood import Values
@@ -87,7 +87,7 @@ def test_the_gradient_is_that_of_finite_differences(seed):
     expected = float(found(away) - found(-away)) / (2 * away)
     read = values_of(nodes, scene)
     own = GuideReadings(read.kind, read.parent, nodes, scene, read, torch.arange(3).expand(30, 3))
-    moved = moving(net, own, ALL)
+    moved = reparameterised_readings(net, own, ALL)
     assert torch.equal(moved.nodes, nodes) and torch.equal(moved.scene, scene)
     energy_distance(moved, target).backward()
     slope = sum(
@@ -120,7 +120,7 @@ def test_objects_that_were_not_drawn_do_not_move():
     graph, scene, nodes = (x if isinstance(x, SceneGraph) else x.detach() for x in drawn(net, 10))
     read = values_of(nodes, scene)
     which = torch.tensor([0, -1, 2]).expand(10, 3)
-    found = moving(net, GuideReadings(graph.kind, graph.parent, nodes, scene, read, which), ALL)
+    found = reparameterised_readings(net, GuideReadings(graph.kind, graph.parent, nodes, scene, read, which), ALL)
     moves = torch.autograd.grad(
         found.nodes[:, 1].sum() + 0 * found.nodes.sum(), list(net.parameters()), allow_unused=True
     )

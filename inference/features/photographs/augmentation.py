@@ -13,7 +13,7 @@ EXPOSURE = 0.05  # standard deviation, of the range
 BLUR, NOISE, QUALITY = 1.2, 0.04, (40, 96)  # largest blur in pixels, largest noise of the range, JPEG's quality
 
 
-def photographed(images: Tensor, rng: np.random.Generator) -> Tensor:
+def augment(images: Tensor, rng: np.random.Generator) -> Tensor:
     """Each image in a light, focus and quality of its own.
 
     Args:
