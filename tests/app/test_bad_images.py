@@ -102,7 +102,7 @@ def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp
 
 @pytest.mark.parametrize(
     ("setting", "where"),
-    [("count.learning_rate=1e38", "at step"), ("pretrain_rate=1e37", "epoch "), ("learning_rate=1e37", "At batch ")],
+    [("count.learning_rate=1e38", " steps "), ("pretrain_rate=1e37", "epoch "), ("learning_rate=1e37", "At batch ")],
 )
 def test_what_is_no_longer_finite_stops_with_the_step_and_a_remedy(call, discs, target, tmp_path, setting, where):
     out = tmp_path / "run"

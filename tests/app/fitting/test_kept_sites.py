@@ -17,7 +17,7 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
     """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target."""
 
     class Learning:
-        tried = SimpleNamespace(low_skill_sites=frozenset("u"))
+        calibrated = SimpleNamespace(low_skill_sites=frozenset("u"))
 
         def site_rows(self, images):
             assert set(images) == {"learnt", "prior", "target"}
@@ -99,7 +99,7 @@ def test_of_many_sites_none_is_learnt_by_chance():
     """Of forty learnt renders are as far away as the prior's; of one they are nearer, which is seen all the same."""
 
     class Learning:
-        tried = SimpleNamespace(low_skill_sites=frozenset())
+        calibrated = SimpleNamespace(low_skill_sites=frozenset())
 
         def site_rows(self, images):
             torch.manual_seed(0)
@@ -134,8 +134,8 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
         return real + learnt * ways + 2.0 * (needed in without)
 
     class Learning:
-        tried = SimpleNamespace(low_skill_sites=frozenset("u"), state=lambda: {"reader": read_by})
-        guide = SimpleNamespace(suited=lambda model: "learnt", net=torch.nn.Linear(2, 2))
+        calibrated = SimpleNamespace(low_skill_sites=frozenset("u"), state=lambda: {"reader": read_by})
+        guide = SimpleNamespace(with_parameters=lambda model: "learnt", net=torch.nn.Linear(2, 2))
         best = SimpleNamespace(held=SimpleNamespace(looks=looks, real=real))
 
         def site_rows(self, images):

@@ -251,13 +251,13 @@ def test_cells_hold_the_sum_of_probabilities(dots):
     torch.testing.assert_close(cells.sum((2, 3)), by_sum, rtol=1e-4, atol=1e-5)
 
 
-def test_what_is_believed_is_whole_objects_or_none(dots):
+def test_pseudo_labels_are_whole_objects_or_none(dots):
     net = untrained(dots)
     held = torch.zeros(1, len(SCOPES), 2, 14, 14)
     held[..., 0, 3, 3], held[..., 0, 3, 10] = 0.6, 0.05  # surely one, and hardly one
     held[..., 1, 8, 3:5] = 0.4  # one between two places
     kinds = [held[:, list(kind.scopes)].expand(4, -1, -1, -1, -1, -1) for kind in KINDS]
-    net.by_head = lambda maps: kinds
+    net.head_probabilities = lambda maps: kinds
     for kind, found in zip(KINDS, net.pseudo_labels([]), strict=True):
         assert found.shape == (1, len(kind.scopes), 3, 14, 14)
         assert torch.allclose(found.sum(2), torch.ones(1)) and (found >= 0).all()
