@@ -196,7 +196,7 @@ def held(mass: Tensor, n: Tensor, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor,
 
 
 def value_loss(output: Tensor, u: Tensor) -> Tensor:
-    """``(...)`` of what is output of u, ``(..., 2 + HARMONICS)``: the negative log density of the normal distribution,
+    """``(...)`` of the output for u, ``(..., 2 + HARMONICS)``: the negative log density of the normal distribution,
     times its standard deviation without gradient [1], and the squared errors of the circles. Without the factor the
     gradient of a site that is read sharply, a place, would be all that shared weights follow."""
     mean, sd = normal(output)

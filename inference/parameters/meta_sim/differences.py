@@ -59,10 +59,8 @@ class SampledScenes(NamedTuple):
         """``num`` scenes of a policy."""
         derivation = derive_complete(model.grammar, structure, num, model.max_steps)[0]
         scenes = run_program(model, derivation)
-        found, class_nodes = (
-            quantiles_of(model, scenes),
-            ClassNodes.from_derivation(model.grammar, model.classes, derivation),
-        )
+        found = quantiles_of(model, scenes)
+        class_nodes = ClassNodes.from_derivation(model.grammar, model.classes, derivation)
         there = (class_nodes.kind >= 0).unsqueeze(-1)
         nodes = [class_nodes.gather(found[site.name]) for site in sites if not site.of_scene]
         scene = [of_scenes(found[site.name]) for site in sites if site.of_scene]
