@@ -38,9 +38,9 @@ from probscene.errors import ProbsceneError
 from probscene.inference.divergence import MMD, KDELogRatio
 from probscene.inference.guides.base import Guide
 from probscene.inference.guides.pcfg import PCFG
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import BASELINES, ScoreFunction
 from probscene.inference.pretrain import pretrain
+from probscene.inference.structure_training import StructureTraining
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
 from probscene.relations import per_parent
 from probscene.sampling import Scenes, seed_everything
@@ -55,7 +55,7 @@ SCENES, BATCH, VARIANCES = (30_000, 60_000, 120_000), (50, 150, 500), (1.0, 4.0,
 
 @dataclass(frozen=True)
 class Settings:
-    """What is searched; see ``Trainer`` and ``ScoreFunction``."""
+    """What is searched; see ``StructureTraining`` and ``ScoreFunction``."""
 
     learning_rate: float
     updates: int
@@ -130,7 +130,7 @@ def learnt(fit: str, settings: Settings, truth: Truth, seed: int) -> Guide:
     loss = ScoreFunction(observe, divergence, settings.baseline, updates=settings.updates)
     batches = max(1, settings.scenes // settings.num_scenes)
     rate, num_scenes = settings.learning_rate, settings.num_scenes
-    Trainer(structures, guide, loss, real, batches, num_scenes, learning_rate=rate, seed=seed).run()
+    StructureTraining(structures, guide, loss, real, batches, num_scenes, learning_rate=rate, seed=seed).run()
     return guide
 
 

@@ -32,7 +32,7 @@ from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
 from probscene.derive import derive_complete
 from probscene.inference.features.base import FeatureNet
-from probscene.inference.features.counting.choices import CountFeatures
+from probscene.inference.features.counting.training import CountFeatures
 from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
 from probscene.inference.statistics.tally import around
 from probscene.model import SceneModel

@@ -40,7 +40,7 @@ from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.parameters.sites import NEAR, quantiles_of, site_name, within
+from probscene.inference.parameters.sites import U_EPS, quantiles_of, site_name, with_handlers
 from probscene.inference.statistics.image_metrics import kid
 from probscene.inference.statistics.metrics import histogram, total_variation
 from probscene.model import SceneModel
@@ -69,7 +69,7 @@ class Narrowed(Messenger):
         low = self.lowest.get(site_name(self.grammar, msg["name"]))
         if low is not None and msg["value"] is None:
             u = msg["fn"].cdf(msg["fn"].sample())
-            msg["value"] = msg["fn"].icdf((low + WIDTH * u).clamp(NEAR, 1 - NEAR))
+            msg["value"] = msg["fn"].icdf((low + WIDTH * u).clamp(U_EPS, 1 - U_EPS))
 
 
 def hidden(model: SceneModel, seed: int) -> SceneModel:
@@ -77,7 +77,7 @@ def hidden(model: SceneModel, seed: int) -> SceneModel:
     assert model.target is not None
     truth, rng = model.target(seed), np.random.default_rng(seed)
     lowest = dict(zip(HIDDEN, rng.uniform(0, 1 - WIDTH, len(HIDDEN)).tolist(), strict=True))
-    return within(truth, Narrowed(truth, lowest))
+    return with_handlers(truth, Narrowed(truth, lowest))
 
 
 def quantiles(model: SceneModel, drawn_by: SceneModel, policy: Policy, seed: int) -> dict[str, list[np.ndarray]]:
@@ -109,7 +109,9 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
     run = fit(args.model, folder / "images", config, out=out, seed=seed, resume=True, execution=execution)
     tensors = run.read_tensors(NAME)
     learnt = (
-        learnt_by(model, run.config, run.parameters, run.guide, beside(tensors)).suited(model) if tensors else model
+        learnt_by(model, run.config, run.parameters, run.guide, beside(tensors)).with_parameters(model)
+        if tensors
+        else model
     )
     structure = copy(run.guide)
     structure.suits = None

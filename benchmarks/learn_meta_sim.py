@@ -41,7 +41,7 @@ IMAGES, TRIED, TOLD = 1000, 500, 10  # of the target; scenes that figures are of
 
 def figures(transform: ParameterTransform | None, structure: Policy) -> tuple[dict[str, float], Tensor]:
     """Of new scenes, how far they are from rows; and images of some of them."""
-    model = MODEL if transform is None else transform.suited(MODEL)
+    model = MODEL if transform is None else transform.with_parameters(MODEL)
     seed_everything(1)
     with torch.no_grad():
         scenes = sample(model, structure, TRIED)

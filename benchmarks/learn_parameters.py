@@ -116,7 +116,7 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
     panels, tensors = [], run.read_tensors(NAME)
     suits = None
     if tensors:
-        suits = learnt_by(run.model, run.config, run.parameters, run.guide, beside(tensors)).suited
+        suits = learnt_by(run.model, run.config, run.parameters, run.guide, beside(tensors)).with_parameters
     for source in SOURCES:
         policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
         policy.suits = suits if source in ("parameters", "both") else None

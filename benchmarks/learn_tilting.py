@@ -135,7 +135,7 @@ def main():
         row: dict = {"seed": seed, "photographs": len(target), "judged": int(held.sum())}
         row |= {"moved": [site.name for site in learning.learnt], "renders": learning.schedule.drawn}
         row["seconds"] = round(time.process_time() - before)
-        learnt = model if learning.guide is None else learning.guide.suited(model)
+        learnt = model if learning.guide is None else learning.guide.with_parameters(model)
         images = renders(observer, learnt, start, args.images)
         of_source = same | {"learnt": apart(images)}
         row |= {judge: {source: found[judge] for source, found in of_source.items()} for judge in judges}

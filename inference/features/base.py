@@ -65,8 +65,8 @@ class FeatureNet(Protocol):
 
 
 Draw = Callable[[int], Examples]
-Seen = Callable[[int, int], None]
-"""Told how many images have been looked at, and of how many."""
+ImageCallback = Callable[[int, int], None]
+"""Called with how many images have been embedded, and of how many."""
 
 
 class Renders(Protocol):
@@ -164,12 +164,12 @@ class Features(Protocol):
         """
         return None
 
-    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
+    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], callback: ImageCallback) -> dict[str, Any]:
         """Suit a trained network to the target's images, in place, such as by choosing how counts are read in them.
 
         Args:
             photographs: opens the target; a network that learns from it is bound to it, see ``target_fingerprint``.
-            each: is told how many images have been looked at, and of how many.
+            callback: called with how many images have been embedded, and of how many.
 
         Returns:
             What was found, for JSON; of features that count, under ``"classes"``, a record of each class with
@@ -264,9 +264,9 @@ def embed_real(net: FeatureNet, images: Tensor) -> Tensor:
 
 @torch.no_grad()
 def embed_all(
-    net: FeatureNet, batches: Iterable[Tensor], each: Callable[[int], None] | None = None, real: bool = False
+    net: FeatureNet, batches: Iterable[Tensor], callback: Callable[[int], None] | None = None, real: bool = False
 ) -> Tensor:
-    """Features ``(L, D)`` of a stream of image batches; ``each`` is told how many more images are done.
+    """Features ``(L, D)`` of a stream of image batches; ``callback`` is called with how many more images are done.
 
     Args:
         real: whether they are the target's images.
@@ -277,8 +277,8 @@ def embed_all(
     out = []
     for images in batches:
         out.append(embed_real(net, images) if real else net.embed(images))
-        if each is not None:
-            each(len(images))
+        if callback is not None:
+            callback(len(images))
     features = torch.cat(out)
     if not torch.isfinite(features).all():
         raise ProbsceneError("expected finite features, got NaN or infinity; train the feature network again.")

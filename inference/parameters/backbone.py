@@ -13,11 +13,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..features.base import FeatureNet, enter
-from ..features.counting.batches import images_a_step
+from ..features.counting.batches import images_per_step
 from ..features.counting.net import CountNet, conv, layers
 
 if TYPE_CHECKING:
-    from ..features.photographs.heads import PretrainedCountNet
+    from ..features.photographs.net import PretrainedCountNet
 
 WIDTH = 64  # channels
 STRIDE = 4  # pixels of a reduced image a cell
@@ -30,26 +30,26 @@ class Backbone(nn.Module):
 
     Attributes:
         cell: ``(2,)`` pixels of the image that a cell spans, along x and y.
-        knowing: parts that know much already, and are trained slowly.
+        pretrained_parts: parts that know much already, and are trained slowly.
     """
 
     cell: Tensor
-    knowing: tuple[nn.Module, ...] = ()
+    pretrained_parts: tuple[nn.Module, ...] = ()
 
     def enter(self, images: Tensor) -> Tensor:
         """Of ``(N, 1 or 3, H, W)`` uint8 images."""
         raise NotImplementedError
 
-    def images_a_step(self, most: int) -> int:
+    def images_per_step(self, most: int) -> int:
         """How many images it is shown in a step of its training, at most ``most``."""
         return most
 
     @staticmethod
-    def of(net: FeatureNet) -> "Backbone | None":
+    def from_feature_net(net: FeatureNet) -> "Backbone | None":
         """That which suits what structure was learnt by; None where nothing does."""
         if isinstance(net, CountNet):
             return RenderBackbone(net)
-        if hasattr(net, "look"):  # torchvision takes seconds to import
+        if hasattr(net, "compute_maps"):  # torchvision takes seconds to import
             return PhotographBackbone(cast("PretrainedCountNet", net))
         return None
 
@@ -65,16 +65,16 @@ class RenderBackbone(Backbone):
         self.side, self.down = nn.Conv2d(b, WIDTH, 1, bias=False), nn.Conv2d(c, WIDTH, 1, bias=False)
         self.both = nn.Sequential(nn.BatchNorm2d(WIDTH), nn.ReLU(inplace=True), *conv(WIDTH, WIDTH, 3, 1))
         self.cell = torch.full((2,), float(STRIDE * self.reduce))
-        self.knowing = self.fine, self.coarse
+        self.pretrained_parts = self.fine, self.coarse
 
     def enter(self, images: Tensor) -> Tensor:
         """Reduced images, padded to whole cells."""
         x = enter(images, self.channels, self.reduce)
         return F.pad(x, (0, -x.shape[-1] % (2 * STRIDE), 0, -x.shape[-2] % (2 * STRIDE)))
 
-    def images_a_step(self, most: int) -> int:
+    def images_per_step(self, most: int) -> int:
         """See ``Backbone``; fewer where they are large."""
-        return images_a_step(most, self.area)
+        return images_per_step(most, self.area)
 
     def forward(self, x: Tensor) -> Tensor:
         """See ``Backbone``."""
@@ -106,7 +106,7 @@ class PhotographBackbone(Backbone):
     def forward(self, x: Tensor) -> Tensor:
         """See ``Backbone``."""
         net = self.net[0]
-        maps, size = net.normal(net.look(x)), net.places(FINEST)
+        maps, size = net.normalise(net.compute_maps(x)), net.places(FINEST)
         if self.training:
             shifted = (some + SHIFT * torch.randn(*some.shape[:2], 1, 1) for some in maps)
             maps = [F.dropout2d(some, DROPPED) for some in shifted]

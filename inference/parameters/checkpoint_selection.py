@@ -13,7 +13,7 @@ from .guide import ParameterGuide
 
 
 class HeldOutSet(NamedTuple):
-    """What judges.
+    """Held-out images that guides are compared with.
 
     Attributes:
         look: gives features of a guide's renders, ``(N, D)``, under one seed.
@@ -23,52 +23,52 @@ class HeldOutSet(NamedTuple):
     look: Callable[[ParameterGuide], Features]
     real: Features
 
-    def looks(self, guide: ParameterGuide, passed: frozenset[str]) -> Features:
+    def looks(self, guide: ParameterGuide, prior_sites: frozenset[str]) -> Features:
         """Those of a guide's renders in which sites of some names have their prior, ``(N, D)``."""
-        guide.passed = passed
+        guide.prior_sites = prior_sites
         looks = self.look(guide)
-        guide.passed = frozenset()
+        guide.prior_sites = frozenset()
         return looks
 
 
 class CheckpointSelector:
-    """Goes back to the best state where training has made a guide's scenes surely farther from the images.
+    """Goes back to the best state where training made a guide's scenes significantly farther from held-out images.
 
     Attributes:
         weights: of the best guide's network so far; empty before the first one.
-        passed: names of its sites that had their prior where it was judged.
+        prior_sites: names of its sites that had their prior where it was judged.
     """
 
     def __init__(self, held: HeldOutSet):
-        self.held, self.weights, self.passed = held, dict[str, Tensor](), frozenset[str]()
+        self.held, self.weights, self.prior_sites = held, dict[str, Tensor](), frozenset[str]()
         self.looks: Features | None = None
 
-    def after(self, guide: ParameterGuide, passed: frozenset[str] = frozenset()) -> None:
-        """Judge a guide after a training of it; in place.
+    def update(self, guide: ParameterGuide, prior_sites: frozenset[str] = frozenset()) -> None:
+        """Compare a guide with the best so far, after a training of it; in place.
 
         Args:
-            passed: names of sites that have their prior in the renders that are compared, as they would keep it in the
-                end: what was learnt of them must not decide about the others.
+            prior_sites: names of sites that have their prior in the renders that are compared, as they would keep it in
+                the end: what was learnt of them must not decide about the others.
         """
         now = {key: value.clone() for key, value in guide.net.state_dict().items()}
-        looks = self.held.looks(guide, passed)
+        looks = self.held.looks(guide, prior_sites)
         if self.weights:
             guide.net.load_state_dict(self.weights)
             if self.looks is None:  # resumed
-                self.looks = self.held.looks(guide, self.passed)
+                self.looks = self.held.looks(guide, self.prior_sites)
             if bootstrap_test(looks, self.looks, self.held.real).sure:
                 return
             guide.net.load_state_dict(now)
-        self.weights, self.looks, self.passed = now, looks, passed
+        self.weights, self.looks, self.prior_sites = now, looks, prior_sites
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
         weights = {f"weights.{key}": value for key, value in self.weights.items()}
-        return weights | {f"passed.{name}": torch.ones(()) for name in self.passed}
+        return weights | {f"passed.{name}": torch.ones(()) for name in self.prior_sites}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a ``state``."""
-        self.weights, self.passed = of_prefix(tensors, "weights."), frozenset(of_prefix(tensors, "passed."))
+        self.weights, self.prior_sites = of_prefix(tensors, "weights."), frozenset(of_prefix(tensors, "passed."))
 
 
 def uninformative_sites(guide: ParameterGuide, held: HeldOutSet) -> frozenset[str]:

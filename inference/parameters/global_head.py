@@ -9,48 +9,49 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-HIDDEN, DROPPED = 96, 0.2
+HIDDEN, DROPOUT = 96, 0.2
 PICTURE, PROFILE = (16, 24), 48  # rows and columns of coarse pictures; parts of a profile
-NUMBERS = 6 + 5 * PICTURE[0] * PICTURE[1] + 4 * PROFILE
-FARTHEST = 5.0  # deviations that enter, at most
+NUM_FEATURES = 6 + 5 * PICTURE[0] * PICTURE[1] + 4 * PROFILE
+MAX_DEVIATIONS = 5.0  # deviations that enter, at most
 
 
 class GlobalHead(nn.Module):
-    """What is said of the scenes' sites.
+    """A head for the scenes' sites.
 
     Args:
         sites: G.
-        each: how many numbers are said of a site.
-        dropped: share of what enters that is left out in training.
+        outputs: numbers a site.
+        dropout: share of what enters that is left out in training.
     """
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, sites: int, each: int, dropped: float = DROPPED):
+    def __init__(self, sites: int, outputs: int, dropout: float = DROPOUT):
         super().__init__()
-        self.sites, self.each, self.drop = sites, each, nn.Dropout(dropped)
-        self.join, self.out = nn.Linear(NUMBERS, HIDDEN), nn.Linear(HIDDEN, sites * each)
-        self.register_buffer("mean", torch.zeros(NUMBERS))
-        self.register_buffer("deviation", torch.zeros(NUMBERS))
+        self.sites, self.outputs, self.drop = sites, outputs, nn.Dropout(dropout)
+        self.join, self.out = nn.Linear(NUM_FEATURES, HIDDEN), nn.Linear(HIDDEN, sites * outputs)
+        self.register_buffer("mean", torch.zeros(NUM_FEATURES))
+        self.register_buffer("deviation", torch.zeros(NUM_FEATURES))
 
     def forward(self, images: Tensor) -> Tensor:
-        """``(N, G, each)`` of ``(N, 1 or 3, H, W)`` images, float32 in 0..1 or uint8."""
-        return self.said(looks(images))
+        """``(N, G, outputs)`` of ``(N, 1 or 3, H, W)`` images, float32 in 0..1 or uint8."""
+        return self.from_features(global_features(images))
 
-    def said(self, x: Tensor) -> Tensor:
-        """``(N, G, each)`` of ``looks``."""
+    def from_features(self, x: Tensor) -> Tensor:
+        """``(N, G, outputs)`` of ``global_features``."""
         x = (x - self.mean) / (self.deviation + 1e-4)
-        return self.out(F.relu(self.join(self.drop(x.clamp(-FARTHEST, FARTHEST))))).unflatten(1, (-1, self.each))
+        hidden = F.relu(self.join(self.drop(x.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS))))
+        return self.out(hidden).unflatten(1, (-1, self.outputs))
 
-    def follow(self, x: Tensor) -> None:
+    def fit_normalisation(self, x: Tensor) -> None:
         """Take the mean and the deviation of numbers that enter from these, if from none before."""
         if not self.deviation.any():
             self.mean.copy_(x.mean(0))
             self.deviation.copy_(x.std(0))
 
 
-def looks(images: Tensor) -> Tensor:
+def global_features(images: Tensor) -> Tensor:
     """``(N, E)`` of ``(N, 1 or 3, H, W)`` images, see above."""
     x = (images if images.is_floating_point() else images / 255).expand(-1, 3, -1, -1)
     grey, colour = x.mean(1, keepdim=True), x.amax(1, keepdim=True) - x.amin(1, keepdim=True)

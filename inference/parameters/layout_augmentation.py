@@ -13,8 +13,8 @@ from torch import Tensor
 
 from probscene.grammar import Grammar
 
-from .graph import Graph
-from .sites import NEAR, site_name
+from .graph import SceneGraph
+from .sites import U_EPS, site_name
 
 SAME, SPACED = 0.3, 0.3  # shares of the arranged scenes' sites; the rest is independent
 JITTER = 0.08  # largest spread of u around a pattern
@@ -32,11 +32,11 @@ class LayoutAugmentation(Messenger):
     def __init__(self, grammar: Grammar, names: frozenset[str], share: float = 0.5):
         super().__init__()
         self.grammar, self.names, self.share = grammar, names, share
-        self.graph: Graph | None = None
+        self.graph: SceneGraph | None = None
         self.chosen = torch.zeros(0, dtype=torch.bool)
 
     def _pyro_post_derive(self, msg: Any) -> None:
-        self.graph = Graph.of(msg["value"].kind, msg["value"].parent)
+        self.graph = SceneGraph.from_nodes(msg["value"].kind, msg["value"].parent)
         self.chosen = torch.rand(len(self.graph.kind)) < self.share
 
     def _pyro_sample(self, msg: Any) -> None:
@@ -44,7 +44,7 @@ class LayoutAugmentation(Messenger):
             return
         fn = msg["fn"]
         drawn = fn.sample()
-        u = self._pattern(fn.cdf(drawn)).clamp(NEAR, 1 - NEAR)
+        u = self._pattern(fn.cdf(drawn)).clamp(U_EPS, 1 - U_EPS)
         msg["value"] = torch.where(self.chosen[:, None], fn.icdf(u), drawn)
 
     def _pattern(self, u: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Objects that are not found in an image: what is far, small or behind something is found less often.
+"""Objects that the reader misses: what is far, small or behind something is detected less often.
 
 What is read in a target is of the objects that are found there, which are not a fair sample. So each scene graph that
 was read gets, beside its own objects, those that were not found in a render of the guide. That is the expectation step
@@ -20,9 +20,11 @@ from .graph import class_of
 from .reader import Detections
 from .reader_training import SupervisedBatch
 
-FEWEST = 20  # objects of a class that are found, and that are not, by which it is told
-TOLD = 0.03  # least Wasserstein-1 distance between u of what is found and of all by which finding goes by a site
-MOST = 4.0  # weight
+MIN_OBJECTS = 20  # objects of a class that are found, and that are not, by which it is told
+MIN_DISTANCE = (
+    0.03  # least Wasserstein-1 distance between u of what is found and of all by which finding goes by a site
+)
+MAX_WEIGHT = 4.0  # weight
 
 
 class MissedObjects(NamedTuple):
@@ -46,7 +48,7 @@ class MissedObjects(NamedTuple):
     rate: Tensor
 
     @staticmethod
-    def of(valued: SupervisedBatch, kinds: Tensor, found: Tensor, sites: Tensor) -> "MissedObjects":
+    def from_renders(valued: SupervisedBatch, kinds: Tensor, found: Tensor, sites: Tensor) -> "MissedObjects":
         """Of renders.
 
         Args:
@@ -58,8 +60,9 @@ class MissedObjects(NamedTuple):
         u, counts = valued.u[..., sites], torch.zeros(len(kinds), len(sites), dtype=torch.bool)
         for c in range(len(kinds)):
             of_class, here = label == c, found & (label == c)
-            if FEWEST <= int(here.sum()) <= int(of_class.sum()) - FEWEST:
-                counts[c] = torch.tensor([_told(u[..., s][here], u[..., s][of_class]) for s in range(len(sites))])
+            if MIN_OBJECTS <= int(here.sum()) <= int(of_class.sum()) - MIN_OBJECTS:
+                sides = zip(u[here].unbind(1), u[of_class].unbind(1), strict=True)
+                counts[c] = torch.tensor([_detection_depends_on(*pair) for pair in sides])
         n, m = ((label >= 0) & ~found & counts.any(1)[label]).nonzero(as_tuple=True)
         centre, above = valued.drawn.centre, valued.parent[n, m].clamp(min=0)
         return MissedObjects(
@@ -72,21 +75,21 @@ class MissedObjects(NamedTuple):
             label[found & (label >= 0)].bincount(minlength=len(kinds)) / len(found),
         )
 
-    def beside(self, found: Detections, number: int) -> tuple[Detections, Tensor, Tensor]:
-        """With what was found in so many images, each has the objects that were not found in one of the renders.
+    def impute(self, found: Detections, number: int) -> tuple[Detections, Tensor, Tensor]:
+        """Add to the detections in each of so many images the objects that were missed in one of the renders.
 
         Returns:
             all objects, those that were found first; u of the others; and how much each of all counts, which is 1 for
             those that were found. Another counts as often as its class is found in the images for once in the renders.
         """
         rate = found.label.bincount(minlength=len(self.rate)) / max(number, 1)
-        weight = (rate / self.rate.clamp(min=1e-6)).clamp(max=MOST)
+        weight = (rate / self.rate.clamp(min=1e-6)).clamp(max=MAX_WEIGHT)
         render = torch.randint(max(int(self.renders), 1), (number,))
         image, which = (self.image == render[:, None]).nonzero(as_tuple=True)
         return (
             Detections(
                 torch.cat([found.image, image]),
-                torch.cat([found.mass, found.mass.new_zeros(len(which))]),
+                torch.cat([found.score, found.score.new_zeros(len(which))]),
                 torch.cat([found.label, self.label[which]]),
                 torch.cat([found.centre, self.centre[which]]),
                 torch.cat([found.parent, self.parent[which]]),
@@ -98,8 +101,8 @@ class MissedObjects(NamedTuple):
         )
 
 
-def _told(found: Tensor, every: Tensor) -> bool:
+def _detection_depends_on(found: Tensor, every: Tensor) -> bool:
     """Whether finding goes by a site of a class, by u ``(K,)``."""
     if found.isnan().any():
         return False
-    return float(wasserstein_distance(found.numpy(), every.numpy())) > TOLD
+    return float(wasserstein_distance(found.numpy(), every.numpy())) > MIN_DISTANCE

@@ -11,7 +11,7 @@ from ..features.counting.net import CountNet
 from .backbone import RenderBackbone
 from .reader import Reader
 
-OF_COUNTS = ("eye.", "what.", "least")  # parts of a reader that find objects
+COUNTING_PREFIXES = ("eye.", "what.", "least")  # parts of a reader that find objects
 
 
 class ReaderCounts:
@@ -19,7 +19,7 @@ class ReaderCounts:
 
     Args:
         net: that count network, on whose convolutions the reader is.
-        state: of the reader, see ``OF_COUNTS``.
+        state: of the reader, see ``COUNTING_PREFIXES``.
     """
 
     def __init__(self, net: CountNet, state: dict[str, Tensor]):
@@ -34,6 +34,6 @@ class ReaderCounts:
         return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
 
 
-def of_counts(reader: Reader) -> dict[str, Tensor]:
+def counting_state(reader: Reader) -> dict[str, Tensor]:
     """What ``ReaderCounts`` needs of a reader's state."""
-    return {key: value for key, value in reader.state_dict().items() if key.startswith(OF_COUNTS)}
+    return {key: value for key, value in reader.state_dict().items() if key.startswith(COUNTING_PREFIXES)}

@@ -17,16 +17,15 @@ from probscene.sampling import seed_everything
 from ..features.base import Examples
 from ..features.counting.batches import STRIDE as CELL
 from ..features.counting.batches import cells, shares
-from ..steps import StepTraining
-from ..training import batch_seed
-from .global_head import NUMBERS, GlobalHead, looks
+from ..training import AdamTraining, batch_seed
+from .global_head import NUM_FEATURES, GlobalHead, global_features
 from .reader import Reader, value_loss
-from .schedule import EACH
+from .schedule import RENDERS_PER_STEP
 
 MIN_VISIBLE = 0.25
-KEPT = 0.25  # of the rate, for convolutions that know the classes already
+PRETRAINED_RATE = 0.25  # of the rate, for parts that are pretrained
 SCENE_IMAGES = 64  # of a step on sites of scenes
-TOGETHER, APART = 256, 64  # renders that are drawn at once; steps from then until the next are
+RENDERS_PER_DRAW, STEPS_PER_DRAW = 256, 64  # renders that are drawn at once; steps from then until the next are
 
 
 class SupervisedBatch(NamedTuple):
@@ -48,25 +47,25 @@ class SupervisedBatch(NamedTuple):
     u: Tensor
     overall: Tensor
 
-    def of(self, rows: slice) -> "SupervisedBatch":
+    def select(self, rows: slice) -> "SupervisedBatch":
         """Some of the scenes."""
         drawn = self.drawn._replace(**{name: part[rows] for name, part in self.drawn._asdict().items()})
         return SupervisedBatch(drawn, *(part[rows] for part in self[1:]))
 
 
-class ReaderTraining(StepTraining):
+class ReaderTraining(AdamTraining):
     """Resumable training.
 
     Args:
         reader: trained in place.
         draw: so many valued renders.
         steps: of AdamW.
-        images: a step, at most; see ``Backbone.images_a_step``.
+        images: a step, at most; see ``Backbone.images_per_step``.
         learning_rate: the largest.
         seed: of everything random.
     """
 
-    what = "the reader"
+    subject = "the reader"
 
     def __init__(
         self,
@@ -77,19 +76,24 @@ class ReaderTraining(StepTraining):
         learning_rate: float = 4e-3,
         seed: int = 0,
     ):
-        knowing = [parameter for part in reader.eye.knowing for parameter in part.parameters()]
-        rest = [parameter for parameter in reader.parameters() if not any(parameter is other for other in knowing)]
-        groups = [{"params": rest}, *([{"params": knowing, "lr": KEPT * learning_rate}] if knowing else [])]
+        pretrained_parts = [parameter for part in reader.eye.pretrained_parts for parameter in part.parameters()]
+        rest = [
+            parameter for parameter in reader.parameters() if not any(parameter is other for other in pretrained_parts)
+        ]
+        groups = [
+            {"params": rest},
+            *([{"params": pretrained_parts, "lr": PRETRAINED_RATE * learning_rate}] if pretrained_parts else []),
+        ]
         adam = torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
         super().__init__(reader, adam, steps, seed, warmup_steps=30)
-        self.reader, self.draw, self.images = reader, draw, reader.eye.images_a_step(images)
+        self.reader, self.draw, self.images = reader, draw, reader.eye.images_per_step(images)
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         return reader_loss(self.reader, self.draw(self.images))
 
 
-class GlobalHeadTraining(StepTraining):
+class GlobalHeadTraining(AdamTraining):
     """Resumable training of an ``GlobalHead``. In its first half renders are drawn, from all of which it learns.
 
     Args:
@@ -100,7 +104,7 @@ class GlobalHeadTraining(StepTraining):
         seed: of everything random.
     """
 
-    what = "the reader of scenes"
+    subject = "the reader of scenes"
 
     def __init__(
         self,
@@ -111,28 +115,30 @@ class GlobalHeadTraining(StepTraining):
         seed: int = 0,
     ):
         adam = torch.optim.AdamW(overall.parameters(), lr=learning_rate, weight_decay=1e-2)
-        super().__init__(overall, adam, -(-renders // EACH), seed, warmup_steps=30)
+        super().__init__(overall, adam, -(-renders // RENDERS_PER_STEP), seed, warmup_steps=30)
         self.overall, self.draw, self.drawn = overall, draw, 0
-        self.looks, self.u = torch.empty(renders, NUMBERS), torch.empty(renders, overall.sites)
+        self.features, self.u = torch.empty(renders, NUM_FEATURES), torch.empty(renders, overall.sites)
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         state = torch.get_rng_state()
-        while self.drawn < min(len(self.u), TOGETHER * (1 + self.done // APART)):  # again where it has been resumed
+        number = min(len(self.u), RENDERS_PER_DRAW * (1 + self.done // STEPS_PER_DRAW))
+        while self.drawn < number:  # a training that was resumed draws all of them again
             self._draw()
         torch.set_rng_state(state)
         rows = torch.randint(self.drawn, (SCENE_IMAGES,))
         u = self.u[rows]
-        return value_loss(self.overall.said(self.looks[rows]), u.nan_to_num(0.5)).where(~u.isnan(), 0.0).sum(1).mean()
+        loss = value_loss(self.overall.from_features(self.features[rows]), u.nan_to_num(0.5))
+        return loss.where(~u.isnan(), 0.0).sum(1).mean()
 
     @torch.no_grad()
     def _draw(self) -> None:
         seed_everything(batch_seed(self.seed, self.total, self.drawn))
-        rows = slice(self.drawn, min(self.drawn + TOGETHER, len(self.u)))
+        rows = slice(self.drawn, min(self.drawn + RENDERS_PER_DRAW, len(self.u)))
         images, self.u[rows] = self.draw(rows.stop - rows.start)
-        self.looks[rows] = looks(images)
+        self.features[rows] = global_features(images)
         if not self.drawn:
-            self.overall.follow(self.looks[rows])
+            self.overall.fit_normalisation(self.features[rows])
         self.drawn = rows.stop
 
 
@@ -146,9 +152,9 @@ def reader_loss(reader: Reader, valued: SupervisedBatch) -> Tensor:
     entropy = -(target * F.log_softmax(logits, 1)).sum((1, 2, 3)).mean()
     parts = zip(*shares(drawn.centre / scale * CELL, label, h, w), strict=True)
     n, m, i, j, share = (torch.cat(part) for part in parts)
-    parent, said = reader.at(seen, n, i, j)
+    parent, output = reader.at(seen, n, i, j)
     u = valued.u[n, m]
-    of_values = value_loss(said, u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
+    of_values = value_loss(output, u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
     has = (valued.parent[n, m] >= 0).float()
     at = drawn.centre[n, valued.parent[n, m].clamp(min=0)] / scale
     away = (torch.stack([j, i], -1) + 0.5 + parent - at).abs().clamp(max=20.0).sum(-1)

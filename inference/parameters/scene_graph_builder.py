@@ -15,7 +15,7 @@ from torch import Tensor
 
 from probscene.grammar import Grammar
 
-from .graph import Graph, class_of
+from .graph import SceneGraph, class_of
 from .reader import Detections
 
 FREE, SHUFFLED = -1, -2  # axes
@@ -90,8 +90,8 @@ class SceneGraphBuilder(NamedTuple):
         return kind, parent, *(_spread_out(part, index, there) for part in (mean, sd))
 
 
-def assembly(
-    grammar: Grammar, classes: tuple[str, ...], graph: Graph, centre: Tensor, group: Tensor | None = None
+def fit_scene_graph_builder(
+    grammar: Grammar, classes: tuple[str, ...], graph: SceneGraph, centre: Tensor, group: Tensor | None = None
 ) -> SceneGraphBuilder:
     """From scenes of the prior.
 
@@ -129,11 +129,11 @@ def assembly(
     return SceneGraphBuilder(kinds, above, stage, axis)
 
 
-def order_by_variance(made: SceneGraphBuilder, found: Detections) -> SceneGraphBuilder:
+def order_by_variance(builder: SceneGraphBuilder, found: Detections) -> SceneGraphBuilder:
     """With an axis for the siblings that no program orders: that along which the objects found vary most."""
-    axis = made.axis.clone()
-    for stage in made.stage.unique().tolist():
-        free = (made.stage == stage) & (axis == FREE)
+    axis = builder.axis.clone()
+    for stage in builder.stage.unique().tolist():
+        free = (builder.stage == stage) & (axis == FREE)
         if not free.any():
             continue
         some = free[found.label]
@@ -142,7 +142,7 @@ def order_by_variance(made: SceneGraphBuilder, found: Detections) -> SceneGraphB
             rows = some & (found.image == image)
             spread += found.centre[rows].var(0, correction=0) * rows.sum()
         axis[free] = int(spread.argmax())
-    return made._replace(axis=axis)
+    return builder._replace(axis=axis)
 
 
 def _stages(earlier: Tensor) -> Tensor:

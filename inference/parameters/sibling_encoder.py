@@ -41,7 +41,7 @@ class SiblingEncoder(nn.Module):
         super().__init__()
         self.read = nn.Linear(2 * max(1, sites) * FEATURES, hidden)
 
-    def ties(self, together: Tensor, own: Tensor, before: SiblingLinks | None = None, first: int = 0) -> SiblingLinks:
+    def links(self, together: Tensor, own: Tensor, before: SiblingLinks | None = None, first: int = 0) -> SiblingLinks:
         """Of nodes of which some sites are known.
 
         Args:
@@ -61,11 +61,11 @@ class SiblingEncoder(nn.Module):
         parts = zip(together.split(at_once), own[..., sites].split(at_once), strict=True)
         columns = torch.cat([sites, sites + S])
         if len(sites):
-            found = [self._ties(*some) for some in parts]
+            found = [self._links(*some) for some in parts]
             place[:, :, columns], last[:, :, columns] = (torch.cat(part) for part in zip(*found, strict=True))
         return SiblingLinks(place.flatten(2), last)
 
-    def _ties(self, together: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    def _links(self, together: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Of the ways of some sites, ``(N, M, W, 4)`` and ``(N, M, W)``."""
         v, M = u.transpose(1, 2).contiguous(), u.shape[1]  # sums along the last axis are much faster
         known, half = ~v.isnan(), v > 0.5

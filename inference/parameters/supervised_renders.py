@@ -11,10 +11,10 @@ from probscene.policy import Policy
 from probscene.sampling import Scenes, sample
 
 from ..features.base import Examples
-from .graph import Seen
+from .graph import ClassNodes
 from .layout_augmentation import LayoutAugmentation
 from .reader_training import SupervisedBatch
-from .sites import Site, of_scenes, quantiles_of, within
+from .sites import Site, of_scenes, quantiles_of, with_handlers
 
 Label = Callable[[Scenes], Examples]
 """Renders scenes and labels them."""
@@ -34,21 +34,21 @@ class SupervisedRenders:
 
     @torch.no_grad()
     def draw(
-        self, num: int, policy: Policy, drawn_by: SceneModel | None = None, arranged: float = 0.0
+        self, num: int, policy: Policy, drawn_by: SceneModel | None = None, augmented: float = 0.0
     ) -> SupervisedBatch:
         """``num`` scenes of a policy.
 
         Args:
             drawn_by: the same model with other parameters.
-            arranged: share of the scenes whose sites of nodes are arranged, see ``LayoutAugmentation``.
+            augmented: share of the scenes whose sites of nodes are augmented, see ``LayoutAugmentation``.
         """
         model = self.model if drawn_by is None else drawn_by
-        if arranged:
+        if augmented:
             names = frozenset(site.name for site in self.node_sites)
-            model = within(model, LayoutAugmentation(model.grammar, names, arranged))
-        return self.of(sample(model, policy, num, density=False))
+            model = with_handlers(model, LayoutAugmentation(model.grammar, names, augmented))
+        return self.label_scenes(sample(model, policy, num, density=False))
 
-    def of(self, scenes: Scenes) -> SupervisedBatch:
+    def label_scenes(self, scenes: Scenes) -> SupervisedBatch:
         """Of scenes of the model, whatever drew their parameters.
 
         Raises:
@@ -57,12 +57,12 @@ class SupervisedRenders:
         drawn, found = self.label(scenes), quantiles_of(self.model, scenes)
         self._check(found)
         derivation = scenes.derivation.trimmed()
-        seen = Seen.of(self.model.grammar, self.model.classes, derivation)
+        class_nodes = ClassNodes.from_derivation(self.model.grammar, self.model.classes, derivation)
         N, M = derivation.kind.shape
 
         def nodes(part: Tensor, empty: float) -> Tensor:
-            taken = seen.taken(part[:, :M])
-            return taken.where((seen.kind >= 0).view(*seen.kind.shape, *(1,) * (taken.ndim - 2)), empty)
+            taken = class_nodes.gather(part[:, :M])
+            return taken.where((class_nodes.kind >= 0).view(*class_nodes.kind.shape, *(1,) * (taken.ndim - 2)), empty)
 
         u = torch.stack([found[site.name] for site in self.node_sites], -1) if self.node_sites else torch.zeros(N, M, 0)
         scene = [of_scenes(found[site.name]) for site in self.scene_sites]
@@ -73,8 +73,8 @@ class SupervisedRenders:
                 size=nodes(drawn.size, 0.0),
                 visible=nodes(drawn.visible, 0.0),
             ),
-            seen.kind,
-            seen.parent,
+            class_nodes.kind,
+            class_nodes.parent,
             nodes(derivation.parent, -1),
             nodes(u, torch.nan),
             torch.cat(scene, 1) if scene else torch.zeros(N, 0),
@@ -90,7 +90,7 @@ class SupervisedRenders:
                 )
 
 
-def joined(parts: list[SupervisedBatch]) -> SupervisedBatch:
+def concatenate(parts: list[SupervisedBatch]) -> SupervisedBatch:
     """Several batches as one."""
     nodes = max(part.parent.shape[1] for part in parts)
 

@@ -103,7 +103,7 @@ def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp
 @pytest.mark.parametrize(
     ("setting", "where"),
     [
-        ("features.schedule.learning_rate=1e38", "at step"),
+        ("features.schedule.learning_rate=1e38", " steps "),
         ("pretrain.learning_rate=1e37", "epoch "),
         ("structure.learning_rate=1e37", "At batch "),
     ],

@@ -10,8 +10,8 @@ from probscene.app.fitting.presets import QUICK
 from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import FAR, ScoreFunction
+from probscene.inference.structure_training import StructureTraining
 from probscene.structure import StructurePrior, counts
 
 
@@ -61,7 +61,7 @@ def test_each_objective_learns_from_samples(small, objective):
     training = config.structure
     loss = ScoreFunction(small.observe, config.make_divergence(), training.baseline, updates=training.updates)
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
-    Trainer(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=training.learning_rate).run()
+    StructureTraining(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=training.learning_rate).run()
     with torch.no_grad():
         assert 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item() < 0.12
 

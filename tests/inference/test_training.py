@@ -16,14 +16,13 @@ from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.features.counting.training import CountTraining
-from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.photographs.net import PretrainedCountNet
 from probscene.inference.features.photographs.training import PretrainedCountTraining
 from probscene.inference.features.presence import PresenceNet, PresenceTraining
-from probscene.inference.features.projected import ProjectionTraining
-from probscene.inference.features.projection import Projected
+from probscene.inference.features.projection import Projected, ProjectionTraining
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
+from probscene.inference.structure_training import StructureTraining
 from probscene.inference.training import batch_seed
 from probscene.sampling import seed_everything
 
@@ -80,7 +79,7 @@ def structure(dots, small, divergence=None, **options):
         updates=2,
     )
     real = small.features[torch.multinomial(small.target, 200, replacement=True)]
-    return Trainer(small.program, guide, loss, real, 4, num_scenes=40, seed=5, **options), guide
+    return StructureTraining(small.program, guide, loss, real, 4, num_scenes=40, seed=5, **options), guide
 
 
 ALL = {
@@ -141,14 +140,14 @@ def test_interrupted_anywhere_it_goes_on_to_the_same_bits(made):
         first, _ = made()
         kept, heard = {}, []
 
-        def each(training, line, stop=stop, kept=kept, heard=heard):
+        def callback(training, line, stop=stop, kept=kept, heard=heard):
             if len(heard) == stop:
                 kept.update({key: value.clone() for key, value in training.state().items()})
                 raise Interrupted
             heard.append(line)
 
         with pytest.raises(Interrupted):
-            first.run(each)
+            first.run(callback)
         second, again = made()
         second.restore(kept)
         assert 0 <= second.done <= first.done
@@ -173,7 +172,7 @@ def test_what_is_not_finite_ends_it(name, dots, small):
 
 @pytest.mark.parametrize("cosine", [True, False])
 def test_pyros_own_loop_takes_the_same_steps(dots, small, cosine):
-    """The loop of examples/multi_mnist.py, seeded as ``Trainer`` seeds its batches."""
+    """The loop of examples/multi_mnist.py, seeded as ``StructureTraining`` seeds its batches."""
     torch.manual_seed(0)
     trainer, learnt = structure(dots, small, cosine=cosine)
     trainer.run()

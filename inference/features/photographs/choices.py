@@ -8,10 +8,10 @@ from probscene.model import SceneModel
 
 from ...divergence import Blockwise, Divergence
 from ...training import Training, batch_seed
-from ..base import FeatureNet, Features, Photographs, Renders, Seen
+from ..base import FeatureNet, Features, ImageCallback, Photographs, Renders
 
 if TYPE_CHECKING:
-    from .heads import PretrainedCountNet
+    from .net import PretrainedCountNet
 
 COUNT_ON_PRETRAINED = "count=efficientnet"
 
@@ -44,7 +44,7 @@ class PretrainedCountFeatures(Features):
 
     def build(self, model: SceneModel) -> FeatureNet:
         """Pretrained, with untrained heads."""
-        from .heads import PretrainedCountNet  # torchvision takes seconds to import
+        from .net import PretrainedCountNet  # torchvision takes seconds to import
 
         return PretrainedCountNet(model.classes, model.canvas, model.stuff, self.scenes)
 
@@ -62,11 +62,11 @@ class PretrainedCountFeatures(Features):
             heads, draw, self.pairs, self.epochs, photographs=images, seed=batch_seed(seed, 1)
         )
 
-    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
+    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], callback: ImageCallback) -> dict[str, Any]:
         """Choose how each class is read."""
         from .adapting import adapt
 
-        return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, each)
+        return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, callback)
 
     def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
         """Of things as chosen, of stuff none."""

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from probscene.inference.parameters.calibration import UNCLEAR
-from probscene.inference.parameters.sites import LEARN, MEANT, find_sites
+from probscene.inference.parameters.calibration import LOW_SKILL
+from probscene.inference.parameters.sites import LEARN, OPTED_OUT, find_sites
 from probscene.inference.statistics.residual import Grade, ResidualRatio, Sample, residual_ratio, worst
 from probscene.inference.statistics.trust import Trust
 from probscene.inference.statistics.verdict import Verdict
 
-from ..fitting.outcome import compared
+from ..fitting.outcome import feature_mask
 from ..fitting.run import RunFolder
 from .advice import of_structure, remedy
 from .estimate import class_counts, counted_classes
@@ -148,13 +148,13 @@ def doubtful_sites(run: RunFolder) -> tuple[str, ...]:
     say that it is to be kept, nor is the same read, with some skill, in the prior's renders and in the target."""
     of = {site["name"]: site for site in run.parameters.get("sites", [])}
     unread = unread_sites(run)
-    return tuple(name for name in unread if unread[name] != MEANT and not _agrees(of.get(name, {})))
+    return tuple(name for name in unread if unread[name] != OPTED_OUT and not _agrees(of.get(name, {})))
 
 
 def _agrees(site: dict[str, Any]) -> bool:
     """Whether a site of a run's record has its prior in the target, too."""
     apart = site.get("read", {}).get("distance")
-    if not apart or (site["skill"] or 0) < UNCLEAR or None in (apart["prior"], apart["floor"]):
+    if not apart or (site["skill"] or 0) < LOW_SKILL or None in (apart["prior"], apart["floor"]):
         return False
     return apart["prior"] <= AGREES * apart["floor"]
 
@@ -176,7 +176,7 @@ def called(word: Grade | None, verdict: Verdict) -> Grade | None:
 
 def _structure(run: RunFolder, found: Trust, features: dict[str, Tensor], seed: int) -> VerdictComponent:
     net = run.network()
-    which = None if net is None else compared(net)
+    which = None if net is None else feature_mask(net)
     sides = {name: Sample(_some(each if which is None else each[:, which])) for name, each in features.items()}
     figures = residual_ratio(sides[TARGET], sides[LEARNT], {PRIOR: sides[PRIOR]}, seed=seed)
     word = called(None if figures is None else figures.word, found.verdict)

@@ -26,7 +26,7 @@ from probscene.sampling import sample
 from probscene.threads import threads
 
 from ..chunks import CHUNK, chunk_randomness
-from ..fitting.outcome import compared
+from ..fitting.outcome import feature_mask
 from ..fitting.pipeline import Progress
 from ..fitting.rendered_features import RenderedFeatures
 from ..fitting.run import RunFolder
@@ -140,7 +140,7 @@ def diagnose(
     real = _real(run, target, net, each)
     seen = looked.look(run, target, net, EfficientNetLite(), each, images, seed)
     rendered = np.concatenate([seen[name].places for name in (looked.LEARNT, looked.PRIOR)])
-    which = compared(net)
+    which = feature_mask(net)
     which = torch.ones(real.shape[1], dtype=torch.bool) if which is None else which
     try:
         found = trust(

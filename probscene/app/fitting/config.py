@@ -16,11 +16,11 @@ from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
 from probscene.inference.features.base import Features
 from probscene.inference.features.counting.batches import CountSchedule
-from probscene.inference.features.counting.choices import CountFeatures
+from probscene.inference.features.counting.training import CountFeatures
 from probscene.inference.features.names import PRETRAINED, network_name
 from probscene.inference.features.photographs.choices import COUNT_ON_PRETRAINED, PretrainedCountFeatures
 from probscene.inference.features.presence import PRESENCE, PRESENCE_COUNTS, PresenceFeatures
-from probscene.inference.features.projected import ProjectedFeatures
+from probscene.inference.features.projection import ProjectedFeatures
 from probscene.inference.guides.lstm import GUIDES, make_guide
 from probscene.inference.objective import BASELINES
 from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule

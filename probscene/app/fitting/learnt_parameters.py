@@ -33,7 +33,7 @@ def with_parameters(
     """A policy whose scenes have learnt parameters, in place; as it is where none are kept. Arguments as of
     ``learnt_by``."""
     if tensors and record.get("kept") == "learnt":
-        policy.suits = learnt_by(model, config, record, policy, tensors).suited
+        policy.suits = learnt_by(model, config, record, policy, tensors).with_parameters
     return policy
 
 
@@ -57,6 +57,6 @@ def learnt_by(
         guide = ParameterTransform(model, sites, policy, schedule.hidden, schedule.rounds)
     else:
         guide = ParameterGuide(model, sites, policy)
-        guide.passed = frozenset(site["name"] for site in fitted if not site["learnt"])
+        guide.prior_sites = frozenset(site["name"] for site in fitted if not site["learnt"])
     guide.net.load_state_dict({key.removeprefix(f"{NAME}."): value for key, value in tensors.items()})
     return guide.eval()

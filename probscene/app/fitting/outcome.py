@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probscene.inference.features.base import FeatureNet
-from probscene.inference.features.photographs.readability import ENOUGH, histogram_scores, scores
+from probscene.inference.features.photographs.readability import MIN_LABELS, histogram_scores, scores
 from probscene.inference.guides.base import Guide
 from probscene.inference.statistics.bootstrap_test import bootstrap_test
 from probscene.inference.training import batch_seed
@@ -33,9 +33,9 @@ WORSE, LITTLE = 2.0, 0.1  # standard errors, and objects, by which scores on lab
 SURELY, MUCH = 4.0, 0.1  # standard errors by which means differ that are told, and what part of the larger one
 
 
-def compared(net: FeatureNet) -> Tensor | None:
+def feature_mask(net: FeatureNet) -> Tensor | None:
     """``(D,)`` whether a feature says anything of the target's images; None where all do."""
-    return getattr(net, "compared", None)
+    return getattr(net, "feature_mask", None)
 
 
 def give_up(run: RunFolder) -> str:
@@ -65,7 +65,7 @@ def conclude(
     if not run.config.fallback_to_prior:
         run.write_tensors("guide", guide.state_dict() | beside(run.read_tensors(NAME) or {}))
         return ""
-    which = compared(net)
+    which = feature_mask(net)
     which = slice(None) if which is None else which
     found, numbers = [], []
     number = min(SCENES, 2 * run.config.structure.num_scenes)
@@ -126,7 +126,7 @@ def worse_than_labels(labels: PartialLabels, learnt: dict[str, NDArray[np.float6
     """
     found = {}
     for name, counts in zip(labels.classes, labels.counts.T.double().numpy(), strict=True):
-        if name not in learnt or len(counts) < ENOUGH:
+        if name not in learnt or len(counts) < MIN_LABELS:
             continue
         of_scenes, of_labels = scores(learnt[name], counts), histogram_scores(counts)
         chance = float((of_scenes - of_labels).std(ddof=1)) / math.sqrt(len(counts))

@@ -17,7 +17,7 @@ from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.backbone import Backbone, RenderBackbone
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
-from probscene.inference.parameters.reader_counts import of_counts
+from probscene.inference.parameters.reader_counts import counting_state
 from probscene.inference.parameters.schedule import ParameterSchedule
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.training import Training, batch_seed
@@ -60,7 +60,7 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     seed_everything(batch_seed(run.record["seed"], 5))
-    eye, schedule = Backbone.of(inner(net)), run.config.parameters
+    eye, schedule = Backbone.from_feature_net(inner(net)), run.config.parameters
     by_reading = isinstance(schedule, ParameterSchedule)
     joint = isinstance(schedule, MetaSimSchedule) and isinstance(run.model.grammar, JointGrammar)
     if joint or (by_reading and eye is None):
@@ -97,7 +97,7 @@ def learn_parameters(
         learning.run(each)
         keep.finish()
         if isinstance(learning, ParameterLearning) and isinstance(eye, RenderBackbone):
-            run.write_tensors(READER, of_counts(learning.tried.reader))
+            run.write_tensors(READER, counting_state(learning.calibrated.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
         judges = _some(target, held, JUDGED), lambda: _some(target, held, DOUBTFUL)
         run.write_parameters(_record(run, guide, learning, *judges))
@@ -125,15 +125,15 @@ def _record(
     method = {"method": run.config.parameter_method}
     if not isinstance(learning, ParameterLearning):
         return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held, more).distances}
-    assert learning.tried.skill is not None
-    shares = learning.tried.skill.share.tolist()
+    assert learning.calibrated.skill is not None
+    shares = learning.calibrated.skill.share.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
     found = select_sites(run, guide, learning, held, more)
-    passed = frozenset() if learning.guide is None else learning.guide.passed
+    passed = frozenset() if learning.guide is None else learning.guide.prior_sites
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
         share, fitted = skill.get(site, torch.nan), site in learning.learnt
-        because = site.keeps or learning.tried.why_not(site)
+        because = site.keeps or learning.calibrated.why_not(site)
         if site.name in passed:
             because = found.because.get(site.name, "scenes come no nearer to held-out images by it")
         about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}

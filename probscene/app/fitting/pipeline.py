@@ -29,7 +29,7 @@ from ..labels.partial_labels import PartialLabels, PartlyLabelledImages
 from ..progress import Display, Progress
 from ..workers.cluster import Cluster
 from .cache import NetworkCache
-from .outcome import compared, conclude, give_up
+from .outcome import conclude, feature_mask, give_up
 from .parameter_stage import READER, learn_parameters
 from .plugins import inner
 from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
@@ -119,7 +119,7 @@ def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, clust
         net.finish(cache_in)
         run.keep_network(net.net)
         real = _real_features(run, net.net, show, images)
-    which = compared(net.net)
+    which = feature_mask(net.net)
     with threads(1):  # the guide's tensors are tiny: a second thread only waits
         if which is not None and not which.any():
             message = give_up(run)
@@ -237,7 +237,7 @@ def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: 
     features, *others = (
         embed_all(net, images.batches(RENDERED_AT_ONCE, view), each, real=True) for view in range(views)
     )
-    which = compared(net)
+    which = feature_mask(net)
     if which is None or which.any():
         check_features(features)
     kept = {"features": features, "fingerprint": fingerprint(images)}

@@ -5,9 +5,9 @@ from dataclasses import replace
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.features.counting.batches import CountSchedule
-from probscene.inference.features.counting.choices import CountFeatures
+from probscene.inference.features.counting.training import CountFeatures
 from probscene.inference.features.presence import PresenceFeatures
-from probscene.inference.features.projected import ProjectedFeatures
+from probscene.inference.features.projection import ProjectedFeatures
 from probscene.inference.parameters.schedule import ParameterSchedule
 
 from .config import Auto, FitConfig, LSTMConfig, Pretrain, ScoreFunctionTraining

@@ -75,33 +75,35 @@ def select_sites(
     of_prior = drawn("prior", run.model)
 
     def compared() -> BootstrapTest:
-        return bootstrap_test(drawn("learnt", learnt.suited(run.model)), of_prior, real)
+        return bootstrap_test(drawn("learnt", learnt.with_parameters(run.model)), of_prior, real)
 
     apart = compared()
     kept, because = "learnt" if apart.one < apart.other else "prior", dict[str, str]()
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
-        well = frozenset(learning.settle(learning, True) if learning.settled is None else learning.settled)
+        well = frozenset(
+            learning.select_prior_sites(learning, True) if learning.prior_sites is None else learning.prior_sites
+        )
         badly = frozenset[str]()
-        if learning.tried.unclear:
+        if learning.calibrated.low_skill_sites:
             seed_everything(batch_seed(run.record["seed"], 6, 4))
             badly, because = of_unclear(learning, more(), well)
-        learnt.passed = well | badly
-        if learnt.passed:
+        learnt.prior_sites = well | badly
+        if learnt.prior_sites:
             apart = compared()
         if apart.sure and judge is not None:
-            learnt.passed = uninformative_sites(learnt, judge) | because.keys()
+            learnt.prior_sites = uninformative_sites(learnt, judge) | because.keys()
             apart = compared()
-        kept = "prior" if apart.sure or len(learnt.passed) == len(learnt.sites) else "learnt"
+        kept = "prior" if apart.sure or len(learnt.prior_sites) == len(learnt.sites) else "learnt"
         if kept == "prior":
-            learnt.passed = frozenset()
+            learnt.prior_sites = frozenset()
     if isinstance(learning, TiltingLearning) and not learning.learnt:
         kept = "prior"
     distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
     if not isinstance(learning, ParameterLearning):  # which reads nothing
         return SiteSelection(distances, {}, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
-    readings = {name: learning.tried.readings(some) for name, some in images.items()}
-    halves = [learning.tried.readings(held[i::2]) for i in (0, 1)]
+    readings = {name: learning.calibrated.readings(some) for name, some in images.items()}
+    halves = [learning.calibrated.readings(held[i::2]) for i in (0, 1)]
     sites = {}
     for site in learning.learnt:
         each = {name: _quantiles(found[site.name]) for name, found in readings.items()}
@@ -139,7 +141,7 @@ def settling(
     def named(learning: ParameterLearning, many: bool) -> frozenset[str]:
         assert learning.guide is not None and learning.best is not None
         images = constant(many)
-        learnt = _compared(run, learning.guide.suited(run.model), guide, len(images["target"]), "learnt")
+        learnt = _compared(run, learning.guide.with_parameters(run.model), guide, len(images["target"]), "learnt")
         read = learning.site_rows(images | {"learnt": learnt})
         names = passed(learning, read, True)
         if sure or not names:  # what is passed where one is not careful is a part of it
@@ -155,7 +157,7 @@ def settling(
         assert learning.guide is not None
         if last and sure:
             return named(learning, True)
-        now = _digest(learning.guide.net.state_dict(), learning.tried.state())
+        now = _digest(learning.guide.net.state_dict(), learning.calibrated.state())
         if now not in known:
             known[now] = named(learning, False)
         return known[now]
@@ -184,7 +186,7 @@ def passed(
     Args:
         read: of ``"learnt"``, ``"prior"`` and ``"target"``, see ``ParameterLearning.site_rows``.
     """
-    clear = {name: of for name, of in read.items() if name not in learning.tried.unclear}
+    clear = {name: of for name, of in read.items() if name not in learning.calibrated.low_skill_sites}
     chance = (1 - SURE) / max(1, len(clear))
 
     def passes(of: dict[str, tuple[Tensor, Tensor]]) -> bool:
@@ -211,13 +213,13 @@ def of_unclear(
         images: of the target, ``(L, C, H, W)`` uint8; nothing was learnt from them.
         kept: sites that are read well and keep their prior.
     """
-    unclear = learning.tried.unclear
-    without = learning.own_scenes(kept | unclear)
+    unclear = learning.calibrated.low_skill_sites
+    without = learning.guide_scenes(kept | unclear)
     because = {
         name: f"in renders that look like the target {share:.0%} of its variance can be read"
-        for name, share in learning.tried.lost(without).items()
+        for name, share in learning.calibrated.unidentifiable_sites(without).items()
     }
-    learnt = learning.own_scenes(kept)
+    learnt = learning.guide_scenes(kept)
     for site, *u in zip(learning.scene_sites, without.overall.unbind(1), learnt.overall.unbind(1), strict=True):
         moved = _distance(*(some[~some.isnan()] for some in u)) or 0.0
         if site.name in unclear - because.keys() and moved < LEAST_MOVED:
@@ -228,8 +230,8 @@ def of_unclear(
     others, chance = unclear - set(likely), (1 - SURE) / max(1, len(likely))
     if not likely:
         return others, because
-    renders = {name: learning.own_scenes(kept | others | {name}).drawn.image for name in likely}
-    renders["learnt"] = learning.own_scenes(kept | others).drawn.image
+    renders = {name: learning.guide_scenes(kept | others | {name}).drawn.image for name in likely}
+    renders["learnt"] = learning.guide_scenes(kept | others).drawn.image
     read = learning.site_rows(renders | {"target": images})
     return others | {name for name in likely if _share(read[name], name, "learnt") < 1 - chance}, because
 
@@ -261,10 +263,10 @@ def held_out(run: RunFolder, guide: Guide, held: Tensor) -> HeldOutSet:
         now = _digest(learnt.net.state_dict())
         if now != of:
             of, known = now, {}
-        if learnt.passed not in known:
+        if learnt.prior_sites not in known:
             seed_everything(batch_seed(run.record["seed"], 6, 3))
-            known[learnt.passed] = embed(_renders(run, learnt.suited(run.model), guide, len(held)))
-        return known[learnt.passed]
+            known[learnt.prior_sites] = embed(_renders(run, learnt.with_parameters(run.model), guide, len(held)))
+        return known[learnt.prior_sites]
 
     return HeldOutSet(look, embed(held))
 

@@ -17,12 +17,12 @@ from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.guides.base import Guide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.parameters.reader_counts import ReaderCounts
 from probscene.inference.pretrain import pretrain
 from probscene.inference.render_cache import RenderCache
 from probscene.inference.statistics.bootstrap_test import bootstrap_test
+from probscene.inference.structure_training import StructureTraining
 from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
@@ -32,7 +32,7 @@ from ..workers.actor_pool import ActorPool
 from ..workers.cluster import Cluster
 from .config import ScoreFunctionTraining
 from .learnt_parameters import NAME, beside, with_parameters
-from .outcome import compared
+from .outcome import feature_mask
 from .parameter_stage import READER
 from .plugins import inner
 from .rendered_features import RENDERED_AT_ONCE, Chunk, Observe, RenderedFeatures
@@ -129,7 +129,7 @@ def learn_structure_again(
     trainer = _trainer(run, model, guide, objective, real, config.refine.batches, rate, seeds, pool)
     seen = _seen(run, observer, net, guide)
     _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
-    which = compared(net)
+    which = feature_mask(net)
     which = slice(None) if which is None else which
     now, then, target = (part[:, which].double().numpy() for part in (_seen(run, observer, net, guide), seen, real))
     if bootstrap_test(now, then, target).sure:
@@ -203,8 +203,8 @@ def _objective(
 ) -> ScoreFunction:
     kinds = {*run.unread, *(model.stuff if run.readings else ())}
     held = PriorCountPenalty(model, kinds, run.config.structure.num_scenes)
-    observe = held.beside(observe if pool is None else pool.around(observe))
-    return score_function(run.config.structure, model, observe, held.added_to(run.divergence(inner(net))), guide)
+    observe = held.append_counts(observe if pool is None else pool.wrap(observe))
+    return score_function(run.config.structure, model, observe, held.add_to(run.divergence(inner(net))), guide)
 
 
 def score_function(
@@ -239,13 +239,15 @@ def _trainer(
     rate: float,
     seed: int,
     pool: RenderCache | None,
-) -> Trainer:
+) -> StructureTraining:
     training = run.config.structure
     scenes, images = training.num_scenes, training.num_real
-    return Trainer(model, guide, objective, real, batches, scenes, images, rate, training.cosine, seed, pool)
+    return StructureTraining(model, guide, objective, real, batches, scenes, images, rate, training.cosine, seed, pool)
 
 
-def _run(trainer: Trainer, keep: Checkpointer, stage: str, progress: Progress, crew: ActorPool | None) -> None:
+def _run(
+    trainer: StructureTraining, keep: Checkpointer, stage: str, progress: Progress, crew: ActorPool | None
+) -> None:
     def each(trainer: Training, diagnostics: dict[str, float]) -> None:
         keep({"stage": stage, **diagnostics})
         progress(stage, trainer.done, trainer.total, f"cost {diagnostics['cost']:.3f}")

@@ -17,7 +17,7 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
     """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target."""
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset("u"))
+        calibrated = SimpleNamespace(low_skill_sites=frozenset("u"))
 
         def site_rows(self, images):
             assert set(images) == {"learnt", "prior", "target"}
@@ -43,11 +43,13 @@ class Renders:
 
     def __init__(self, learnt: dict[str, float], moves: dict[str, float], of_scenes: tuple[str, ...] = ()):
         self.learnt, self.moves, self.seed = learnt, moves, 0
-        self.tried = SimpleNamespace(unclear=frozenset(learnt), lost=lambda renders: {"lost": 0.1})
+        self.calibrated = SimpleNamespace(
+            low_skill_sites=frozenset(learnt), unidentifiable_sites=lambda renders: {"lost": 0.1}
+        )
         self.scene_sites = [SimpleNamespace(name=name) for name in of_scenes]
         self.asked = []
 
-    def own_scenes(self, kept):
+    def guide_scenes(self, kept):
         self.asked.append(kept)
         values = {name: value * (name not in kept) for name, value in self.learnt.items()}
         u = torch.linspace(0, 0.5, 50)[:, None] + torch.tensor([0.1 * values[s.name] for s in self.scene_sites])
@@ -97,7 +99,7 @@ def test_of_many_sites_none_is_learnt_by_chance():
     """Of forty learnt renders are as far away as the prior's; of one they are nearer, which is seen all the same."""
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset())
+        calibrated = SimpleNamespace(low_skill_sites=frozenset())
 
         def site_rows(self, images):
             torch.manual_seed(0)
@@ -132,8 +134,8 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
         return real + learnt * ways + 2.0 * (needed in without)
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset("u"), state=lambda: {"reader": read_by})
-        guide = SimpleNamespace(suited=lambda model: "learnt", net=torch.nn.Linear(2, 2))
+        calibrated = SimpleNamespace(low_skill_sites=frozenset("u"), state=lambda: {"reader": read_by})
+        guide = SimpleNamespace(with_parameters=lambda model: "learnt", net=torch.nn.Linear(2, 2))
         best = SimpleNamespace(held=SimpleNamespace(looks=looks, real=real))
 
         def site_rows(self, images):
@@ -183,8 +185,8 @@ def test_what_a_guide_looks_like_is_drawn_once_until_its_weights_change(monkeypa
     monkeypatch.setattr(select_sites, "_renders", renders)
     monkeypatch.setattr(select_sites, "_embed", lambda: lambda images: images.double().numpy())
     held = select_sites.held_out(SimpleNamespace(record={"seed": 0}, model=None), None, torch.zeros(5, 2))
-    guide = SimpleNamespace(net=torch.nn.Linear(2, 2), passed=frozenset())
-    guide.suited = lambda model: (float(guide.net.weight.data.sum()), guide.passed)
+    guide = SimpleNamespace(net=torch.nn.Linear(2, 2), prior_sites=frozenset())
+    guide.with_parameters = lambda model: (float(guide.net.weight.data.sum()), guide.prior_sites)
     sets = [frozenset(), frozenset("a"), frozenset(), frozenset("a")]
     looks = [held.looks(guide, passed) for passed in sets]
     assert [passed for _, passed in drawn] == sets[:2]

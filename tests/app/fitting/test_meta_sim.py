@@ -76,9 +76,9 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, discs, target, tmp_path, 
     it_is_kept(monkeypatch)
     run = MetaSimLearning.run
 
-    def interrupted(self, each=None):
+    def interrupted(self, callback=None):
         def heard(training, line):
-            each(training, line)
+            callback(training, line)
             if training.done == 2:
                 raise KeyboardInterrupt
 

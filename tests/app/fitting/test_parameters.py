@@ -34,12 +34,12 @@ PRIOR = StructurePrior(ROW, Dots=counts(0, 1, 1, 1))
 
 def anything_is_read(patch):
     """Also what a reader of six steps says; and it is kept."""
-    patch.setattr(skill, "READABLE", -1e9)
-    patch.setattr(reader, "LEAST_MASS", (1e-3,))
+    patch.setattr(skill, "MIN_SKILL", -1e9)
+    patch.setattr(reader, "SCORE_THRESHOLDS", (1e-3,))
     patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(select_sites, "passed", lambda *_: frozenset())
     patch.setattr(select_sites, "of_unclear", lambda *_: (frozenset(), {}))
-    for renders in ("TRIED", "ASSEMBLED", "MISSED"):
+    for renders in ("CALIBRATION_RENDERS", "BUILDER_RENDERS", "MISSED_RENDERS"):
         patch.setattr(learning, renders, 40)
 
 
@@ -106,9 +106,9 @@ def interrupted_at(training, stop):
     """A training's ``run`` that is interrupted after so many steps."""
     run = training.run
 
-    def interrupted(self, each=None):
+    def interrupted(self, callback=None):
         def heard(training, line):
-            each(training, line)
+            callback(training, line)
             if training.done >= stop:
                 raise KeyboardInterrupt
 
@@ -128,10 +128,10 @@ def test_a_fit_goes_on_to_the_same_bytes(both, of, stop, call, discs, target, tm
     anything_is_read(monkeypatch)
     with monkeypatch.context() as patch:
         if of == "Again":
-            trainer = structure.Trainer
+            trainer = structure.StructureTraining
             again = type("Again", (trainer,), {"run": interrupted_at(trainer, stop)})
             first = iter((trainer, again))
-            patch.setattr(structure, "Trainer", lambda *args, **named: next(first)(*args, **named))
+            patch.setattr(structure, "StructureTraining", lambda *args, **named: next(first)(*args, **named))
         else:
             patch.setattr(parameters.ParameterLearning, "run", interrupted_at(parameters.ParameterLearning, stop))
         assert call(*words).code != 0

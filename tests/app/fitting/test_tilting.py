@@ -36,7 +36,7 @@ def lit(tmp_path_factory, discs) -> Path:
 
 def it_is_kept(patch):
     patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
-    patch.setattr(learning, "CHANCE", 1.1)  # of so few scenes, whatever they say
+    patch.setattr(learning, "FALSE_DISCOVERY_RATE", 1.1)  # of so few scenes, whatever they say
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +83,9 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, lit, discs, target, tmp_p
     monkeypatch.setattr(storage, "SAVE_EVERY", 0)
     run, out = learning.TiltingLearning.run, tmp_path / "run"
 
-    def interrupted(self, each=None):
+    def interrupted(self, callback=None):
         def heard(training, line):
-            each(training, line)
+            callback(training, line)
             if training.done == 2:
                 raise KeyboardInterrupt
 
@@ -103,7 +103,7 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, lit, discs, target, tmp_p
 
 
 def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tmp_path, monkeypatch):
-    monkeypatch.setattr(learning, "CHANCE", 0.0)
+    monkeypatch.setattr(learning, "FALSE_DISCOVERY_RATE", 0.0)
     out = tmp_path / "run"
     done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
     assert done.code == 0, done.err

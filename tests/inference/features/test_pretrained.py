@@ -122,7 +122,7 @@ def test_an_image_keeps_its_shape_and_enters_with_the_squares_area(height, width
     for size, step in ((224, 32), (299, 1)):
         frozen = pretrained._Frozen(size, step, 0.0, 1.0, ())
         h, w = frozen.entering(height, width)
-        assert h % step == w % step == 0 and min(h, w) >= pretrained.LEAST
+        assert h % step == w % step == 0 and min(h, w) >= pretrained.MIN_SIDE
         assert (frozen.entering(width, height)) == (w, h)
         if height == width:
             assert (h, w) == (size, size)
@@ -175,7 +175,7 @@ def test_torchvisions_own_file_is_taken_where_it_was_downloaded(weights, residua
     (tmp_path / "checkpoints").mkdir()
     images = noise(1)
     for name, (file, _), network in (("inception", weights, Inception), ("resnet50", residual, ResNet50)):
-        url = pretrained.OFFERED[name].url
+        url = pretrained.TORCHVISION_WEIGHTS[name].url
         (tmp_path / "checkpoints" / url.rpartition("/")[2]).write_bytes(file.read_bytes())
         assert pretrained.weights_file(f"{name}=x.pth").name == "x.pth"
         own = pretrained.pretrained(name)
@@ -196,7 +196,7 @@ def test_without_a_file_and_a_network_one_error_says_what_to_give(name, tmp_path
         pretrained.pretrained(name)
     said = str(error.value)
     assert f"{name}=FILE" in said and "efficientnet" in said and "no route" in said and "\n" not in said
-    assert pretrained.OFFERED[name].url in said and socket.getdefaulttimeout() == before
+    assert pretrained.TORCHVISION_WEIGHTS[name].url in said and socket.getdefaulttimeout() == before
 
 
 @pytest.mark.parametrize("word", ["vgg", "inception=", "resnet50=", "efficientnet=x", "resnet", ""])

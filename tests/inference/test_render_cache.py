@@ -11,10 +11,10 @@ from probscene.derive import derive_complete
 from probscene.grammar import Grammar
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
 from probscene.inference.render_cache import RenderCache
+from probscene.inference.structure_training import StructureTraining
 from probscene.model import Groups, SceneModel
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
@@ -37,8 +37,8 @@ class Observe:
 @settings(deadline=None, max_examples=20)
 def test_features_are_of_a_scene_of_equal_counts_and_as_few_as_asked_are_rendered(dots, seed, least):
     seed_everything(seed)
-    observe, pool, drawn = Observe(dots, noise=0.01), RenderCache(dots, least), {}
-    features = pool.around(observe)
+    observe, cache, drawn = Observe(dots, noise=0.01), RenderCache(dots, least), {}
+    features = cache.wrap(observe)
     for number in (7, 30, 1, 60):
         scenes = sample(dots, dots.prior, number)
         each = scenes.derivation.counts(2)
@@ -50,19 +50,19 @@ def test_features_are_of_a_scene_of_equal_counts_and_as_few_as_asked_are_rendere
             if before[tuple(row)] < least:
                 drawn[tuple(row)] = drawn.get(tuple(row), 0) + 1
         assert observe.seen - was == sum(before[tuple(row)] < least for row in each.tolist())
-    assert pool.drawn == observe.seen == sum(drawn.values()) and pool.asked == 98
+    assert cache.rendered == observe.seen == sum(drawn.values()) and cache.requested == 98
 
 
 def test_which_render_is_taken_again_is_chance(dots):
     seed_everything(0)
-    pool = RenderCache(dots, 5)
-    features = pool.around(Observe(dots, noise=1e-3))
+    cache = RenderCache(dots, 5)
+    features = cache.wrap(Observe(dots, noise=1e-3))
     derivation, _ = derive_complete(dots.grammar, dots.prior, 1, dots.max_steps)
     several = run_program(dots, derivation[torch.zeros(5, dtype=torch.int64)])
     first = features(several)
     taken = torch.cat([features(several) for _ in range(200)])
     often = (taken[:, None] == first).all(2).sum(0)
-    assert pool.drawn == 5 and often.sum() == 1000 and often.min() > 140
+    assert cache.rendered == 5 and often.sum() == 1000 and often.min() > 140
 
 
 def test_groups_are_told_apart(dots):
@@ -85,13 +85,15 @@ def test_groups_are_told_apart(dots):
     assert len(whole.unique(dim=0)) == len({row[:2] for row in on}) < len(table.unique(dim=0))
 
 
-def trainer(dots, pool, batches):
+def trainer(dots, cache, batches):
     torch.manual_seed(0)
     guide = LSTMGuide(dots.grammar, dots.max_steps, hidden=8)
     pretrain(guide, dots.prior, num_derivations=300, epochs=2, learning_rate=5e-3)
     observe = Observe(dots)
-    objective = ScoreFunction(observe if pool is None else pool.around(observe), KDELogRatio())
-    return observe, Trainer(dots, guide, objective, torch.full((50, 2), 2.0), batches, num_scenes=40, pool=pool)
+    objective = ScoreFunction(observe if cache is None else cache.wrap(observe), KDELogRatio())
+    return observe, StructureTraining(
+        dots, guide, objective, torch.full((50, 2), 2.0), batches, num_scenes=40, render_cache=cache
+    )
 
 
 def test_an_interrupted_training_goes_on_to_the_same_bytes(dots):
@@ -125,14 +127,14 @@ def test_a_pool_that_never_takes_again_changes_nothing(dots):
 
 
 def test_learning_ends_as_near_with_a_tenth_of_the_renders(dots):
-    def mean_reds(pool):
+    def mean_reds(cache):
         torch.manual_seed(0)
         guide = LSTMGuide(dots.grammar, dots.max_steps, hidden=16)
         pretrain(guide, dots.prior, num_derivations=1000, epochs=3, learning_rate=5e-3)
         observe = Observe(dots)
-        objective = ScoreFunction(pool.around(observe) if pool else observe, KDELogRatio(), updates=3)
+        objective = ScoreFunction(cache.wrap(observe) if cache else observe, KDELogRatio(), updates=3)
         real = torch.tensor([[2.0, 1.0]]).repeat(50, 1) + 0.1 * torch.randn(50, 2)
-        Trainer(dots, guide, objective, real, 40, num_scenes=100, pool=pool).run()
+        StructureTraining(dots, guide, objective, real, 40, num_scenes=100, render_cache=cache).run()
         drawn = derive_complete(dots.grammar, guide.eval(), 2000, dots.max_steps)[0].counts(2)
         return drawn.float().mean(0), observe.seen
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene.inference.features.base import Examples
-from probscene.inference.parameters.calibration import NEAR_ENOUGH, CalibratedReader
-from probscene.inference.parameters.reader import LEAST_MASS, Detections, blocks
+from probscene.inference.parameters.calibration import MAX_MATCH_DISTANCE, CalibratedReader
+from probscene.inference.parameters.reader import SCORE_THRESHOLDS, Detections, find_objects
 from probscene.inference.parameters.reader_training import MIN_VISIBLE, SupervisedBatch
 from probscene.inference.parameters.sites import Site
 from probscene.inference.parameters.skill import Skill
@@ -20,16 +20,16 @@ seeds = st.integers(0, 2**31)
 @given(seeds, st.floats(0.1, 0.5), st.floats(0.0, 0.5))
 def test_blocks_that_hold_more_are_among_those_that_hold_less(seed, least, more):
     rng = np.random.default_rng(seed)
-    mass = torch.from_numpy(rng.uniform(0, 1, (3, 9, 7)) ** 4).float()
-    n, y, x, inside = blocks(mass, least)
+    score = torch.from_numpy(rng.uniform(0, 1, (3, 9, 7)) ** 4).float()
+    n, y, x, inside = find_objects(score, least)
     enough = inside > least + more
-    again = blocks(mass, least + more)
+    again = find_objects(score, least + more)
     for part, other in zip((n, y, x, inside), again, strict=True):
         assert torch.equal(part[enough], other)
 
 
 @given(seeds, st.integers(0, 60))
-def test_the_least_mass_makes_the_fewest_mistakes_up_to_chance(seed, number):
+def test_the_threshold_makes_the_fewest_mistakes_up_to_chance(seed, number):
     """As a loop over images, objects and nodes counts them."""
     rng = np.random.default_rng(seed)
     N, M = 4, 5
@@ -41,28 +41,28 @@ def test_the_least_mass_makes_the_fewest_mistakes_up_to_chance(seed, number):
     valued = SupervisedBatch(drawn, label, label, label, nothing, torch.zeros(N, 0))
     image = torch.from_numpy(np.sort(rng.integers(0, N, number)))
     place = torch.from_numpy(rng.uniform(0, 60, (number, 2))).float()
-    mass = torch.from_numpy(rng.uniform(0.2, 1, number))
-    found = Detections(image, mass, image, place, place, torch.zeros(number, 0, 6), torch.zeros(N, 0, 6))
-    reader = SimpleNamespace(find_all=lambda images: found, leasts=LEAST_MASS, least=torch.tensor(0.0))
-    CalibratedReader.settle(SimpleNamespace(reader=reader), valued)
+    score = torch.from_numpy(rng.uniform(0.2, 1, number))
+    found = Detections(image, score, image, place, place, torch.zeros(number, 0, 6), torch.zeros(N, 0, 6))
+    reader = SimpleNamespace(detect_all=lambda images: found, thresholds=SCORE_THRESHOLDS, least=torch.tensor(0.0))
+    CalibratedReader.choose_threshold(SimpleNamespace(reader=reader), valued)
 
     def mistakes(least: float) -> int:
         hit, spare = set(), 0
         for k in range(number):
-            if mass[k] > least:
+            if score[k] > least:
                 away = {
                     m: float((centre[image[k], m] - place[k]).norm())
                     for m in range(M)
                     if label[image[k], m] >= 0 and seen[image[k], m] >= MIN_VISIBLE
                 }
                 node = min(away, key=away.get, default=None)
-                near = node is not None and away[node] < NEAR_ENOUGH and (int(image[k]), node) not in hit
+                near = node is not None and away[node] < MAX_MATCH_DISTANCE and (int(image[k]), node) not in hit
                 spare += not near
                 hit |= {(int(image[k]), node)} if near else set()
         return int(((label >= 0) & (seen >= MIN_VISIBLE)).sum()) - len(hit) + spare
 
-    fewest = min(map(mistakes, LEAST_MASS))
-    wanted = min(least for least in LEAST_MASS if mistakes(least) <= fewest + fewest**0.5)
+    fewest = min(map(mistakes, SCORE_THRESHOLDS))
+    wanted = min(least for least in SCORE_THRESHOLDS if mistakes(least) <= fewest + fewest**0.5)
     assert float(reader.least) == np.float32(wanted)
 
 
@@ -71,7 +71,7 @@ def test_sites_that_are_read_with_an_error_are_refined(smeared):
     of_nodes = tuple(Site(name, ("cell",)) for name in ("sharp", "poor", "never", "turn"))
     tried = CalibratedReader(smeared, SimpleNamespace(), of_nodes, (Site("sun", ()), Site("cloud", ())))
     tried.skill = Skill(torch.zeros(6, dtype=torch.int64), torch.tensor([0.95, 0.1, 0.5, 0.6, 0.5, 0.95]))
-    tried.readings_of = torch.tensor([100, 100, 3, 100, 100, 100])
+    tried.num_readings = torch.tensor([100, 100, 3, 100, 100, 100])
     assert tried.good.tolist() == [True, False, False, True, True, True]
     assert tried.noisy.tolist() == [False, True, True, False]
 
@@ -97,10 +97,12 @@ def test_a_sun_behind_clouds_is_lost(smeared):
         seen = seen._replace(image=image, label=none, centre=torch.zeros(2000, 1, 2))
         return SupervisedBatch(seen, none, none, none, torch.zeros(2000, 1, 0), u)
 
-    reader = SimpleNamespace(find=find, find_all=find, leasts=LEAST_MASS, least=torch.tensor(0.0))
+    reader = SimpleNamespace(detect=find, detect_all=find, thresholds=SCORE_THRESHOLDS, least=torch.tensor(0.0))
     tried = CalibratedReader(smeared, reader, (), (sun, cloud))
     any_weather = drawn(torch.rand(2000, generator=torch.Generator().manual_seed(0)), 1)
-    tried.on(any_weather, any_weather.drawn.image)
-    assert tried.good_sites == {sun, cloud} and tried.unclear == {"sun"}
-    assert tried.lost(any_weather) == tried.lost(drawn(torch.tensor(0.5), 2)) == {}
-    assert {name: round(share, 1) for name, share in tried.lost(drawn(torch.tensor(0.95), 3)).items()} == {"sun": 0.0}
+    tried.calibrate(any_weather, any_weather.drawn.image)
+    assert tried.good_sites == {sun, cloud} and tried.low_skill_sites == {"sun"}
+    assert tried.unidentifiable_sites(any_weather) == tried.unidentifiable_sites(drawn(torch.tensor(0.5), 2)) == {}
+    assert {
+        name: round(share, 1) for name, share in tried.unidentifiable_sites(drawn(torch.tensor(0.95), 3)).items()
+    } == {"sun": 0.0}

@@ -10,8 +10,7 @@ from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import bandwidth
 from probscene.inference.features.counting.training import relative_count_loss
-from probscene.inference.features.photographs.head import KINDS, STRIDES
-from probscene.inference.features.photographs.heads import LEAST_UNIT, PretrainedCountNet
+from probscene.inference.features.photographs.net import KINDS, MIN_UNIT, STRIDES, PretrainedCountNet
 from probscene.inference.features.photographs.readability import disagreement
 from probscene.inference.features.photographs.reading import LARGE, RULES, SCOPES, Rule, read
 from probscene.inference.features.photographs.training import PretrainedCountTraining
@@ -75,7 +74,7 @@ def untrained(dots, **words) -> PretrainedCountNet:
 def test_a_head_is_a_convolution_of_all_maps_brought_to_one_place(dots, k):
     """The first layer at each stride, then upsampled, is one layer of the upsampled maps beside one another."""
     net, kind = untrained(dots), KINDS[k]
-    maps = net.normal(net.look(torch.randint(0, 256, (2, 3, *dots.canvas), dtype=torch.uint8)))
+    maps = net.normalise(net.compute_maps(torch.randint(0, 256, (2, 3, *dots.canvas), dtype=torch.uint8)))
     head, maps_of_kind = net.heads[k][0], maps[STRIDES.index(kind.stride) :]
     size = maps_of_kind[0].shape[2:]
     upsampled = (F.interpolate(each, size, mode="bilinear") for each in maps_of_kind[1:])
@@ -103,7 +102,7 @@ def test_features_are_read_by_the_median_of_their_rules_in_units(dots):
     net.rules.copy_(torch.stack([only(3, 14), only(0, 16) | only(4, 16) | only(9, 16)]))
     net.scope.copy_(torch.tensor([0, 3]))
     images = torch.randint(0, 256, (5, 3, 64, 96), dtype=torch.uint8)
-    by_kind = [logits.softmax(3).mean(0)[:, :, 1:] for logits in net(net.normal(net.look(images)))]
+    by_kind = [logits.softmax(3).mean(0)[:, :, 1:] for logits in net(net.normalise(net.compute_maps(images)))]
     seen = [by_kind[0][:, 0, :1], by_kind[1][:, 2, 1:]]  # scope 3 is the third of those 8 pixels apart
     for embed, rules in ((net.embed, ([3], [14])), (net.embed_real, ([0, 4, 9], [16]))):
         each = [torch.cat([read(seen[c], RULES[r]) for r in rules[c]], 1).quantile(0.5, 1) for c in range(2)]
@@ -113,7 +112,7 @@ def test_features_are_read_by_the_median_of_their_rules_in_units(dots):
         assert torch.allclose(one, embed(images), rtol=1e-4, atol=1e-4)
         assert embed(images[:0]).shape == (0, 2)
     net.read[1] = False
-    assert net.compared.tolist() == [True, False]
+    assert net.feature_mask.tolist() == [True, False]
     assert (net.embed(images)[:, 1] == 0).all() and (net.embed_real(images)[:, 1] == 0).all()
     net.steps[0, :2] = torch.tensor([-1.0, 1e9])
     assert torch.allclose(net.embed_real(images)[:, 0] * net.unit[0], torch.ones(5))
@@ -122,10 +121,10 @@ def test_features_are_read_by_the_median_of_their_rules_in_units(dots):
 
 def test_readings_of_all_scopes_are_those_of_each(dots):
     net = untrained(dots)
-    maps = net.look(torch.randint(0, 256, (3, 3, 64, 96), dtype=torch.uint8))
+    maps = net.compute_maps(torch.randint(0, 256, (3, 3, 64, 96), dtype=torch.uint8))
     whole, each = net.readings(maps)
     assert whole.shape == (3, len(SCOPES), len(RULES), 2) and each.shape == (4, *whole.shape)
-    by_head = net.by_head(maps)
+    by_head = net.head_probabilities(maps)
     for s, scope in enumerate(SCOPES):
         k = next(k for k, kind in enumerate(KINDS) if s in kind.scopes)
         probability = by_head[k][:, :, KINDS[k].scopes.index(s)]
@@ -138,16 +137,16 @@ def test_things_come_before_stuff_and_choose_the_unit(dots):
     plain, net = untrained(dots), untrained(dots, stuff=dots.classes[:1])
     net.load_state_dict(plain.state_dict())
     assert net.names == dots.classes[::-1] and net.blocks == (1, 1) and plain.blocks == (2, 0)
-    assert net.compared.tolist() == [True, False] and plain.compared.all()
+    assert net.feature_mask.tolist() == [True, False] and plain.feature_mask.all()
     images = torch.randint(0, 256, (20, 3, 64, 96), dtype=torch.uint8)
     units = plain.unit[[1, 0]] / plain.unit
     assert torch.allclose(net.embed(images), plain.embed(images)[:, [1, 0]] * units, atol=1e-5)
     true = torch.randint(0, 9, (20, 1, 2)).float().expand(-1, len(SCOPES), -1)
     read = (true[:, :, None] + torch.arange(len(RULES))[:, None] - 13).abs()
-    net.finish(read, true, torch.tensor([3.0, 4.0]))
+    net.calibrate(read, true, torch.tensor([3.0, 4.0]))
     spread = true[:, 0].std(0)
     assert net.unit.tolist() == pytest.approx(
-        (bandwidth(true[:, 0, 1:] / spread[1]) * spread).clamp(min=LEAST_UNIT)[[1, 0]].tolist(), rel=1e-5
+        (bandwidth(true[:, 0, 1:] / spread[1]) * spread).clamp(min=MIN_UNIT)[[1, 0]].tolist(), rel=1e-5
     )
     assert torch.equal(net.rules, only(13, 13).expand(2, -1, -1)) and net.size.tolist() == [3, 4]
     assert net.scope.tolist() == [LARGE, LARGE]
@@ -246,20 +245,20 @@ def test_cells_hold_the_sum_of_probabilities(dots):
     net, images = untrained(dots), torch.randint(0, 256, (3, 3, *dots.canvas), dtype=torch.uint8)
     C = torch.arange(len(dots.classes))
     net.scope.copy_((C + 1) % len(SCOPES))
-    by_sum = net.readings(net.look(images))[0][:, net.scope, 0, C]
+    by_sum = net.readings(net.compute_maps(images))[0][:, net.scope, 0, C]
     cells = net.cells(images)
     assert cells.shape == (3, len(C), *net.places(min(STRIDES))) and net.classes == dots.classes
     torch.testing.assert_close(cells.sum((2, 3)), by_sum, rtol=1e-4, atol=1e-5)
 
 
-def test_what_is_believed_is_whole_objects_or_none(dots):
+def test_pseudo_labels_are_whole_objects_or_none(dots):
     net = untrained(dots)
     held = torch.zeros(1, len(SCOPES), 2, 14, 14)
     held[..., 0, 3, 3], held[..., 0, 3, 10] = 0.6, 0.05  # surely one, and hardly one
     held[..., 1, 8, 3:5] = 0.4  # one between two places
     kinds = [held[:, list(kind.scopes)].expand(4, -1, -1, -1, -1, -1) for kind in KINDS]
-    net.by_head = lambda maps: kinds
-    for kind, found in zip(KINDS, net.believed([]), strict=True):
+    net.head_probabilities = lambda maps: kinds
+    for kind, found in zip(KINDS, net.pseudo_labels([]), strict=True):
         assert found.shape == (1, len(kind.scopes), 3, 14, 14)
         assert torch.allclose(found.sum(2), torch.ones(1)) and (found >= 0).all()
         counts = found[:, :, 1:].sum((3, 4))
@@ -283,7 +282,7 @@ def test_heads_teach_themselves_what_they_half_see(learnt, dots, draw_twice):
 
 def read_of(net: PretrainedCountNet, images: torch.Tensor) -> torch.Tensor:
     """Sums of probabilities ``(N, S, C)``."""
-    return net.readings(net.look(images))[0][:, :, RULES.index(Rule("sum"))]
+    return net.readings(net.compute_maps(images))[0][:, :, RULES.index(Rule("sum"))]
 
 
 def test_how_far_heads_are_apart_is_noted_before_they_teach_one_another(learnt, dots, draw_twice):
@@ -292,5 +291,5 @@ def test_how_far_heads_are_apart_is_noted_before_they_teach_one_another(learnt, 
     taught = training(dots, draw_twice, 80, 15, 64, 8, photographs=images)
     taught.restore(learnt[0].state())
     taught.run()
-    before = disagreement(learnt[0].net.readings([part.half() for part in learnt[0].net.look(images)])[1])
+    before = disagreement(learnt[0].net.readings([part.half() for part in learnt[0].net.compute_maps(images)])[1])
     assert taught.done == 16 and torch.equal(taught.net.apart, before)

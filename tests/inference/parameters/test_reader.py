@@ -15,12 +15,18 @@ from probscene.grammar import Grammar
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.batches import STRIDE as CELL
 from probscene.inference.features.counting.batches import cells
-from probscene.inference.parameters.graph import Graph, Seen
-from probscene.inference.parameters.reader import Detections, blocks, circles, cut_draw, cut_mean
-from probscene.inference.parameters.scene_graph_builder import assembly, order_by_variance
+from probscene.inference.parameters.graph import ClassNodes, SceneGraph
+from probscene.inference.parameters.reader import (
+    Detections,
+    find_objects,
+    harmonics,
+    truncated_mean,
+    truncated_quantile,
+)
+from probscene.inference.parameters.scene_graph_builder import fit_scene_graph_builder, order_by_variance
 from probscene.inference.parameters.sites import Site, find_sites
 from probscene.inference.parameters.skill import CIRCLE, LINE, TWICE, Skill
-from probscene.inference.parameters.supervised_renders import SupervisedRenders, joined
+from probscene.inference.parameters.supervised_renders import SupervisedRenders, concatenate
 from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
@@ -34,8 +40,8 @@ def test_cut_normal_distributions_are_scipys(mean, sd, v):
         return  # nearly nothing of it lies between 0 and 1
     reference = truncnorm(low, high, mean, sd)
     one, other = torch.tensor(mean).double(), torch.tensor(sd).double()
-    assert float(cut_mean(one, other)) == pytest.approx(reference.mean(), abs=1e-3)
-    assert float(cut_draw(one, other, torch.tensor(v).double())) == pytest.approx(reference.ppf(v), abs=5e-3)
+    assert float(truncated_mean(one, other)) == pytest.approx(reference.mean(), abs=1e-3)
+    assert float(truncated_quantile(one, other, torch.tensor(v).double())) == pytest.approx(reference.ppf(v), abs=5e-3)
 
 
 @given(seeds, st.integers(0, 12))
@@ -49,7 +55,7 @@ def test_objects_apart_are_all_found(seed, number):
     places = torch.tensor(np.array(centre).reshape(1, -1, 2), dtype=torch.float32)
     label = torch.zeros(places.shape[:2], dtype=torch.int64)
     mass = cells(places * CELL, label, 1, 20, 20)[:, 1]
-    n, y, x, inside = blocks(mass, 0.4)
+    n, y, x, inside = find_objects(mass, 0.4)
     assert len(n) == len(centre)
     found = {(int(i), int(j)) for i, j in zip(x, y, strict=True)}
     wanted = {tuple(np.floor(at - 0.5).astype(int).tolist()) for at in centre}
@@ -59,7 +65,7 @@ def test_objects_apart_are_all_found(seed, number):
 def test_objects_come_image_by_image():
     mass = torch.zeros(3, 6, 6)
     mass[0, 1, 1] = mass[2, 4, 4] = mass[2, 1, 1] = 1.0
-    assert blocks(mass, 0.4)[0].tolist() == [0, 2, 2] and len(blocks(torch.zeros(2, 6, 6), 0.4)[0]) == 0
+    assert find_objects(mass, 0.4)[0].tolist() == [0, 2, 2] and len(find_objects(torch.zeros(2, 6, 6), 0.4)[0]) == 0
 
 
 def said(u, error=0.02, way=LINE):
@@ -71,9 +77,9 @@ def said(u, error=0.02, way=LINE):
     if way == LINE:
         raw[:, 0, 0], raw[:, 0, 1] = noisy, np.log(error)
     if way == CIRCLE:
-        raw[:, 0, 2:] = circles(noisy) * 0.98
+        raw[:, 0, 2:] = harmonics(noisy) * 0.98
     if way == TWICE:
-        raw[:, 0, 4:] = circles(noisy)[:, 2:] * 0.98
+        raw[:, 0, 4:] = harmonics(noisy)[:, 2:] * 0.98
     return raw
 
 
@@ -81,7 +87,7 @@ def said(u, error=0.02, way=LINE):
 def test_the_way_is_found_and_read(way):
     u = torch.rand(600, generator=torch.Generator().manual_seed(1))
     raw = said(u, way=way)
-    skill = Skill.of(raw, u[:, None])
+    skill = Skill.from_readings(raw, u[:, None])
     assert skill.way.tolist() == [way] and float(skill.share) > 0.9 and bool(skill.readable)
     mean, sd = skill.read(raw)
     apart = (mean[:, 0] - u).abs()
@@ -93,8 +99,8 @@ def test_the_way_is_found_and_read(way):
 def test_what_says_nothing_is_not_readable():
     u = torch.rand(600, generator=torch.Generator().manual_seed(1))
     raw = said(u, way=LINE)[torch.randperm(600, generator=torch.Generator().manual_seed(2))]
-    assert not Skill.of(raw, u[:, None]).readable.any()
-    assert not Skill.of(raw, torch.full((600, 1), torch.nan)).readable.any()
+    assert not Skill.from_readings(raw, u[:, None]).readable.any()
+    assert not Skill.from_readings(raw, torch.full((600, 1), torch.nan)).readable.any()
 
 
 @given(seeds, st.sampled_from([LINE, CIRCLE, TWICE]), st.floats(0.3, 1.0), st.floats(0.02, 0.4))
@@ -106,8 +112,8 @@ def test_what_is_told_of_others_is_that_of_a_regression_however_far_guesses_are_
     read = torch.from_numpy(u + error * rng.standard_normal(200)).float().nan_to_num(0.5)
     raw = torch.zeros(200, 1, 6)
     raw[:, 0, 0], raw[:, 0, 1] = 0.5 + much * 0.2 * (read - 0.5), -6.0
-    raw[:, 0, 2:] = much * circles(read) + torch.tensor([0.1, 0.2, 0.3, 0.4])
-    told = Skill(torch.tensor([way]), torch.ones(1)).told(raw, torch.from_numpy(u).float()[:, None])
+    raw[:, 0, 2:] = much * harmonics(read) + torch.tensor([0.1, 0.2, 0.3, 0.4])
+    told = Skill(torch.tensor([way]), torch.ones(1)).explained_variance(raw, torch.from_numpy(u).float()[:, None])
     there = ~np.isnan(u)
     true, said = u[there], read.numpy()[there]
     if way:
@@ -118,27 +124,27 @@ def test_what_is_told_of_others_is_that_of_a_regression_however_far_guesses_are_
     left = np.linalg.lstsq(x, y, rcond=None)[1].sum()
     assert float(told) == pytest.approx(1 - left / (y.var(0).sum() * 100), abs=2e-3)
     few = torch.from_numpy(u).float()[:38, None]
-    assert Skill(torch.tensor([way]), torch.ones(1)).told(raw[:38], few).isnan().all()
+    assert Skill(torch.tensor([way]), torch.ones(1)).explained_variance(raw[:38], few).isnan().all()
 
 
 @given(seeds, st.integers(0, 40))
 def test_what_is_the_same_for_all_says_nothing_however_few_they_are(seed, number):
     rng = torch.Generator().manual_seed(seed)
     u, raw = torch.rand(number, 1, generator=rng), torch.randn(1, 1, 6, generator=rng).expand(number, 1, 6)
-    share = Skill.of(raw, u).share
+    share = Skill.from_readings(raw, u).share
     assert share.isnan().all() if number < 2 else float(share) < 0.05
 
 
 def test_a_site_that_few_objects_have_is_hardly_ever_read_by_chance():
     torch.manual_seed(0)
-    readable = [bool(Skill.of(torch.randn(20, 1, 6), torch.rand(20, 1)).readable) for _ in range(500)]
+    readable = [bool(Skill.from_readings(torch.randn(20, 1, 6), torch.rand(20, 1)).readable) for _ in range(500)]
     assert sum(readable) < 5
 
 
 def test_skill_is_the_share_of_the_variance_that_is_explained():
     u = torch.rand(20_000, generator=torch.Generator().manual_seed(1))
     for error in (0.02, 0.06):
-        share = float(Skill.of(said(u, error), u[:, None]).share)
+        share = float(Skill.from_readings(said(u, error), u[:, None]).share)
         assert share == pytest.approx(1 - 12 * error**2, abs=0.01)
 
 
@@ -147,11 +153,13 @@ def test_graphs_are_those_that_were_drawn(trays):
     seed_everything(0)
     scenes = sample(trays, trays.prior, 60)
     derivation = scenes.derivation.trimmed()
-    seen = Seen.of(trays.grammar, trays.classes, derivation)
+    seen = ClassNodes.from_derivation(trays.grammar, trays.classes, derivation)
     place = torch.rand(*seen.kind.shape, 2) * 60
     place[..., 0] = place[..., 0].sort(1).values  # siblings go from the left to the right
-    group = seen.taken(derivation.parent)
-    made = assembly(trays.grammar, trays.classes, Graph.of(seen.kind, seen.parent), place, group)
+    group = seen.gather(derivation.parent)
+    made = fit_scene_graph_builder(
+        trays.grammar, trays.classes, SceneGraph.from_nodes(seen.kind, seen.parent), place, group
+    )
     n, m = (seen.kind >= 0).nonzero(as_tuple=True)
     label = torch.tensor([trays.classes.index(trays.grammar.kinds[k]) for k in seen.kind[n, m].tolist()])
     parent = seen.parent[n, m]
@@ -176,10 +184,12 @@ def test_siblings_of_groups_that_cannot_be_seen_come_in_any_order():
     for text, any_order in (("Scene -> left(Cars) right(Cars) sun", True), ("Scene -> left(Cars) sun", False)):
         grammar = Grammar(f"{text}\nCars -> car car car")
         derivation = expand(grammar, lambda t, frontier, previous: frontier[0], 20, 4)
-        seen = Seen.of(grammar, ("car", "sun"), derivation)
+        seen = ClassNodes.from_derivation(grammar, ("car", "sun"), derivation)
         place = torch.rand(20, seen.kind.shape[1], 2, generator=torch.Generator().manual_seed(0))
-        group = seen.taken(derivation.parent)
-        made = assembly(grammar, ("car", "sun"), Graph.of(seen.kind, seen.parent), place, group)
+        group = seen.gather(derivation.parent)
+        made = fit_scene_graph_builder(
+            grammar, ("car", "sun"), SceneGraph.from_nodes(seen.kind, seen.parent), place, group
+        )
         n, m = (seen.kind >= 0).nonzero(as_tuple=True)
         label = (seen.kind[n, m] == grammar.kind("sun")).long()
         nothing = torch.zeros(len(n), 0, 6)
@@ -208,7 +218,7 @@ def test_batches_are_joined_as_they_are(model):
     )
     seed_everything(0)
     parts = [renders.draw(3, model.prior), renders.draw(5, model.prior)]
-    whole = joined(parts)
+    whole = concatenate(parts)
     for part, rows in zip(parts, (slice(0, 3), slice(3, 8)), strict=True):
         M = part.parent.shape[1]
         assert torch.equal(whole.drawn.image[rows], part.drawn.image)

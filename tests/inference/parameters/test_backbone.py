@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.photographs.net import PretrainedCountNet
 from probscene.inference.features.presence import PresenceNet
 from probscene.inference.parameters.backbone import WIDTH, Backbone, RenderBackbone, cell_colours
 from probscene.inference.parameters.reader import Reader
@@ -16,7 +16,7 @@ CLASSES = ("red", "blue")
 
 def eye_of(kind, canvas):
     net = CountNet(CLASSES, 3, canvas, width=(4, 8, 8)) if kind == "renders" else PretrainedCountNet(CLASSES, canvas)
-    eye = Backbone.of(net)
+    eye = Backbone.from_feature_net(net)
     assert eye is not None
     return eye.eval()
 
@@ -38,7 +38,7 @@ def test_what_is_found_does_not_depend_on_the_other_images(kind):
     reader = Reader(eye, 2, 1, 1).eval()
     torch.nn.init.normal_(reader.what.weight, std=30.0)
     images = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
-    alone, together = reader.find(images[3:4]), reader.find(images)
+    alone, together = reader.detect(images[3:4]), reader.detect(images)
     rows = together.image == 3
     assert len(alone.image) and torch.allclose(alone.centre, together.centre[rows], atol=1e-3)
     assert torch.allclose(alone.overall[0], together.overall[3], atol=1e-4)
@@ -78,5 +78,5 @@ def test_the_reader_is_shown_fewer_renders_that_are_larger(size, images):
 
 
 def test_features_without_places_give_no_eye():
-    assert Backbone.of(PresenceNet(CLASSES)) is None
-    assert isinstance(Backbone.of(CountNet(CLASSES, 3, (64, 64))), RenderBackbone)
+    assert Backbone.from_feature_net(PresenceNet(CLASSES)) is None
+    assert isinstance(Backbone.from_feature_net(CountNet(CLASSES, 3, (64, 64))), RenderBackbone)

@@ -5,9 +5,9 @@ from probscene.derive import derive_complete
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
+from probscene.inference.structure_training import StructureTraining
 
 
 def learner(small, batches, seed=5, divergence=None, **options):
@@ -20,7 +20,7 @@ def learner(small, batches, seed=5, divergence=None, **options):
         updates=2,
     )
     real = small.features[torch.multinomial(small.target, 200, replacement=True)]
-    return Trainer(small.program, guide, loss, real, batches, num_scenes=40, seed=seed, **options)
+    return StructureTraining(small.program, guide, loss, real, batches, num_scenes=40, seed=seed, **options)
 
 
 @pytest.mark.parametrize("num_real", [None, 50])

@@ -2,8 +2,8 @@
 
 import torch
 
-from probscene.inference.parameters.global_head import GlobalHead, looks
-from probscene.inference.parameters.reader import HARMONICS, cut_mean, normal
+from probscene.inference.parameters.global_head import GlobalHead, global_features
+from probscene.inference.parameters.reader import HARMONICS, normal, truncated_mean
 from probscene.inference.parameters.reader_training import GlobalHeadTraining
 
 RENDERS = 600
@@ -37,7 +37,7 @@ def test_a_horizon_and_an_exposure_are_read_from_few_renders_and_where_some_have
     torch.manual_seed(1)
     images, u = views(200)
     with torch.no_grad():
-        read = cut_mean(*normal(net(images)))
+        read = truncated_mean(*normal(net(images)))
     assert ((1 - 12 * (read - u).square().mean(0)) > 0.9).all()
 
 
@@ -75,6 +75,6 @@ def test_what_was_interrupted_ends_the_same():
 def test_grey_and_colour_bytes_and_floats_look_the_same():
     torch.manual_seed(0)
     images, _ = views(3)
-    known = looks(images)
-    assert torch.allclose(known, looks(images.expand(-1, 3, -1, -1)), atol=1e-5)
-    assert torch.allclose(known, looks(images / 255), atol=1e-5)
+    known = global_features(images)
+    assert torch.allclose(known, global_features(images.expand(-1, 3, -1, -1)), atol=1e-5)
+    assert torch.allclose(known, global_features(images / 255), atol=1e-5)

@@ -27,7 +27,7 @@ def move(guide, towards):
 def looks(guide):
     """u of both sites, in place of an image."""
     seed_everything(1)
-    scenes = sample(guide.suited(guide.model), guide.model.prior, 150)
+    scenes = sample(guide.with_parameters(guide.model), guide.model.prior, 150)
     u = quantiles_of(guide.model, scenes)
     floor = u["floor.turn"].nan_to_num(0.0).sum(1)
     return torch.stack([u["scene.bright"][:, 0], floor], 1).double().numpy()
@@ -44,14 +44,14 @@ def test_a_site_that_brings_scenes_no_nearer_is_named(trays):
     assert uninformative_sites(guide, held((0.0, 0.4), (0.6, 1.0))) == {"scene.bright"}
     assert uninformative_sites(guide, held((0.6, 1.0), (0.6, 1.0))) == frozenset()
     assert uninformative_sites(guide, held((0.0, 0.4), (0.0, 0.4))) == set(NAMES)
-    assert not guide.passed
+    assert not guide.prior_sites
 
 
 def test_a_site_that_is_passed_draws_the_prior_s_numbers(trays):
     guide = guide_of(trays, (2.0, 2.0))
-    guide.passed = frozenset(["floor.turn"])
+    guide.prior_sites = frozenset(["floor.turn"])
     seed_everything(0)
-    learnt = sample(guide.suited(trays), trays.prior, 20)
+    learnt = sample(guide.with_parameters(trays), trays.prior, 20)
     seed_everything(0)
     prior = sample(trays, trays.prior, 20)
     for name, value in prior.parameters.items():
@@ -60,17 +60,17 @@ def test_a_site_that_is_passed_draws_the_prior_s_numbers(trays):
 
 def test_training_that_made_it_surely_worse_is_undone(trays):
     guide, best = guide_of(trays, (1.0, 1.0)), CheckpointSelector(held((0.6, 1.0), (0.6, 1.0)))
-    best.after(guide)
+    best.update(guide)
     move(guide, (2.0, 2.0))
-    best.after(guide)  # better
+    best.update(guide)  # better
     assert float(guide.net.scene_out[0].bias[6].detach()) == 2.0
     move(guide, (-2.0, -2.0))
-    best.after(guide)  # worse
+    best.update(guide)  # worse
     assert float(guide.net.scene_out[0].bias[6].detach()) == 2.0
     resumed = CheckpointSelector(best.held)
     resumed.restore(best.state())
     move(guide, (-2.0, -2.0))
-    resumed.after(guide)
+    resumed.update(guide)
     assert float(guide.net.scene_out[0].bias[6].detach()) == 2.0
 
 
@@ -83,20 +83,20 @@ def test_sites_that_would_keep_their_prior_do_not_decide_about_others(trays):
         return float(guide.net.scene_out[0].bias[6].detach())
 
     guide, best = guide_of(trays, first), CheckpointSelector(judges)
-    best.after(guide, turn)
+    best.update(guide, turn)
     move(guide, second)
-    best.after(guide, turn)
-    assert bias(guide) == second[0] and best.passed == turn and not guide.passed
+    best.update(guide, turn)
+    assert bias(guide) == second[0] and best.prior_sites == turn and not guide.prior_sites
     move(guide, (-3.0, 4.0))
-    best.after(guide, turn)
+    best.update(guide, turn)
     assert bias(guide) == second[0]
     resumed = CheckpointSelector(judges)
     resumed.restore(best.state())
     move(guide, (2.5, -1.0))
-    resumed.after(guide, turn)
+    resumed.update(guide, turn)
     assert bias(guide) == 2.5
     all_sites = CheckpointSelector(judges)
-    all_sites.after(move(guide, (0.0, 0.0)) or guide)
+    all_sites.update(move(guide, (0.0, 0.0)) or guide)
     move(guide, second)
-    all_sites.after(guide)
+    all_sites.update(guide)
     assert bias(guide) == 0.0
