@@ -21,9 +21,8 @@ from probscene.model import SceneModel
 
 from ..datasets.generate import generate, generate_scenes
 from ..evaluation.diagnose import diagnose
-from ..evaluation.evaluate import evaluate
+from ..evaluation.evaluate import evaluate, warn_of_saturated_lists
 from ..evaluation.labels import counts_of_dataset, read_labels
-from ..evaluation.list_warnings import tell
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
 from ..files import make_folder, write_json
 from ..fitting import session
@@ -74,13 +73,13 @@ def demo(
         run, opened = _begun(model, target, out / "run", preset, seed, threads, show)
         if not run.is_finished:
             session.carry_out(run, opened, show, cache, use_cache)
-            tell(run, show)
+            warn_of_saturated_lists(run, show)
         generate(run, num, out / "dataset", seed, progress=show.stage("generating"))
         if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
             _judge(run, opened or open_images(target, loaded, False, show), out, show)
     console = Console(highlight=False)
     measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))
-    for table in tables.distances({"truth": measured["distances"]["truth"]}):
+    for table in tables.distance_tables({"truth": measured["distances"]["truth"]}):
         console.print(table)
     print("\nWithout labels:")
     verdict_text.show_parts(measured["trust"], console)
@@ -117,7 +116,7 @@ def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:
     found = evaluate(run, target, read_labels(out / "truth.csv", model, target), show)
     judged = diagnose(run, target, show, evaluation=found)
     write_json(out / "evaluation.json", found.record() | {"trust": judged.record()})
-    report.write(run, found, target, judged=judged)
+    report.write(run, found, target, diagnostics=judged)
     sources = policies(run)
     panels = {"Prior": PRIOR, "Structure alone": STRUCTURE, "Structure and parameters": LEARNT}
     if STRUCTURE not in sources:

@@ -15,7 +15,7 @@ from probscene.inference.features.base import FeatureNet, Features
 from probscene.model import SceneModel
 
 from ..arguments import checked_seed
-from ..evaluation.list_warnings import tell
+from ..evaluation.evaluate import warn_of_saturated_lists
 from ..fitting import session
 from ..fitting.overrides import override
 from ..fitting.plugins import GuideMaker, Plugins, in_memory, is_file_part, lasting_word, load_part
@@ -137,7 +137,7 @@ def fit(
                     )
                 if not run.is_finished:
                     session.carry_out(run, images, show, *_cache(cache), nodes)
-                    tell(run, show)
+                    warn_of_saturated_lists(run, show)
         except BaseException:
             if temporary is not None:
                 shutil.rmtree(temporary, ignore_errors=True)

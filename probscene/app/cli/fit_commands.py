@@ -75,7 +75,7 @@ def fit(
 
     from ..api.fit import chosen_preset, preset_for_photographs, with_learn
     from ..evaluation.diagnose import diagnose
-    from ..evaluation.list_warnings import tell
+    from ..evaluation.evaluate import warn_of_saturated_lists
     from ..fitting import session
     from ..fitting.pipeline import open_target
     from ..loading import split_reference
@@ -129,7 +129,7 @@ def fit(
             if unfinished:
                 session.carry_out(run, images, show, cache, not no_cache, nodes)
         if unfinished:
-            tell(run, show)
+            warn_of_saturated_lists(run, show)
             if not no_verdict:
                 judged = diagnose(run, images or open_target(run, show), show)
     if judged is not None:

@@ -15,7 +15,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.likelihood import likelihood
-from probscene.app.evaluation.structure_counts import label
+from probscene.app.evaluation.structure_counts import group_label
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.views.report import report, write
@@ -146,7 +146,7 @@ def test_the_command_shows_what_depends_on_context(call, plates, found, tmp_path
     assert json.loads((tmp_path / "e.json").read_text()) == json.loads(json.dumps(found.record()))
     for group in ("all", "first", "others"):
         value = found.distance("prior", "truth")["children"]["mug per plate"][group]["total_variation"]["value"]
-        name = label(PAIR, group)[:12]  # a long name goes on in the line below
+        name = group_label(PAIR, group)[:12]  # a long name goes on in the line below
         assert any(name in line and f"{value:.3f}" in line for line in shown.out.splitlines())
     assert "impossible" in shown.out and "log q" in shown.out
     plain = call(*words)
@@ -165,7 +165,7 @@ def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
 def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_path):
     text = write(plates.run, found, plates.opened, tmp_path / "r.html").read_text(encoding="utf-8")
     for group in ("all", "first", "second", "others"):
-        assert text.count(label(PAIR, group)) >= 2  # a chart and a table
+        assert text.count(group_label(PAIR, group)) >= 2  # a chart and a table
     assert "log q of the labelled structures" in text and "impossible" in text
     from probscene.app.progress import Display
 

@@ -14,7 +14,7 @@ from PIL import Image
 from probscene.app.evaluation.compare import compare, open_runs
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import Labels
-from probscene.app.evaluation.structure_counts import StructureCounts, count, sampled
+from probscene.app.evaluation.structure_counts import StructureCounts, count_structures, sample_counts
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
 from probscene.app.views.comparison import picture, shown
@@ -60,7 +60,7 @@ def nested(tmp_path_factory) -> dict[str, RunFolder]:
 def truth_of(run: RunFolder, num: int = 300) -> Labels:
     torch.manual_seed(9)
     derivation, _ = derive_complete(run.model.grammar, run.model.prior, num, run.model.max_steps)
-    return Labels(count(run.model, derivation), derivation)
+    return Labels(count_structures(run.model, derivation), derivation)
 
 
 def test_each_run_is_as_far_from_the_truth_as_evaluate_says(two, target):
@@ -118,7 +118,7 @@ def test_where_kinds_nest_children_are_compared_by_rank(nested):
         assert np.allclose(rows[words].shares["truth"][: len(share)], share)
         assert rows[words].means["truth"] == pytest.approx(np.mean(expected))
         assert 0 < rows[words].apart["a"] < 1
-    structures = sampled(first.model, nested["b"].guide, 300, 0)
+    structures = sample_counts(first.model, nested["b"].guide, 300, 0)
     assert np.array_equal(found.sources["b"].counts, structures.counts)
     assert set(found.likelihoods) == {"prior", "a", "b"}
     assert found.likelihoods["b"].nats.value == pytest.approx(

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from probscene.app.evaluation.image_distances import as_of, image_distances
+from probscene.app.evaluation.image_distances import extrapolate, image_distances
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import features_in, features_of, own_net
 from probscene.dataset import ImageFolder
@@ -64,7 +64,7 @@ def test_fid_of_two_samples_of_one_distribution_falls_as_one_over_their_number()
     sampled = torch.randn(4, 2000, 6, generator=torch.Generator().manual_seed(0))
     few = [fid(one[:400], one[400:800], "noise", size=2) for one in sampled]
     many = sum(fid(one[:1000], one[1000:], "noise", size=2).value for one in sampled) / 4
-    assert sum(as_of(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
+    assert sum(extrapolate(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
 
 
 @pytest.mark.parametrize(

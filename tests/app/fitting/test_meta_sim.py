@@ -12,7 +12,7 @@ from probscene.app.fitting.preset import Preset
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
-from probscene.inference.statistics.bootstrap_test import BootstrapTest
+from probscene.inference.statistics.energy import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"steps": 4, "scenes": 6, "values": 10, "rate": 0.05, "feature_size": 96, "images": 20, "hidden": 8}
@@ -21,7 +21,7 @@ LEARN = ("--learn", "structure,parameters", "--parameters", "meta-sim", "--set",
 
 
 def it_is_kept(patch):
-    patch.setattr(select_sites, "farther", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
 
 
 @pytest.fixture(scope="module")

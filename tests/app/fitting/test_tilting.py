@@ -13,7 +13,7 @@ from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.tilting import learning
-from probscene.inference.statistics.bootstrap_test import BootstrapTest
+from probscene.inference.statistics.energy import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"rounds": 3, "first": 50, "scenes": 20, "steps": 4, "images": 20}
@@ -36,7 +36,7 @@ def lit(tmp_path_factory, discs) -> Path:
 
 
 def it_is_kept(patch):
-    patch.setattr(select_sites, "farther", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(learning, "CHANCE", 1.1)  # of so few scenes, whatever they say
 
 
