@@ -63,7 +63,7 @@ def test_extreme_counts_are_those_of_enumeration(pair):
         for sign in (1, -1):
             total = process.max_totals(sign * objects, STEPS)
             for steps in range(STEPS + 1):
-                assert total[steps] == (sign * every[rules <= steps, kind]).max(initial=-np.inf)
+                assert total[steps] == (sign * every[rules <= steps, kind].astype(float)).max(initial=-np.inf)
             largest = process.max_total(sign * objects)
             assert largest >= total[-1] and (np.isinf(largest) or largest == process.max_totals(sign * objects, 60)[-1])
 

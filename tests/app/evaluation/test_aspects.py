@@ -105,13 +105,13 @@ def guided(fitted, *, learnt: SceneModel | None, structure=TRUTH):
     return Guided.at(fitted.path, model=dots(24.0))
 
 
-def words(found) -> dict[str, str | None]:
+def grades(found) -> dict[str, str | None]:
     return {name: part.grade for name, part in found.components.parts.items()}
 
 
 def test_a_sample_of_the_target_is_good_in_every_part(fitted):
     found = diagnose(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
-    assert set(words(found).values()) == {Grade.GOOD} and found.components.verdict == "good"
+    assert set(grades(found).values()) == {Grade.GOOD} and found.components.verdict == "good"
     record = json.loads(json.dumps(found.record(), allow_nan=False))
     assert record["verdict"] == record["overall"] == "good" and list(record["parts"]) == list(KINDS)
     for name in ("layout", "looks"):
@@ -125,10 +125,10 @@ def test_a_sample_of_the_target_is_good_in_every_part(fitted):
 @pytest.mark.parametrize("learnt", [None, dots(24.0)])
 def test_layout_and_looks_of_the_prior_are_not_good_however_good_the_structure(fitted, learnt):
     found = diagnose(guided(fitted, learnt=learnt), fitted.images, quiet, 300)
-    found_words = words(found)
-    assert found_words.pop("looks") in (Grade.NO_BETTER, None)  # dots are small, and images few
-    assert found_words.pop("structure") in (Grade.GOOD, Grade.BETTER)  # dots that lie in a line are counted otherwise
-    assert found_words == {"layout": Grade.NO_BETTER}
+    found_grades = grades(found)
+    assert found_grades.pop("looks") in (Grade.NO_BETTER, None)  # dots are small, and images few
+    assert found_grades.pop("structure") in (Grade.GOOD, Grade.BETTER)  # dots that lie in a line are counted otherwise
+    assert found_grades == {"layout": Grade.NO_BETTER}
     record = found.record()
     assert record["overall"] == "no better than the prior" and record["verdict"] != "good"
     assert "--learn structure,parameters" in record["parts"]["layout"]["remedy"]
@@ -137,25 +137,25 @@ def test_layout_and_looks_of_the_prior_are_not_good_however_good_the_structure(f
 
 def test_halfway_is_better_than_the_prior(fitted):
     found = diagnose(guided(fitted, learnt=dots(11.0)), fitted.images, quiet, 300)
-    assert words(found)["layout"] is Grade.BETTER and found.components.overall is not Grade.GOOD
+    assert grades(found)["layout"] is Grade.BETTER and found.components.overall is not Grade.GOOD
 
 
 def test_a_class_whose_layout_is_the_priors_is_named(fitted):
     found = diagnose(guided(fitted, learnt=dots(0.0, 24.0)), fitted.images, quiet, 300)
     layout = {name: each["layout"] for name, each in found.components.classes.items()}
-    assert layout == {"red": Grade.GOOD, "blue": Grade.NO_BETTER} and words(found)["layout"] is not Grade.GOOD
+    assert layout == {"red": Grade.GOOD, "blue": Grade.NO_BETTER} and grades(found)["layout"] is not Grade.GOOD
     assert "Layout by class: good for red; no better than the prior for blue." in printed(found)
 
 
 def test_what_looks_unlike_the_target_is_no_better_than_the_prior(fitted):
     found = diagnose(guided(fitted, learnt=dots(0.0, bright=0.3)), fitted.images, quiet, 300)
-    assert words(found)["looks"] is not Grade.GOOD and "scene.photo(...)" in found.components.parts["looks"].remedy
+    assert grades(found)["looks"] is not Grade.GOOD and "scene.photo(...)" in found.components.parts["looks"].remedy
 
 
 def test_features_that_do_not_say_where_objects_are(fitted, monkeypatch):
     monkeypatch.delattr(CountNet, "cells")
     found = diagnose(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
-    assert words(found) == {"structure": Grade.GOOD, "layout": None, "looks": Grade.GOOD}
+    assert grades(found) == {"structure": Grade.GOOD, "layout": None, "looks": Grade.GOOD}
     assert "do not say where objects are" in printed(found) and found.components.verdict == "not judged"
     assert found.record()["overall"] == "not judged"
 
@@ -183,7 +183,7 @@ def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, l
     site = {"name": "light", "kinds": [], "learnt": learnt, "skill": None, "because": ""}
     chosen = override(preset("quick"), [f"parameter_method={method}"])
     run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]}, preset=chosen)
-    figures = SimpleNamespace(left=None, high=None)
+    figures = SimpleNamespace(ratio=None, high=None)
     said = component_remedy(run, "looks", Grade.NO_BETTER, figures, "More photographs would tell.")
     named = re.findall(r"--set (\w+)\.(\w+)=(\d+)", said)
     assert said.count("--set") == len(named) and learnt <= bool(named)
@@ -194,9 +194,15 @@ def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, l
 @pytest.mark.parametrize("verdict", Verdict)
 @pytest.mark.parametrize("labelled", [True, False])
 def test_structure_that_is_read_wrongly_needs_labels_and_what_is_to_be_set_has_a_value(verdict, labelled):
-    run = SimpleNamespace(preset=preset("quick"), record={"labels": {}} if labelled else {})
-    said = structure_remedy(run, SimpleNamespace(verdict=verdict, remedy="Use it."))
-    assert "train" not in said and ("--set batches=120" in said) is (verdict in (Verdict.NOT_FITTED, Verdict.UNDERFIT))
+    features = SimpleNamespace(pretrained=True)
+    run = SimpleNamespace(preset=preset("quick"), record={"labels": {}} if labelled else {}, features=features)
+    said = structure_remedy(run, verdict)
+    assert "train the" not in said and ("--set batches=120" in said) is (
+        verdict in (Verdict.NOT_FITTED, Verdict.UNDERFIT)
+    )
+    assert "pretrained" not in said  # which it has
+    features.pretrained = False
+    assert (structure_remedy(run, verdict) == said) is (verdict is not Verdict.DOMAIN_SHIFT)
     if verdict is Verdict.UNDERFIT:
         assert ("label more images than this fit had" if labelled else "label ten images") in said
 
@@ -207,7 +213,7 @@ def printed(found) -> str:
     return out.getvalue()
 
 
-def aspects_of(*found) -> VerdictComponents:
+def components_of(*found) -> VerdictComponents:
     parts = zip(KINDS, found, strict=True)
 
     def component(kind, word):
@@ -220,7 +226,7 @@ def aspects_of(*found) -> VerdictComponents:
 @given(st.sampled_from(Grade), st.sampled_from([*Grade, None]), st.sampled_from([*Grade, None]), st.booleans())
 def test_the_whole_is_never_better_than_its_worst_part(structure, layout, looks, doubt):
     found = structure, layout, looks
-    whole = replace(aspects_of(*found), doubtful=("dot.x",) if doubt else ())
+    whole = replace(components_of(*found), doubtful=("dot.x",) if doubt else ())
     good = not doubt and set(found) == {Grade.GOOD}
     assert good is (whole.verdict == "good") is (whole.overall is Grade.GOOD) is (whole.head.grade is Grade.GOOD)
     if not doubt or set(found) != {Grade.GOOD}:

@@ -208,7 +208,7 @@ def test_where_fits_set_out_from_another_policy_it_is_a_source(fitted, target, t
     json.dumps(found.record())
     console = Console(width=200, file=io.StringIO())
     show(found, console)
-    assert console.file.getvalue().count("start") >= 4
+    assert console.file.getvalue().count("initialisation") >= 4
     several = compare({"one": run}, opened(target.images), None, quiet, num=50)
     assert list(several.sources) == ["prior", "start", "one", "estimate"]
     assert list(several.distances()["estimate"]) == ["prior", "start", "one"]

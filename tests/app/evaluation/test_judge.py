@@ -15,6 +15,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation import diagnose as verdict
 from probscene.app.evaluation.diagnose import diagnose
 from probscene.app.evaluation.evaluate import evaluate
+from probscene.app.evaluation.explain import structure_reason
 from probscene.app.evaluation.label_agreement import DISAGREE, agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
@@ -108,12 +109,11 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
     target = getattr(drawn, folder)
     told = []
     found = diagnose(guided(seeing, policy), target, lambda *said: told.append(said), SCENES)
-    assert found.structure.verdict == expected, found.structure.because
+    assert found.structure.verdict == expected, structure_reason(found.structure)
     assert told[-1][0] == "judging" and told[-1][1] == told[-1][2]
     assert len(found.real_uncovered) == len(found.generated_uncovered) == verdict.NUM_EXAMPLES
     assert found.names == tuple(target.paths[i].name for i in found.real_uncovered)
     assert all(picture.shape == (64, 64, 3) for picture in found.generated_uncovered)
-    assert not found.structure.pretrained
     record = json.loads(json.dumps(found.record(), allow_nan=False))
     assert record["parts"]["structure"]["verdict"] == str(expected) and "labels" not in record
     # Discs stand and look as the prior's, which few images can tell from the target's: the structure is not the whole.

@@ -12,4 +12,4 @@ def test_the_worst_of_labels_that_are_all_the_same():
         "b": HistogramComparison(0.5, 0.5, 0.0, 0.0),
         "c": HistogramComparison(0.3, 0.3, 0.1, 0.2),
     }
-    assert Agreement.worst.fget(SimpleNamespace(each=found)) == "b"
+    assert Agreement.worst.fget(SimpleNamespace(histograms=found)) == "b"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.components import KINDS, VerdictComponent, VerdictComponents
-from probscene.app.evaluation.sizes import SCENES, BoxSizes, _medians, compared, given_boxes, sizes, with_sizes
+from probscene.app.evaluation.sizes import NUM_SCENES, BoxSizes, _medians, compare_sizes, given_boxes, sizes, with_sizes
 from probscene.dataset import ImageFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
@@ -32,7 +32,7 @@ def side(number: int, scale: float = 1.0, seed: int = 0):
 
 
 @pytest.mark.parametrize(
-    ("number", "prior", "learnt", "word", "worse"),
+    ("number", "prior", "learnt", "grade", "worse"),
     [
         (600, 1.5, 1.0, Grade.GOOD, False),
         (600, 1.0, 1.0, Grade.GOOD, False),  # sizes that are right are right, whoever made them so
@@ -44,9 +44,9 @@ def side(number: int, scale: float = 1.0, seed: int = 0):
         (12, 1.05, 1.1, None, False),
     ],
 )
-def test_the_word_for_sizes_is_right_where_they_are_known(number, prior, learnt, word, worse):
-    found = compared(side(number), side(800, prior, 1), side(800, learnt, 2))
-    assert (found.grade, found.worse, found.boxes) == (word, worse, number)
+def test_the_grade_of_sizes_is_right_where_they_are_known(number, prior, learnt, grade, worse):
+    found = compare_sizes(side(number), side(800, prior, 1), side(800, learnt, 2))
+    assert (found.grade, found.worse, found.boxes) == (grade, worse, number)
     assert found.low[0] <= found.given[0] <= found.high[0] and found.off_low <= found.off_high
     assert found.learnt == pytest.approx((20 * learnt, 30 * learnt), rel=0.05)
 
@@ -63,9 +63,9 @@ def test_medians_are_those_of_the_boxes_and_a_resample_has_whole_images(rows):
 
 @given(st.sampled_from([*Grade, None]), st.booleans())
 def test_looks_are_no_better_than_the_priors_where_sizes_are_worse(looks, worse):
-    size = compared(side(600), side(600), side(600, 1.3 if worse else 1.0))
-    words = {"structure": Grade.GOOD, "layout": Grade.GOOD, "looks": looks}
-    before = VerdictComponents({k: VerdictComponent(words[k], f"{k}.", verdict=str(words[k])) for k in KINDS}, {}, {})
+    size = compare_sizes(side(600), side(600), side(600, 1.3 if worse else 1.0))
+    grades = {"structure": Grade.GOOD, "layout": Grade.GOOD, "looks": looks}
+    before = VerdictComponents({k: VerdictComponent(grades[k], f"{k}.", verdict=str(grades[k])) for k in KINDS}, {}, {})
     found = with_sizes(before, {"red": size})
     assert with_sizes(before, {}) is before and found.parts["sizes"].grade is (Grade.NO_BETTER if worse else Grade.GOOD)
     assert found.parts["looks"].grade is (Grade.NO_BETTER if worse and looks is not None else looks)
@@ -98,7 +98,7 @@ def test_boxes_of_labels_are_held_beside_those_of_scenes(tmp_path):
     run = SimpleNamespace(model=model, guide=guide, record={"labels": labels}, visible_shares=dict)
     boxes, told = given_boxes(run, target), []
     found = sizes(run, boxes, told.append)
-    assert found["red"].grade is Grade.NO_BETTER and found["red"].worse and sum(told) == 2 * SCENES
+    assert found["red"].grade is Grade.NO_BETTER and found["red"].worse and sum(told) == 2 * NUM_SCENES
     assert found["blue"].grade is Grade.GOOD and found["blue"].given == found["blue"].prior == found["blue"].learnt
     assert found["red"].boxes == sum(int((each[:, 0] == 0).sum()) for each in boxes.boxes)
     assert given_boxes(SimpleNamespace(model=model, record={}), target) is None

@@ -14,7 +14,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import own_net
 from probscene.dataset import ImageFolder
 from probscene.errors import RunError
-from probscene.inference.divergence import SHARE
+from probscene.inference.divergence import SELF_SHARE
 from probscene.inference.features.base import embed_all
 from probscene.inference.features.photographs import readability
 from probscene.inference.statistics.verdict import Verdict
@@ -46,7 +46,7 @@ def test_the_network_is_recorded_and_only_its_projection_kept(run, target):
 def test_the_log_says_how_the_projection_came_out(run):
     first, *rest = map(json.loads, (run[0].path / "log.jsonl").read_text().splitlines())
     assert first["stage"] == "projection" and first["ratio"] == sorted(first["ratio"], reverse=True)
-    assert first["self_share"] == pytest.approx(SHARE, rel=0.05) and first["ratio"][0] > 2
+    assert first["self_share"] == pytest.approx(SELF_SHARE, rel=0.05) and first["ratio"][0] > 2
     assert [line["stage"] for line in rest] == ["structure"] * 2
 
 

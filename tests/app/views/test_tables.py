@@ -137,7 +137,7 @@ bins = st.integers(1, 400).map(range) | st.lists(st.text("abwmi", min_size=1, ma
 
 
 @settings(max_examples=60)
-@given(bins, st.sampled_from([charts.WIDE, charts.SMALLER, (2.6, 2.6)]), st.sampled_from([7.5, 10, 14]))
+@given(bins, st.sampled_from([charts.WIDE, charts.NARROW, (2.6, 2.6)]), st.sampled_from([7.5, 10, 14]))
 def test_labels_of_bins_never_touch_and_are_those_of_their_bins(bins, size, points):
     with matplotlib.rc_context({"xtick.labelsize": points}):
         figure = Figure(size, layout="constrained")

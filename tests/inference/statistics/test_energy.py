@@ -61,7 +61,7 @@ def test_the_permutation_test_is_scipys():
         return scipy.stats.energy_distance(x, y)
 
     theirs = scipy.stats.permutation_test(
-        (a[:, 0], b[:, 0]), statistic, n_size=999, alternative="greater", rng=np.random.default_rng(0)
+        (a[:, 0], b[:, 0]), statistic, n_resamples=999, alternative="greater", rng=np.random.default_rng(0)
     )
     assert permutation_p_value(a, b, permutations=1999) == pytest.approx(theirs.pvalue, abs=0.03)
     assert 0.005 < theirs.pvalue < 0.3  # so that the comparison says something
@@ -102,7 +102,7 @@ def test_a_feature_that_is_constant_in_the_real_images_has_a_floor():
         generated[:, 3] = rng.random(600) < share
         found = marginal_test(generated, real)
         assert np.isfinite(found.distances).all() and found.largest.close == close
-    assert found.worst == 3
+    assert found.feature == 3
     both = marginal_test(np.zeros((100, 1)), np.zeros((100, 1)))
     assert both.distances.tolist() == [0] and both.largest.close
 

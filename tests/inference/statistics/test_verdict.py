@@ -153,9 +153,7 @@ def test_the_images_that_stand_apart_are_named():
     found = structure_verdict(generated, real, names=NAMES, resolution=0.5)
     assert set(found.statistics.real_uncovered.worst[:2]) == {13, 250}
     assert found.statistics.generated_uncovered.worst[0] == 99
-    assert (
-        found.verdict == Verdict.GOOD and found.statistics.real_uncovered.probability < 0.02
-    )  # three images are no verdict
+    assert found.verdict == Verdict.GOOD and found.statistics.real_uncovered.share < 0.02  # three images are no verdict
     assert set(found.record()["single_features"]) == set(NAMES)
 
 
