@@ -85,7 +85,8 @@ def _check_guide(guide: object) -> None:
     if missing:
         raise ModelError(
             f"expected a guide with {', '.join(GUIDE_ATTRIBUTES[:-1])} and {GUIDE_ATTRIBUTES[-1]}, got "
-            f"{type(guide).__name__} without {', '.join(missing)}; derive it from probscene.inference.guides.base.Guide."
+            f"{type(guide).__name__} without {', '.join(missing)}; derive it from "
+            "probscene.inference.guides.base.Guide."
         )
 
 

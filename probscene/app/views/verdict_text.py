@@ -34,7 +34,7 @@ def show(found: FitDiagnostics, console: Console) -> None:
         return
     for text in _sentences(found):
         console.print(text, soft_wrap=True)
-    table = Table(title="Can this structure be trusted? Without labels", title_justify="left", title_style="bold")
+    table = Table(title="Statistics of structure, without labels", title_justify="left", title_style="bold")
     for name in STATISTICS_HEAD:
         table.add_column(name, justify="right" if name else "left")
     for row in rows(found.structure.statistics):

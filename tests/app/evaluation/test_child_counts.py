@@ -158,7 +158,7 @@ def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
     lines = [line for line in shown.out.splitlines() if not line.startswith("Warning: ")]
     titles = [line.strip() for line in lines if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
-        "Distance to the truth", "TV: total variation", "Distance to what the feature network sees *",
+        "Distance to the truth", "TV: total variation", "Distance to what the feature network reads *",
         "Images by number of objects", "Objects by class", "Counts read in each labelled image"]  # fmt: skip
 
 

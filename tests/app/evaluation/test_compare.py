@@ -191,7 +191,7 @@ def test_the_command_draws_prints_and_writes_the_same(call, two, target, tmp_pat
 
 def test_the_runs_own_target_is_taken_where_none_is_named(call, two, target, tmp_path):
     done = call("compare", *two, "--num", 100, "--out", tmp_path / "c.png")
-    assert done.code == 0 and "what the feature network sees" in done.out and "An estimate without labels" in done.out
+    assert done.code == 0 and "what the feature network reads" in done.out and "An estimate without labels" in done.out
     done = call("compare", *two, "--labels", target.labels, "--num", 100, "--out", tmp_path / "c.png")
     assert done.code == 0 and "TV and W-1 to the truth" in done.out
 
