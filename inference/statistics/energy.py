@@ -277,7 +277,7 @@ def _root(squared: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.sqrt(np.maximum(squared, 0.0))
 
 
-def _energy_test(distances: Features, floor: Features, split_size: int) -> EnergyTest:
+def _energy_test(distances: NDArray[np.floating], floor: NDArray[np.floating], split_size: int) -> EnergyTest:
     distance = float(distances.mean())
     low, high = np.quantile(floor, [0.025, 0.975])
     return EnergyTest(
