@@ -28,7 +28,7 @@ from ..labels.reading import has_boxes
 from ..labels.text import text_of
 from .structure_counts import Counts, StructureCounts, count_structures
 
-SEEN = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
+VISIBLE_NOTE = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
 
 
 class Labels(NamedTuple):
@@ -77,7 +77,7 @@ def read_labels(path: Path, model: SceneModel, target: Images, some: bool = Fals
     if has_boxes(path):
         boxes = read_boxes(path, model, target, some, min_height)
         low = min_height * float(np.median(target.scales))
-        counts, notes = StructureCounts(boxes.counts, {}), (SEEN, *boxes.notes)
+        counts, notes = StructureCounts(boxes.counts, {}), (VISIBLE_NOTE, *boxes.notes)
         whole = None if min_height else boxes
         return Labels(counts, None, boxes.classes, notes, low, boxes.rows, whole)
     if min_height:

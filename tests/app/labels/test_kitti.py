@@ -15,7 +15,7 @@ from PIL import Image
 from pycocotools.coco import COCO
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.labels import SEEN, read_labels
+from probscene.app.evaluation.labels import VISIBLE_NOTE, read_labels
 from probscene.app.evaluation.structure_counts import sample_counts
 from probscene.app.evaluation.visible import MAX_RENDERED, Visibility, count_scenes, count_visible
 from probscene.app.fitting.run import RunFolder
@@ -164,7 +164,7 @@ def test_a_written_dataset_is_read_back(tmp_path):
     seen = [Counter(dataset.cats[a["category_id"]]["name"] for a in dataset.imgToAnns[i]) for i in range(40)]
     target = ImageFolder(tmp_path / "out" / "images", model.canvas, model.channels)
     read = read_labels(tmp_path / "out" / "Kitti" / "raw" / "training" / "label_2", model, target)
-    assert read.classes == model.classes and read.notes == (SEEN,)
+    assert read.classes == model.classes and read.notes == (VISIBLE_NOTE,)
     assert read.structures.counts.tolist() == [[found[name] for name in model.classes] for found in seen]
 
 
@@ -230,7 +230,7 @@ def test_the_commands_take_the_folder(call, fitted, target, labelled, tmp_path):
             record["sources"]["prior"]["mean_number"]
             == count_visible(model, model.prior, 100, 0, Visibility()).sum() / 100
         )
-        assert SEEN in record["notes"] and SEEN in done.out
+        assert VISIBLE_NOTE in record["notes"] and VISIBLE_NOTE in done.out
         said = "40 of 40 images have regions marked DontCare"
         assert said in record["notes"][-1] and said in " ".join(done.out.split())
         done = call(command, fitted, *words, *more, "--min-height", 9)
