@@ -30,7 +30,7 @@ from learn_driving import FLOOR, counted, sampled_anew
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.sources import PRIOR, START, before
+from probscene.app.evaluation.sources import PRIOR, START, baseline_policies
 from probscene.app.files import write_json
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
@@ -38,7 +38,7 @@ from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.inference.statistics.metrics import histogram, total_variation
+from probscene.inference.statistics.count_metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
@@ -142,7 +142,7 @@ def of_seed(args, seed: int) -> list[dict]:
     floor = [total_variation(histogram(sample[:, i]), histogram(truth[:, i])) for i in range(len(target.classes))]
     own = figures(target, target.prior, truth, held_out) | {"total_variation": round(float(np.mean(floor)), 4)}
     rows = [{"variant": FLOOR, "settings": "", "seed": seed, **own, "seconds": 0.0}]
-    for name, policy in before(model).items():
+    for name, policy in baseline_policies(model).items():
         rows.append(
             {"variant": name, "settings": "", "seed": seed, **figures(model, policy, truth, held_out), "seconds": 0.0}
         )

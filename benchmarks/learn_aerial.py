@@ -28,7 +28,7 @@ from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL, QUICK
 from probscene.app.fitting.store import timing
 from probscene.derive import derive_complete
-from probscene.inference.statistics.metrics import total_variation
+from probscene.inference.statistics.count_metrics import total_variation
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET, poisson
 from probscene.policy import Policy
 from probscene.relations import per_parent

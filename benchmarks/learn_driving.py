@@ -22,7 +22,7 @@ from torch.nn.functional import one_hot
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.sources import FITTED, LEARNT, START, before
+from probscene.app.evaluation.sources import LEARNT, SAMPLED_SOURCES, START, baseline_policies
 from probscene.app.files import write_json
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
@@ -33,8 +33,7 @@ from probscene.app.memory import tune_malloc
 from probscene.derive import derive_complete
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.features.counting.training import CountFeatures
-from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
-from probscene.inference.statistics.tally import around
+from probscene.inference.statistics.count_metrics import bootstrap_interval, histogram, total_variation, wasserstein
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
@@ -58,7 +57,10 @@ def apart(counts: np.ndarray, truth: np.ndarray) -> dict[str, list[float]]:
     resampled = rng.multinomial(len(counts), own, RESAMPLES) / len(counts)
     distances = {"total_variation": total_variation, "wasserstein": wasserstein}
     return {
-        name: [round(x, 4) for x in around(distance(own, true), [distance(each, true) for each in resampled], 0.0)]
+        name: [
+            round(x, 4)
+            for x in bootstrap_interval(distance(own, true), [distance(each, true) for each in resampled], 0.0)
+        ]
         for name, distance in distances.items()
     }
 
@@ -116,7 +118,7 @@ def main():
         run = fit(args.model, folder / "images", config, out=path, seed=seed, resume=True, execution=execution)
         truth = counted(model, target.prior)
         row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
-        policies = {**before(run.model), LEARNT: run.guide}
+        policies = {**baseline_policies(run.model), LEARNT: run.guide}
         counts = {name: counted(model, policy) for name, policy in policies.items()}
         counts[FLOOR] = sampled_anew(target, args.images)
         row |= distances(model, counts, truth)
@@ -128,7 +130,7 @@ def main():
         rows.append(row)
         print(json.dumps(row), flush=True)
         write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
-    for name in (name for name in (*FITTED, FLOOR) if name in rows[0]):
+    for name in (name for name in (*SAMPLED_SOURCES, FLOOR) if name in rows[0]):
         cars = [row[name]["car"]["total_variation"][0] for row in rows]
         print(f"{name:8} cars, total variation: mean {np.mean(cars):.3f}, {min(cars):.3f} to {max(cars):.3f}")
 

@@ -27,7 +27,7 @@ from probscene.app.fitting.presets import preset
 from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
 from probscene.derive import derive_complete
-from probscene.inference.statistics.metrics import histogram, total_variation
+from probscene.inference.statistics.count_metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import per_parent

@@ -26,7 +26,7 @@ import probscene as ps
 from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import Labels, read_labels
-from probscene.app.evaluation.sources import FITTED
+from probscene.app.evaluation.sources import SAMPLED_SOURCES
 from probscene.app.evaluation.structure_counts import StructureCounts
 from probscene.app.files import make_folder, write_json
 from probscene.app.fitting.config import BOTH, STRUCTURE, configuration, parameter_choice
@@ -36,7 +36,7 @@ from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
-from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.count_metrics import histogram, total_variation, wasserstein
 
 SCENES, RESAMPLES = 2000, 200
 COUNTS = "count=efficientnet"
@@ -110,7 +110,9 @@ def main():
         row |= {"unread": list(run.unread), "means": {}, "distances": {}}
         for c, name in enumerate(classes):
             column = found.classes.index(name)
-            each = {s: source.counts[:, column] for s, source in found.sources.items() if s in (*FITTED, "truth")}
+            each = {
+                s: source.counts[:, column] for s, source in found.sources.items() if s in (*SAMPLED_SOURCES, "truth")
+            }
             row["means"][name] = {s: round(float(x.mean()), 2) for s, x in each.items()}
             row["distances"][name] = {s: apart(x, counts[rest, c]) for s, x in each.items() if s != "truth"}
             if len(few):

@@ -41,8 +41,8 @@ from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.sites import U_EPS, quantiles_of, site_name, with_handlers
+from probscene.inference.statistics.count_metrics import histogram, total_variation
 from probscene.inference.statistics.image_metrics import kid
-from probscene.inference.statistics.metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything

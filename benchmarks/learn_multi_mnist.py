@@ -34,7 +34,7 @@ from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
-from probscene.inference.statistics.metrics import histogram, pooled_shares, total_variation
+from probscene.inference.statistics.count_metrics import histogram, pooled_shares, total_variation
 from probscene.inference.structure_training import StructureTraining
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL
 from probscene.sampling import seed_everything

@@ -40,7 +40,7 @@ from probscene.app.loading import renderer_for
 from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.statistics.image_metrics import Figure, kid
+from probscene.inference.statistics.image_metrics import ImageDistance, kid
 from probscene.policy import Policy
 from probscene.sampling import Scenes
 
@@ -74,7 +74,7 @@ def drawn(run: RunFolder, policy: Policy, seed: int) -> tuple[list[Scenes], Tens
     return scenes, torch.cat([render(some.drawing).image for some in scenes])[:IMAGES]
 
 
-def said(figure: Figure) -> dict[str, float]:
+def said(figure: ImageDistance) -> dict[str, float]:
     """For JSON."""
     return {"value": figure.value, "low": figure.low, "high": figure.high}
 

@@ -22,7 +22,7 @@ from given import command, out_option
 from learn_driving import FLOOR, counted, distances, sampled_anew
 from torch import Tensor
 
-from probscene.app.evaluation.sources import FITTED, LEARNT, before
+from probscene.app.evaluation.sources import LEARNT, SAMPLED_SOURCES, baseline_policies
 from probscene.app.files import make_folder, write_json
 from probscene.app.fitting.config import FitConfig
 from probscene.app.fitting.presets import preset
@@ -88,7 +88,7 @@ def measured(model: SceneModel, seed: int, again: int, args: argparse.Namespace)
     target, channel, began = model.target(seed), Channel(model), time.monotonic()
     guide = learn(model, channel, channel.sample(target, target.prior, args.images, 1000 + seed), config, again)
     truth = counted(model, target.prior)
-    counts = {name: counted(model, policy) for name, policy in {**before(model), LEARNT: guide}.items()}
+    counts = {name: counted(model, policy) for name, policy in {**baseline_policies(model), LEARNT: guide}.items()}
     counts[FLOOR] = sampled_anew(target, args.images)
     row = {"seed": seed, "again": again, "seconds": round(time.monotonic() - began, 1)}
     sides = (model, guide), (target, target.prior)
@@ -115,7 +115,7 @@ def main():
             print(json.dumps(rows[-1]), flush=True)
             write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
     first = model.classes[0]
-    for name in (name for name in (*FITTED, FLOOR, "read") if name in rows[0]):
+    for name in (name for name in (*SAMPLED_SOURCES, FLOOR, "read") if name in rows[0]):
         each = [row[name][first]["total_variation"][0] for row in rows]
         print(f"{name:8} {first}, total variation: mean {np.mean(each):.3f}, {min(each):.3f} to {max(each):.3f}")
 

@@ -42,8 +42,8 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import Evaluation, evaluate
 from probscene.app.evaluation.labels import Labels, read_labels
-from probscene.app.evaluation.sources import FITTED, LEARNT, before
-from probscene.app.evaluation.structure_counts import sampled
+from probscene.app.evaluation.sources import LEARNT, SAMPLED_SOURCES, baseline_policies
+from probscene.app.evaluation.structure_counts import sample_counts
 from probscene.app.files import write_json
 from probscene.app.fitting.config import BOTH, STRUCTURE
 from probscene.app.fitting.pipeline import Execution
@@ -53,8 +53,8 @@ from probscene.app.labels.kitti import DONT_CARE, read_objects
 from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
+from probscene.inference.statistics.count_metrics import histogram, total_variation, wasserstein
 from probscene.inference.statistics.image_metrics import fid, kid
-from probscene.inference.statistics.metrics import histogram, total_variation, wasserstein
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -81,7 +81,7 @@ def row(found: Evaluation) -> dict:
     """How far prior, start and learnt are from the labels."""
     each = cars(found)
     out = {"truth": {"mean": round(float(np.dot(np.arange(len(each["truth"])), each["truth"])), 2)}}
-    for name in (name for name in each if name in FITTED):
+    for name in (name for name in each if name in SAMPLED_SOURCES):
         out[name] = {
             "mean": round(float(np.dot(np.arange(len(each[name])), each[name])), 2),
             "total_variation": round(float(total_variation(each[name], each["truth"])), 3),
@@ -100,7 +100,7 @@ def from_all(found: Evaluation, counts: Path) -> dict:
             "wasserstein": round(float(wasserstein(each, every)), 3),
         }
         for name, each in cars(found).items()
-        if name in (*FITTED, "truth")
+        if name in (*SAMPLED_SOURCES, "truth")
     }
 
 
@@ -126,8 +126,8 @@ def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) ->
 def structures(run: RunFolder) -> dict[str, dict[str, float]]:
     """How many objects of each class scenes of each source have in the mean."""
     means = {
-        name: sampled(run.model, policy, SCENES, 0).counts.mean(0).round(2).tolist()
-        for name, policy in {**before(run.model), LEARNT: run.guide}.items()
+        name: sample_counts(run.model, policy, SCENES, 0).counts.mean(0).round(2).tolist()
+        for name, policy in {**baseline_policies(run.model), LEARNT: run.guide}.items()
     }
     return {name: dict(zip(run.model.classes, each, strict=True)) for name, each in means.items()}
 
@@ -163,7 +163,7 @@ def said(images: Tensor) -> dict[str, list[float]]:
 def looks(run: RunFolder, frames: ImageFolder, num: int, grid: Path) -> dict:
     """What is said of frames and of each source's images, and how far these are from the frames; some as a picture."""
     real = frames.subset(len(frames))
-    policies = before(run.model)
+    policies = baseline_policies(run.model)
     if run.parameters:
         policies["structure"] = copy(run.guide)
         policies["structure"].suits = None

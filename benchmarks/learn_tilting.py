@@ -36,8 +36,8 @@ from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import TiltingLearning
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
-from probscene.inference.statistics.tally import around, resamples
-from probscene.inference.statistics.two_sample import Features
+from probscene.inference.statistics.count_metrics import bootstrap_interval, resamples
+from probscene.inference.statistics.energy import Features
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
@@ -61,7 +61,7 @@ def squared(own: Features, real: Features) -> tuple[float, float, float]:
 
     whole = found(np.ones((1, len(own))), np.ones((1, len(real))))
     drawn = found(resamples(len(own), RESAMPLES, 0), resamples(len(real), RESAMPLES, 1))
-    value, low, high = around(float(whole[0]), drawn)
+    value, low, high = bootstrap_interval(float(whole[0]), drawn)
     return round(value, 4), round(low, 4), round(high, 4)
 
 

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from probscene.errors import ProbsceneError
 
-BLOCK = 2**18  # kernels in memory at once
-SHARE = 0.1  # of the density at a scene that is its own kernel's
+BLOCK_SIZE = 2**18  # kernels in memory at once
+SELF_SHARE = 0.1  # of the density at a scene that is its own kernel's
 
 
 class Divergence(Protocol):
@@ -87,15 +87,15 @@ class KDELogRatio:
     stabilised: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        generated, real = _compared(generated, real, self.stabilised)
+        generated, real = _transformed(generated, real, self.stabilised)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
-        cost = self.of_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
+        cost = self.cost_of_log_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
         if self.marginal_variance is not None and generated.shape[1] > 1:
             one, other = (features.T.contiguous().unsqueeze(-1) for features in (generated, real))  # (D, N or L, 1)
-            cost = cost + self.of_ratio(self._log_ratios(one, other, self.marginal_variance)).sum(0)
+            cost = cost + self.cost_of_log_ratio(self._log_ratios(one, other, self.marginal_variance)).sum(0)
         return cost
 
-    def of_ratio(self, log_ratio: Tensor) -> Tensor:
+    def cost_of_log_ratio(self, log_ratio: Tensor) -> Tensor:
         """The cost where the log ratio is ``log_ratio``; of the same shape."""
         return log_ratio
 
@@ -116,7 +116,7 @@ class JensenShannon(KDELogRatio):
     it never exceeds log 2, so no scene is punished without bound for being where no real one is (not in [1]).
     """
 
-    def of_ratio(self, log_ratio: Tensor) -> Tensor:
+    def cost_of_log_ratio(self, log_ratio: Tensor) -> Tensor:
         """``log 2 - log(1 + p~/q~)``."""
         return math.log(2) - torch.nn.functional.softplus(-log_ratio)
 
@@ -137,7 +137,7 @@ class MMD:
     stabilised: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        generated, real = _compared(generated, real, self.stabilised)
+        generated, real = _transformed(generated, real, self.stabilised)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         N, L = len(generated), len(real)
         within = torch.exp(-0.5 / variance * _squared_distances(generated, generated)).fill_diagonal_(0.0)
@@ -168,7 +168,7 @@ class Blockwise:
     divergences: tuple[Divergence | None, ...]
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        _check(generated, real)
+        _check_features(generated, real)
         blocks = zip(self.divergences, generated.split(self.sizes, 1), real.split(self.sizes, 1), strict=True)
         costs = [divergence(*block) for divergence, *block in blocks if divergence is not None]
         return sum(costs, torch.zeros(len(generated)))
@@ -195,7 +195,7 @@ def _log_sums(points: Tensor, data: Tensor, variance: float, leave_one_out: bool
     if leave_one_out:
         pivot = pivot.where(pivot != torch.arange(N), nearest[:, 1:])
     fill = partial(torch.addcmul, value=1 / variance) if d == 1 else partial(torch.baddbmm, alpha=1 / variance)
-    rows, samples = min(N, max(1, BLOCK // L)), min(B, max(1, BLOCK // (N * L)))
+    rows, samples = min(N, max(1, BLOCK_SIZE // L)), min(B, max(1, BLOCK_SIZE // (N * L)))
     memory = points.new_empty(samples * rows * L)
     found = torch.empty_like(points[..., 0])
     for b in range(0, B, samples):
@@ -230,13 +230,13 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
     return (a.square().sum(1, keepdim=True) + b.square().sum(1) - 2 * a @ b.T).clamp_(min=0.0)
 
 
-def _compared(generated: Tensor, real: Tensor, stabilised: bool) -> tuple[Tensor, Tensor]:
+def _transformed(generated: Tensor, real: Tensor, stabilised: bool) -> tuple[Tensor, Tensor]:
     """Features, checked, and transformed where they are to be stabilised."""
-    _check(generated, real)
+    _check_features(generated, real)
     return (anscombe(generated), anscombe(real)) if stabilised else (generated, real)
 
 
-def _check(generated: Tensor, real: Tensor) -> None:
+def _check_features(generated: Tensor, real: Tensor) -> None:
     if generated.ndim != 2 or real.ndim != 2 or generated.shape[1] != real.shape[1]:
         raise ProbsceneError(
             f"expected generated (N, D) and real (L, D) features, got {tuple(generated.shape)} and {tuple(real.shape)}."
@@ -257,9 +257,9 @@ def self_share(points: Tensor) -> float:
 
 
 def bandwidth(points: Tensor) -> float:
-    """The least standard deviation of a Gaussian kernel at which ``points (N, d)`` have a self share of ``SHARE``, or
-    of two points' worth where there are too few for that."""
-    share, low, high = max(SHARE, 2 / len(points)), -20.0, 20.0  # powers of two
+    """The least standard deviation of a Gaussian kernel at which ``points (N, d)`` have a self share of ``SELF_SHARE``,
+    or of two points' worth where there are too few for that."""
+    share, low, high = max(SELF_SHARE, 2 / len(points)), -20.0, 20.0  # powers of two
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if self_share(points / 2**middle) > share else (low, middle)

@@ -141,6 +141,39 @@ class Branching:
                 return float(length[0])
             length = grown
 
+    def max_totals(self, gain: np.ndarray, max_steps: int) -> np.ndarray:
+        """``(T + 1,)`` the largest total gain of a derivation of at most 0, 1, ..., T rules; -inf where there is none.
+
+        Args:
+            gain: ``(E,)`` of each production, such as the objects that it adds.
+            max_steps: T.
+        """
+        (E, R), size = self.children.shape, len(self.types)
+        total = np.full((size + 1, max_steps + 1), -np.inf)  # of derivations of exactly n rules
+        total[size, 0] = 0.0
+        partial = np.full((R + 1, E, max_steps + 1), -np.inf)  # over the first r children
+        partial[0, :, 0] = gain
+        for n in range(1, max_steps + 1):
+            for r, child in enumerate(self.children.T):
+                partial[r + 1, :, n - 1] = (partial[r, :, :n] + total[child, n - 1 :: -1]).max(1)
+            np.maximum.at(total[:, n], self.owner, partial[R, :, n - 1])
+        return np.maximum.accumulate(total[0])
+
+    def max_total(self, gain: np.ndarray) -> float:
+        """The largest total gain of a derivation of any length, of gains that are all of one sign; infinite if there is
+        no largest."""
+        size = len(self.types)
+        total = np.append(np.full(size, -np.inf), 0.0)
+        before = total
+        with np.errstate(invalid="ignore"):  # of a child without an end beside one without a largest
+            for n in range(3 * size):
+                if n == size:  # deeper derivations repeat a type, and have a larger total only if there is no largest
+                    before = total.copy()
+                if n == 2 * size:
+                    total[total > before] = np.inf
+                np.fmax.at(total, self.owner, gain + total[self.children].sum(1))
+        return float(total[0])
+
 
 def expand_table(table: Tensor, P: int, C: int) -> Tensor:
     """A table ``(..., p, c, K)`` with P and C entries on its two index axes; all later ones are as the last."""

@@ -24,7 +24,7 @@ def test_python_runs(tmp_path, monkeypatch, capsys):
     (tmp_path / "drawn" / "images").rename(tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PROBSCENE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("probscene.app.evaluation.source_features.IMAGES", 40)
+    monkeypatch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 40)
     fit = ps.fit
     monkeypatch.setattr(ps, "fit", lambda model, target, config: fit(model, target, ps.preset(config).set(TINY)))
     monkeypatch.setattr(ps.Run, "report", functools.partialmethod(ps.Run.report, num=200, scenes=60))

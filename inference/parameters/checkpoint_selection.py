@@ -6,8 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..statistics.bootstrap_test import bootstrap_test
-from ..statistics.two_sample import Features
+from ..statistics.energy import Features, bootstrap_test
 from ..training import of_prefix
 from .guide import ParameterGuide
 
@@ -56,7 +55,7 @@ class CheckpointSelector:
             guide.net.load_state_dict(self.weights)
             if self.looks is None:  # resumed
                 self.looks = self.held.looks(guide, self.prior_sites)
-            if bootstrap_test(looks, self.looks, self.held.real).sure:
+            if bootstrap_test(looks, self.looks, self.held.real).significant:
                 return
             guide.net.load_state_dict(now)
         self.weights, self.looks, self.prior_sites = now, looks, prior_sites
@@ -83,11 +82,11 @@ def uninformative_sites(guide: ParameterGuide, held: HeldOutSet) -> frozenset[st
 
     prior, away = look(frozenset()), {}
     for name in sorted(names):
-        apart = bootstrap_test(prior, look(frozenset((name,))), held.real)
-        if apart.sure:
-            away[name] = apart.other
+        test = bootstrap_test(prior, look(frozenset((name,))), held.real)
+        if test.significant:
+            away[name] = test.baseline_distance
     if len(away) > 1:
-        apart = bootstrap_test(look(frozenset(away)), prior, held.real)
-        if apart.one >= apart.other:
+        test = bootstrap_test(look(frozenset(away)), prior, held.real)
+        if test.distance >= test.baseline_distance:
             away = {min(away, key=away.__getitem__): 0.0}
     return names - frozenset(away)

@@ -11,16 +11,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 from torch.nn.functional import pad
 
+from probscene.branching import Branching
 from probscene.grammar import Grammar
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.reach import Reach
 from probscene.request import Renderable
 from probscene.sampling import Scenes, run_program, sample
 from probscene.scenarios import JointGrammar
@@ -141,9 +142,10 @@ def _of_nodes(name: str, kinds: list[str], grammar: Grammar, classes: tuple[str,
 
 def occurs_once(grammar: Grammar, kinds: list[str]) -> bool:
     """Whether every scene that a grammar derives has exactly one node of some kinds."""
+    process = Branching(grammar, Support(grammar, grammar.legal[:, None, None]).uniform().table)
     numbers = [grammar.kind(kind) for kind in kinds]
-    reach = Reach(grammar, Support(grammar, grammar.legal[:, None, None]), None, [numbers])
-    return reach.least(0) == reach.most(0) == 1
+    nodes = np.isin(grammar.objects.numpy()[process.rule], numbers).sum(1)
+    return process.max_total(nodes) == -process.max_total(-nodes) == 1
 
 
 def _of_all(grammars: dict[str, Grammar], parts: list[tuple[Site, ...]]) -> tuple[Site, ...]:

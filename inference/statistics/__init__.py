@@ -1,1 +1,1 @@
-"""Distances between samples, their intervals, and the verdict."""
+"""Distances between samples, their tests and intervals, and the verdict."""

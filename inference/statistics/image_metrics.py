@@ -1,7 +1,7 @@
-"""FID and KID of features that are computed already, through torchmetrics, with the bootstrap's spread.
+"""FID and KID of features that are computed already, through torchmetrics, with bootstrap intervals.
 
-A figure is nothing without the network whose features it was taken in, and without the number of images, on which FID
-depends: it carries both. Axis letters: L real images, N generated ones, D features, R resamples.
+A distance carries the name of the network whose features it was taken in, and the number of images, on which FID
+depends. Axis letters: L real images, N generated ones, D features, R resamples.
 
 References:
     [1] Heusel et al., *GANs Trained by a Two Time-Scale Update Rule*, 2017: FID.
@@ -20,22 +20,23 @@ from torchmetrics.image.kid import KernelInceptionDistance
 
 from probscene.errors import ProbsceneError
 
-from .tally import around, resamples
+from .count_metrics import bootstrap_interval, resamples
 
-SUBSET = 1000  # of KID, in its authors' code
+KID_SUBSET = 1000  # images, in its authors' code
 
 
-class Figure(NamedTuple):
+class ImageDistance(NamedTuple):
     """A distance between real and generated images.
 
     Attributes:
         name: ``"FID"`` or ``"KID"``.
         features: whose features it was taken in.
-        value: the figure; KID may fall below 0, as an unbiased estimate of 0 does.
-        low, high: the 95 % interval, the bootstrap's spread around the figure.
-        images: how many real ones.
-        generated: how many generated ones, or whatever is on the other side.
-        note: what to bear in mind, or nothing.
+        value: KID may fall below 0, as an unbiased estimate of 0 does.
+        low, high: the 95 % bootstrap interval.
+        images: number of real ones.
+        generated: number of generated ones, or of what is on the other side.
+        min_images: on each side, that the distance needs: for FID covariances of full rank, D + 1; for KID one subset.
+        extrapolated_from: images a side that it was measured with, where those were fewer than ``images``.
     """
 
     name: str
@@ -45,17 +46,11 @@ class Figure(NamedTuple):
     high: float
     images: int
     generated: int
-    note: str = ""
-
-    @property
-    def of_images(self) -> str:
-        """How many images it is of, in words."""
-        if self.images == self.generated:
-            return f"{self.images} images a side"
-        return f"{self.images} real, {self.generated} generated images"
+    min_images: int
+    extrapolated_from: int | None = None
 
 
-def fid(real: Tensor, generated: Tensor, features: str, size: int = 50, seed: int = 0) -> Figure:
+def fid(real: Tensor, generated: Tensor, features: str, size: int = 50, seed: int = 0) -> ImageDistance:
     """Fréchet distance between Gaussians with the features' means and covariances [1].
 
     It is biased upward, the more so the fewer images there are: only figures of as many images may be compared [3].
@@ -71,43 +66,40 @@ def fid(real: Tensor, generated: Tensor, features: str, size: int = 50, seed: in
     """
     real, generated = _checked(real, generated)
     (L, D), N = real.shape, len(generated)
-    metric = FrechetInceptionDistance(feature=_Given(D))
+    metric = FrechetInceptionDistance(feature=_Identity(D))
     metric.update(real, real=True)
     metric.update(generated, real=False)
     weight = [torch.from_numpy(resamples(len(x), size, seed + i)).double() for i, x in enumerate((real, generated))]
     drawn = [frechet(real[a > 0], generated[b > 0], a[a > 0], b[b > 0]).item() for a, b in zip(*weight, strict=True)]
-    few = min(L, N) <= D
-    note = f"FID of {min(L, N)} images in {D} dimensions: covariances of deficient rank, the figure is far too high"
-    return Figure("FID", features, *around(metric.compute().item(), drawn, 0.0), L, N, note if few else "")
+    return ImageDistance("FID", features, *bootstrap_interval(metric.compute().item(), drawn, 0.0), L, N, D + 1)
 
 
-def kid(real: Tensor, generated: Tensor, features: str, subset: int = SUBSET, size: int = 200, seed: int = 0) -> Figure:
+def kid(
+    real: Tensor, generated: Tensor, features: str, subset: int = KID_SUBSET, size: int = 200, seed: int = 0
+) -> ImageDistance:
     """Unbiased squared MMD under the cubic kernel [2], the mean over ten subsets where there are more images.
 
     Args:
-        subset: images of each side in a subset; all where there are fewer on a side, and the note says so.
+        subset: images of each side in a subset; all where there are fewer on a side.
         size: R.
 
     The other arguments and the errors are those of ``fid``.
     """
     real, generated = _checked(real, generated)
-    fewest = min(len(real), len(generated))
-    taken = min(subset, fewest)
+    taken = min(subset, len(real), len(generated))
     with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
         warnings.filterwarnings("ignore", "Metric `Kernel Inception Distance` will save", UserWarning)
         torch.manual_seed(seed)
         subsets = 1 if taken == len(real) == len(generated) else 10
-        metric = KernelInceptionDistance(feature=_Given(real.shape[1]), subsets=subsets, subset_size=taken)
+        metric = KernelInceptionDistance(feature=_Identity(real.shape[1]), subsets=subsets, subset_size=taken)
         metric.update(real, real=True)
         metric.update(generated, real=False)
         value = metric.compute()[0].item()
-    note = f"KID of {fewest} images, fewer than the {subset} of KID's subsets" if fewest < subset else ""
-    return Figure(
-        "KID", features, *around(value, _kid_drawn(real, generated, size, seed)), len(real), len(generated), note
-    )
+    interval = bootstrap_interval(value, _kid_resampled(real, generated, size, seed))
+    return ImageDistance("KID", features, *interval, len(real), len(generated), subset)
 
 
-def frechet(x: Tensor, y: Tensor, of_x: Tensor, of_y: Tensor) -> Tensor:
+def frechet(x: Tensor, y: Tensor, x_weight: Tensor, y_weight: Tensor) -> Tensor:
     """Fréchet distance between Gaussians fitted to weighted points.
 
     The trace of the root of the covariances' product is the nuclear norm of ``A B^T``, where ``A^T A``, ``B^T B`` are
@@ -115,10 +107,10 @@ def frechet(x: Tensor, y: Tensor, of_x: Tensor, of_y: Tensor) -> Tensor:
 
     Args:
         x, y: ``(L, D)`` and ``(N, D)``.
-        of_x, of_y: ``(L,)`` and ``(N,)`` how often each point counts.
+        x_weight, y_weight: ``(L,)`` and ``(N,)`` multiplicities of the points.
     """
     means, roots = [], []
-    for points, weight in ((x, of_x), (y, of_y)):
+    for points, weight in ((x, x_weight), (y, y_weight)):
         means.append(weight @ points / weight.sum())
         root = (points - means[-1]) * (weight / (weight.sum() - 1)).sqrt().unsqueeze(1)
         roots.append(root if len(root) <= root.shape[1] else torch.linalg.qr(root, mode="r").R)
@@ -131,7 +123,7 @@ def frechet(x: Tensor, y: Tensor, of_x: Tensor, of_y: Tensor) -> Tensor:
     )
 
 
-def _kid_drawn(real: Tensor, generated: Tensor, size: int, seed: int) -> np.ndarray:
+def _kid_resampled(real: Tensor, generated: Tensor, size: int, seed: int) -> np.ndarray:
     """``(R,)`` KID of resampled images; the copies of an image are no pair."""
     a, b = (torch.from_numpy(resamples(len(x), size, seed + i)).double() for i, x in enumerate((real, generated)))
     cross = ((a @ _kernel(real, generated)) * b).sum(1) / (a.sum(1) * b.sum(1))
@@ -148,8 +140,8 @@ def _kernel(x: Tensor, y: Tensor) -> Tensor:
     return (x @ y.T / x.shape[1] + 1) ** 3
 
 
-class _Given(nn.Module):
-    """Torchmetrics wants a network; these features have been through one."""
+class _Identity(nn.Module):
+    """Torchmetrics expects a network; these features come from one already."""
 
     def __init__(self, num_features: int):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Were modes lost, and how many generated scenes are worth anything as a sample of the real distribution?
+"""Mode collapse, and the effective sample size of generated scenes as a sample of the real distribution.
 
 Axis letters: N generated, L real, D features, K clusters.
 
@@ -18,21 +18,22 @@ from scipy.cluster.vq import kmeans2, vq
 from scipy.special import expit
 from scipy.stats import beta
 
-from .two_sample import Features
+from .energy import Features
 
-MOST = 20  # clusters
-IMAGES = 50  # a cluster, of those that its share is measured by: fewer could not be missed for sure
-LOST = 0.25  # of the real share
+MAX_CLUSTERS = 20
+IMAGES_PER_CLUSTER = 50  # that its share is measured by: of fewer none could be significantly under-represented
+COLLAPSE_RATIO = 0.25  # of the generated share to the real one
 
 
 class Modes(NamedTuple):
-    """Clusters of the real features and who has them.
+    """Clusters of the real features, and their shares in each sample.
 
     Attributes:
         centre: ``(K, D)``.
         real, generated, prior: ``(K,)`` shares; the prior's are NaN where there is none.
         low, high: ``(K,)`` limits of generated / real, that hold for all clusters at once with 95 %.
-        lost: ``(K,)`` bool: the generated share is surely under a quarter of the real one, and under the prior's.
+        collapsed: ``(K,)`` bool: the generated share is significantly less than ``COLLAPSE_RATIO`` of the real one, and
+            less than the prior's.
         missing: ``(K,)`` bool: the same where the prior's is no larger: the scenes never had it.
     """
 
@@ -42,15 +43,15 @@ class Modes(NamedTuple):
     prior: Features
     low: Features
     high: Features
-    lost: NDArray[np.bool_]
+    collapsed: NDArray[np.bool_]
     missing: NDArray[np.bool_]
 
 
-def interval(found: NDArray[np.int64], number: int, level: float) -> tuple[Features, Features]:
-    """Binomial limits [2] of shares ``found / number``."""
+def binomial_interval(count: NDArray[np.int64], number: int, level: float) -> tuple[Features, Features]:
+    """Clopper-Pearson limits [2] of shares ``count / number``."""
     tail = (1 - level) / 2
-    low = np.where(found > 0, beta.ppf(tail, np.maximum(found, 1), number - found + 1), 0.0)
-    high = np.where(found < number, beta.ppf(1 - tail, found + 1, np.maximum(number - found, 1)), 1.0)
+    low = np.where(count > 0, beta.ppf(tail, np.maximum(count, 1), number - count + 1), 0.0)
+    high = np.where(count < number, beta.ppf(1 - tail, count + 1, np.maximum(number - count, 1)), 1.0)
     return low, high
 
 
@@ -59,30 +60,30 @@ def modes(generated: Features, real: Features, prior: Features | None = None, se
     fitted to accidents of the first half show as rare and not as lost."""
     order = np.random.default_rng(seed).permutation(len(real))
     first, second = real[order[: len(real) // 2]], real[order[len(real) // 2 :]]
-    K = max(1, min(MOST, len(second) // IMAGES))
+    K = max(1, min(MAX_CLUSTERS, len(second) // IMAGES_PER_CLUSTER))
     centre = first.mean(0, keepdims=True) if K == 1 else _centres(first, K, seed)
-    counted = [np.bincount(vq(each, centre)[0], minlength=len(centre)) for each in (second, generated)]
+    counts = [np.bincount(vq(rows, centre)[0], minlength=len(centre)) for rows in (second, generated)]
     level = 1 - 0.05 / (2 * len(centre))
-    real_low, real_high = interval(counted[0], len(second), level)
-    low, high = interval(counted[1], len(generated), level)
-    shares = [found / found.sum() for found in counted]
-    little = high < LOST * real_low
-    prior_share, had = np.full(len(centre), np.nan), np.ones(len(centre), bool)
+    real_low, real_high = binomial_interval(counts[0], len(second), level)
+    low, high = binomial_interval(counts[1], len(generated), level)
+    shares = [count / count.sum() for count in counts]
+    rare = high < COLLAPSE_RATIO * real_low
+    prior_share, in_prior = np.full(len(centre), np.nan), np.ones(len(centre), bool)
     if prior is not None:
-        found = np.bincount(vq(prior, centre)[0], minlength=len(centre))
-        prior_share, had = found / len(prior), interval(found, len(prior), level)[0] > high
+        count = np.bincount(vq(prior, centre)[0], minlength=len(centre))
+        prior_share, in_prior = count / len(prior), binomial_interval(count, len(prior), level)[0] > high
     with np.errstate(divide="ignore"):
         ratio = low / real_high, np.where(real_low > 0, high / np.where(real_low > 0, real_low, 1.0), np.inf)
-    return Modes(centre, shares[0], shares[1], prior_share, *ratio, little & had, little & ~had)
+    return Modes(centre, shares[0], shares[1], prior_share, *ratio, rare & in_prior, rare & ~in_prior)
 
 
 def _centres(points: Features, K: int, seed: int) -> Features:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "One of the clusters is empty")  # its share is then near 0, and no harm
-        return kmeans2(points, _spread(points, K, seed), minit="matrix")[0]
+        return kmeans2(points, _kmeans_plus_plus(points, K, seed), minit="matrix")[0]
 
 
-def _spread(points: Features, K: int, seed: int) -> Features:
+def _kmeans_plus_plus(points: Features, K: int, seed: int) -> Features:
     """Up to K different points, each drawn in proportion to its squared distance from those before it [1]."""
     rng = np.random.default_rng(seed)
     chosen = [points[rng.integers(len(points))]]
@@ -95,17 +96,17 @@ def _spread(points: Features, K: int, seed: int) -> Features:
     return np.stack(chosen)
 
 
-def effective_share(generated: Features, real: Features, folds: int = 5, seed: int = 0) -> float:
-    """ESS / N in 0..1: with weights p/q, how many of the generated scenes count as a sample of the real ones [3].
+def ess_fraction(generated: Features, real: Features, folds: int = 5, seed: int = 0) -> float:
+    """ESS / N of the generated scenes, 0 to 1, with the density ratio p / q of real and generated as weights [3].
 
-    The density ratio is a logistic classifier's [4] on the features and Gaussian bumps at 30 of the pooled points; its
-    penalty is the one that predicts held-out images best, and every scene's weight comes from a classifier that has not
-    seen it. Sets of one distribution come to about 1.
+    The density ratio is that of a logistic classifier [4] on the features and on Gaussian kernels at 30 of the pooled
+    points; its penalty is chosen by cross-validation, and every weight comes from a classifier that was trained without
+    that scene. Sets of one distribution come to about 1.
     """
     rng = np.random.default_rng(seed)
     pooled = np.concatenate([generated, real])
     is_real = np.repeat([0.0, 1.0], [len(generated), len(real)])
-    x = _bumps(pooled, rng)
+    x = _kernel_features(pooled, rng)
     fold = np.empty(len(pooled), np.int64)
     for side in (0.0, 1.0):
         rows = np.flatnonzero(is_real == side)
@@ -114,8 +115,8 @@ def effective_share(generated: Features, real: Features, folds: int = 5, seed: i
     for penalty in (1e-2, 1.0, 1e2, 1e4):
         logit = np.empty(len(pooled))
         for f in range(folds):
-            out = fold == f
-            logit[out] = x[out] @ _logistic(x[~out], is_real[~out], penalty)
+            held_out = fold == f
+            logit[held_out] = x[held_out] @ _logistic(x[~held_out], is_real[~held_out], penalty)
         loss = float((np.logaddexp(0, logit) - is_real * logit).mean())
         if loss < score:
             best, score = logit, loss
@@ -124,13 +125,13 @@ def effective_share(generated: Features, real: Features, folds: int = 5, seed: i
     return float(weight.sum() ** 2 / (weight**2).sum() / len(weight))
 
 
-def _bumps(points: Features, rng: np.random.Generator) -> Features:
+def _kernel_features(points: Features, rng: np.random.Generator) -> Features:
     spread = points.std(0)
     scaled = (points - points.mean(0)) / np.where(spread > 0, spread, 1.0)
-    middle = scaled[rng.permutation(len(scaled))[:30]]
-    squared = ((scaled[:, None] - middle) ** 2).sum(-1)
-    bumps = np.exp(-squared / (2 * max(np.median(squared), 1e-12) / 4))
-    return np.concatenate([np.ones((len(points), 1)), scaled, bumps - bumps.mean(0)], 1)
+    centres = scaled[rng.permutation(len(scaled))[:30]]
+    squared = ((scaled[:, None] - centres) ** 2).sum(-1)
+    kernels = np.exp(-squared / (2 * max(np.median(squared), 1e-12) / 4))
+    return np.concatenate([np.ones((len(points), 1)), scaled, kernels - kernels.mean(0)], 1)
 
 
 def _logistic(x: Features, y: Features, penalty: float, steps: int = 30) -> Features:

@@ -58,8 +58,8 @@ def _own_cache(tmp_path_factory):
 def _few_images_are_looked_at():
     """By a verdict."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("probscene.app.evaluation.source_features.IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.diagnose.SCENES", 60)
+        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
         yield
 
 

@@ -8,7 +8,7 @@ from PIL import Image
 
 from probscene.app.api import demo as module
 from probscene.app.api.demo import demo
-from probscene.app.evaluation import source_features as looked
+from probscene.app.evaluation import source_features
 from probscene.app.fitting import pipeline as fit
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import QUICK
@@ -44,7 +44,7 @@ def contents(folder: Path) -> dict[Path, tuple[bytes, int]]:
 
 def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     out = tmp_path / "demo"
-    monkeypatch.setattr(looked, "IMAGES", 40)
+    monkeypatch.setattr(source_features, "NUM_IMAGES", 40)
 
     def go():
         demo(out, 0, str(discs.file), SHORT, images=40, num=5, execution=ONE_THREAD)

@@ -77,12 +77,12 @@ def test_the_ratio_is_that_of_plain_sums_in_blocks_of_any_size(D, N, L, leave_on
         return log_kernel.logsumexp(1) - np.log(len(data) - leave_one_out)
 
     expected = log_density(generated, 0.7, leave_one_out) - log_density(real, 0.7, False)
-    before, module.BLOCK = module.BLOCK, block
+    before, module.BLOCK_SIZE = module.BLOCK_SIZE, block
     try:
         found = KDELogRatio(0.7, None, leave_one_out)(generated, real)
         bounded = JensenShannon(0.7, None, leave_one_out)(generated.double(), real.double())
     finally:
-        module.BLOCK = before
+        module.BLOCK_SIZE = before
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=3e-5 * (1 + 60 + away) ** 2)
     # log q / ((p + q) / 2), of densities and not of their logarithms' ratio
     middle = torch.logaddexp(expected, torch.zeros_like(expected)) - np.log(2)
@@ -201,7 +201,7 @@ def test_the_bounded_cost_is_the_gradient_of_jensen_shannon(small):
     log_m = ((p + q) / 2).log()
     divergence = ((q * (log_q - log_m)).sum() + (p * (p.log() - log_m)).sum()) / 2
     exact = torch.autograd.grad(divergence, guide.parameters(), retain_graph=True)
-    cost = JensenShannon().of_ratio(log_q - p.log()).detach()
+    cost = JensenShannon().cost_of_log_ratio(log_q - p.log()).detach()
     score = torch.autograd.grad((q.detach() * cost * log_q).sum(), guide.parameters())
     for a, b in zip(exact, score, strict=True):
         assert torch.allclose(2 * a, b, atol=1e-6)

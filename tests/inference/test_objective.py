@@ -10,7 +10,7 @@ from probscene.app.fitting.presets import QUICK
 from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import FAR, ScoreFunction
+from probscene.inference.objective import MAX_LOG_RATIO, ScoreFunction
 from probscene.inference.structure_training import StructureTraining
 from probscene.structure import StructurePrior, counts
 
@@ -46,7 +46,11 @@ def test_each_objective_descends_toward_the_target(small, objective):
         q = log_q.detach().exp()
         away.append(0.5 * (q - small.target).abs().sum().item())
         log_ratio = ((kernel @ q) / (kernel @ small.target)).log()
-        costs = {"kde": log_ratio, "js": JensenShannon().of_ratio(log_ratio), "witness": kernel @ (q - small.target)}
+        costs = {
+            "kde": log_ratio,
+            "js": JensenShannon().cost_of_log_ratio(log_ratio),
+            "witness": kernel @ (q - small.target),
+        }
         optimiser.zero_grad()
         (q * costs[objective] * log_q).sum().backward()
         optimiser.step()
@@ -97,7 +101,7 @@ def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
     pyro.set_rng_seed(5)
     loss(dots, LSTMGuide(dots.grammar, 12, hidden=8), 200, real=None)
     something = loss.batch.derivation.lengths > 2
-    assert something.any() and (loss.batch.cost[something] == 0.1 * FAR).all()
+    assert something.any() and (loss.batch.cost[something] == 0.1 * MAX_LOG_RATIO).all()
 
 
 def test_evaluating_the_loss_changes_nothing(small):

@@ -42,7 +42,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
-from ...statistics.two_sample import Features
+from ...statistics.energy import Features
 from ...training import Callback, TrainingLoop, batch_seed, of_prefix
 from ..guide import ParameterGuide
 from ..likelihood import MaximumLikelihood, Values, log_density

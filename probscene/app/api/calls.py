@@ -164,7 +164,7 @@ def compare(
     """
     opened = comparing.open_runs(runs)
     if out is not None:
-        comparison_picture.make_place(Path(out))
+        comparison_picture.make_folder_of(Path(out))
     first = next(iter(opened.values()))
     with display(progress) as show:
         images = None if target is None and labels is None else _images(first, target, show)

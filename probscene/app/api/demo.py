@@ -76,7 +76,7 @@ def demo(
             _judge(run, opened or open_images(target, loaded, False, show), out, show)
     console = Console(highlight=False)
     measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))
-    for table in tables.distances({"truth": measured["distances"]["truth"]}):
+    for table in tables.distance_tables({"truth": measured["distances"]["truth"]}):
         console.print(table)
     print("\nWithout labels:")
     verdict_text.show_parts(measured["trust"], console)
@@ -105,7 +105,7 @@ def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:
     found = evaluate(run, target, read_labels(out / "truth.csv", model, target), show)
     judged = diagnose(run, target, show, evaluation=found)
     write_json(out / "evaluation.json", found.record() | {"trust": judged.record()})
-    report.write(run, found, target, judged=judged)
+    report.write(run, found, target, diagnostics=judged)
     sources = policies(run)
     panels = {"Prior": PRIOR, "Structure alone": STRUCTURE, "Structure and parameters": LEARNT}
     if STRUCTURE not in sources:

@@ -12,7 +12,7 @@ from probscene.model import SceneModel
 
 from ..arguments import checked_seed
 from ..evaluation.diagnose import FitDiagnostics, diagnose
-from ..evaluation.list_warnings import tell
+from ..evaluation.evaluate import warn_of_saturated_lists
 from ..fitting import begin as beginning
 from ..fitting.begin import FitRequest, ModelFile, TargetImages
 from ..fitting.config import FitConfig
@@ -131,7 +131,7 @@ def carried_out(request: FitRequest, out: Path, show: Display, resume: bool, exe
         assert isinstance(run, Run)
         carry_out(begun, show, execution.cache, nodes)
     if unfinished:
-        tell(run, show)
+        warn_of_saturated_lists(run, show)
     return Done(run, begun.images, unfinished)
 
 

@@ -1,14 +1,15 @@
-"""Can a run be trusted? Its scenes, the prior's and the target's images through its own network, judged without labels.
+"""The diagnostics of a run: its scenes, the prior's and the target's images through its own network, without labels.
 
-Structure is judged by scenes that are drawn and looked at as the fit has looked at them, layout and looks by half as
-many images as ``generate`` writes them (``judging.looked``). For another domain it is asked what stands out in images,
-by EfficientNet-Lite: counts of a strange image may be quite ordinary, and objects may stand where no scene has them. It
-is not asked where the features were suited to the target's images and say what can be read in them: those are another
+Structure is judged by scenes that are rendered and embedded as in the fit, layout and looks by half as many images as
+``generate`` writes them (``source_features``). A domain shift is detected by EfficientNet-Lite's features of patches:
+counts of an image from another domain may be quite ordinary, and objects may stand where no scene has them. It is not
+tested where the features were adapted to the target's images and say what can be read in them: those are another
 domain, and were read as such.
 
 Axis letters: N scenes, L images, D features.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,8 +20,8 @@ from torch import Tensor
 from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features.base import Examples, FeatureNet
-from probscene.inference.statistics.trust import Trust, trust
-from probscene.inference.statistics.two_sample import NEEDED
+from probscene.inference.statistics.energy import MIN_IMAGES
+from probscene.inference.statistics.verdict import StructureVerdict, structure_verdict
 from probscene.policy import Policy
 from probscene.sampling import sample
 from probscene.threads import threads
@@ -33,16 +34,17 @@ from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, kept_features, own_net
 from ..pictures import Pixels, pixels, shrunk
 from . import sizes as size_figures
-from . import source_features as looked
-from .advice import label
-from .components import VerdictComponents, aspects
+from . import source_features
+from .components import VerdictComponents, verdict_components
 from .evaluate import Evaluation
+from .explain import label_images
 from .label_agreement import Agreement, agreement
 from .sizes import Sizes, given_boxes, sizes, with_sizes
+from .source_features import LEARNT, PRIOR, TARGET
 
-SCENES = 1000  # of the guide, and as many of the prior, whoever judges: a run has one verdict
-SHOWN = 8  # images in each picture
-THUMB = 128  # pixels
+NUM_SCENES = 1000  # of the guide, and as many of the prior
+NUM_EXAMPLES = 8  # images in each picture
+THUMBNAIL_SIZE = 128  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,43 +52,43 @@ class FitDiagnostics:
     """A verdict and what it was made from.
 
     Attributes:
-        trust: the verdict on structure and its figures; None where there is none.
+        structure: the verdict on structure and its statistics; None where there is none.
         absent: why there is none.
-        real_unmatched: the real images farthest from any generated scene, indices of the target's images.
-        generated_unmatched: the generated scenes farthest from any real image, ``(H, W, 3)``.
-        names: the files of ``real_unmatched``.
+        real_uncovered: the real images farthest from any generated scene, indices of the target's images.
+        generated_uncovered: the generated scenes farthest from any real image, ``(H, W, 3)``.
+        names: the files of ``real_uncovered``.
         agreement: with the labels, where there are such.
-        walls: what the model is too narrow for, one sentence, where that is known.
+        prior_warning: what the model is too narrow for, one sentence, where that is known.
         usable: which classes can be read, in a sentence, where the features say so.
-        aspects: structure, layout and looks; None where there is no verdict.
+        components: structure, layout and looks; None where there is no verdict.
         basis: the images, their folder, whether the run was fitted to them, and the scenes of each side.
         sizes: of the objects of each class of which boxes were given.
     """
 
-    trust: Trust | None
+    structure: StructureVerdict | None
     absent: str = ""
-    real_unmatched: tuple[int, ...] = ()
-    generated_unmatched: tuple[Pixels, ...] = ()
+    real_uncovered: tuple[int, ...] = ()
+    generated_uncovered: tuple[Pixels, ...] = ()
     names: tuple[str, ...] = ()
     agreement: Agreement | None = None
-    walls: str = ""
+    prior_warning: str = ""
     usable: str = ""
-    aspects: VerdictComponents | None = None
+    components: VerdictComponents | None = None
     basis: dict[str, Any] = field(default_factory=dict)
     sizes: dict[str, Sizes] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
-        if self.trust is None or self.aspects is None:
+        if self.structure is None or self.components is None:
             return {"verdict": None, "because": self.absent}
         more: dict[str, Any] = {"basis": self.basis, "unlike_images": list(self.names)}
         more |= {"usable": self.usable} if self.usable else {}
         more |= {"sizes": size_figures.record(self.sizes)} if self.sizes else {}
         if self.agreement is not None:
-            more["labels"] = self.agreement.record(self.trust.verdict)
-        parts = self.aspects.record()
+            more["labels"] = self.agreement.record(self.structure.verdict)
+        parts = self.components.record()
         parts = parts if self.agreement is None else self.agreement.corrected(parts)
-        return self.trust.record() | parts | more
+        return self.structure.record() | parts | more
 
 
 def diagnose(
@@ -100,75 +102,80 @@ def diagnose(
     """Judge a finished run by a folder of real images.
 
     Args:
-        num: scenes of the guide, and as many of the prior; ``SCENES`` where None.
-        evaluation: with labels, what to hold the verdict against.
+        num: scenes of the guide, and as many of the prior; ``NUM_SCENES`` where None.
+        evaluation: with labels, what to compare the verdict with.
 
     Raises:
         ProbsceneError: fewer scenes than a verdict needs.
         RunError: see ``RunFolder.guide`` and ``own_net``.
     """
-    num = SCENES if num is None else num
-    if num < NEEDED:
-        raise ProbsceneError(f"expected at least {NEEDED} scenes to judge by, got {num}; or 0 for no verdict.")
+    num = NUM_SCENES if num is None else num
+    if num < MIN_IMAGES:
+        raise ProbsceneError(f"expected at least {MIN_IMAGES} scenes to judge by, got {num}; or 0 for no verdict.")
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
     if run.readings and set(run.unread) == set(run.model.classes) - set(run.model.stuff):
         return FitDiagnostics(None, usable(run))
-    if len(target) < NEEDED:
+    if len(target) < MIN_IMAGES:
         return FitDiagnostics(
-            None, f"expected at least {NEEDED} real images for a verdict, got {len(target)} in {target.path}."
+            None, f"expected at least {MIN_IMAGES} real images for a verdict, got {len(target)} in {target.path}."
         )
     training, model, net = run.config.structure, run.model, own_net(run)
     policies = (run.guide, model.pretraining_policy)
     own = kept_features(run, target) is not None
     boxes = None if evaluation is None else evaluation.boxes
     boxes = given_boxes(run, target) if boxes is None and own else boxes
-    images = min(looked.IMAGES, num // 2)
-    total = 2 * CHUNK * -(-num // CHUNK) + len(target) + looked.number_of(run, target, images)
-    total += 0 if boxes is None else 2 * size_figures.SCENES
+    images = min(source_features.NUM_IMAGES, num // 2)
+    total = 2 * CHUNK * -(-num // CHUNK) + len(target) + source_features.num_embedded(run, target, images)
+    total += 0 if boxes is None else 2 * size_figures.NUM_SCENES
     done = 0
 
-    def each(more: int) -> None:
+    def advance(more: int) -> None:
         nonlocal done
         done += more
         progress("judging", done, total, "")
 
-    each(0)
-    eyes = [_Eyes(net, each, keep) for keep in (True, False)]
+    advance(0)
+    nets = [_ThumbnailNet(net, advance, keep) for keep in (True, False)]
     draws = [1 if policy.suits else training.draws_per_structure for policy in policies]
-    scenes = [_features(run, *each_of, num, seed) for each_of in zip(policies, eyes, draws, strict=True)]
-    real = _real(run, target, net, each)
-    seen = looked.look(run, target, net, EfficientNetLite(), each, images, seed)
-    rendered = np.concatenate([seen[name].places for name in (looked.LEARNT, looked.PRIOR)])
-    which = feature_mask(net)
-    which = torch.ones(real.shape[1], dtype=torch.bool) if which is None else which
+    scenes = [_features(run, *source, num, seed) for source in zip(policies, nets, draws, strict=True)]
+    real = _real(run, target, net, advance)
+    sources = source_features.embed_sources(run, target, net, EfficientNetLite(), advance, images, seed)
+    rendered = np.concatenate([sources[name].patches for name in (LEARNT, PRIOR)])
+    mask = feature_mask(net)
+    mask = torch.ones(real.shape[1], dtype=torch.bool) if mask is None else mask
     try:
-        found = trust(
-            scenes[0][:, which].numpy(),
-            real[:, which].numpy(),
-            scenes[1][:, which].numpy(),
-            tuple(name for name, some in zip(net.names, which.tolist(), strict=True) if some),
+        structure = structure_verdict(
+            scenes[0][:, mask].numpy(),
+            real[:, mask].numpy(),
+            scenes[1][:, mask].numpy(),
+            tuple(name for name, kept in zip(net.names, mask.tolist(), strict=True) if kept),
             resolution=run.features.resolution,
-            places=None if run.readings else (seen[looked.TARGET].places, rendered),
+            patches=None if run.readings else (sources[TARGET].patches, rendered),
             seed=seed,
-            pretrained=run.features.pretrained,
         )
     except DataError as error:
         return FitDiagnostics(None, str(error))
-    real_unmatched = tuple(int(i) for i in found.figures.real_unmatched.worst[:SHOWN])
-    generated_unmatched = tuple(eyes[0].thumbs[i] for i in found.figures.generated_unmatched.worst[:SHOWN])
-    names = tuple(target.paths[i].name for i in real_unmatched)
-    uses_labels = None
+    found = structure.statistics
+    real_uncovered = tuple(int(i) for i in found.real_uncovered.worst[:NUM_EXAMPLES])
+    names, label_agreement = tuple(target.paths[i].name for i in real_uncovered), None
     if evaluation is not None and "truth" in evaluation.sources:
-        sources = evaluation.sources
-        uses_labels = agreement(sources["learnt"], sources["truth"], evaluation.classes, label(run))
-    walls = "" if evaluation is None else evaluation.walls
-    features = {looked.LEARNT: scenes[0], looked.PRIOR: scenes[1], looked.TARGET: real}
-    found_sizes = {} if boxes is None else sizes(run, boxes, each, seed)
-    parts = with_sizes(aspects(run, found, features, seen, seed), found_sizes)
-    basis = {"images": len(target), "folder": str(target.path), "fitted_to": own, "scenes": num}
-    shown = real_unmatched, generated_unmatched, names
-    return FitDiagnostics(found, "", *shown, uses_labels, walls, usable(run), parts, basis, found_sizes)
+        counts = evaluation.sources
+        label_agreement = agreement(counts["learnt"], counts["truth"], evaluation.classes, label_images(run))
+    features = {LEARNT: scenes[0], PRIOR: scenes[1], TARGET: real}
+    box_sizes = {} if boxes is None else sizes(run, boxes, advance, seed)
+    return FitDiagnostics(
+        structure=structure,
+        real_uncovered=real_uncovered,
+        generated_uncovered=tuple(nets[0].thumbnails[i] for i in found.generated_uncovered.worst[:NUM_EXAMPLES]),
+        names=names,
+        agreement=label_agreement,
+        prior_warning="" if evaluation is None else evaluation.prior_warning,
+        usable=usable(run),
+        components=with_sizes(verdict_components(run, structure, features, sources, seed), box_sizes),
+        basis={"images": len(target), "folder": str(target.path), "fitted_to": own, "scenes": num},
+        sizes=box_sizes,
+    )
 
 
 def usable(run: RunFolder) -> str:
@@ -183,32 +190,32 @@ def usable(run: RunFolder) -> str:
     return f"Can be used: {good}; {cannot}" if good else f"No class can be used: {cannot}"
 
 
-class _Eyes:
-    """A run's network that keeps small pictures of what it was shown."""
+class _ThumbnailNet:
+    """A run's network that keeps small pictures of the images that it embeds."""
 
-    def __init__(self, net: FeatureNet, each, keep: bool):
-        self.net, self.each, self.keep = net, each, keep
-        self.names, self.thumbs = net.names, []
+    def __init__(self, net: FeatureNet, callback: Callable[[int], None], keep: bool):
+        self.net, self.callback, self.keep = net, callback, keep
+        self.names, self.thumbnails = net.names, []
         if hasattr(net, "embed_from_labels"):
-            self.embed_from_labels = self._embed_drawn
+            self.embed_from_labels = self._embed_from_labels
             self.uses_labels = not keep and getattr(net, "uses_labels", False)
 
     def embed(self, images: Tensor) -> Tensor:
-        self._look(images)
+        self._record(images)
         return self.net.embed(images)
 
-    def _embed_drawn(self, drawn: Examples) -> Tensor:
-        self._look(drawn.image)
+    def _embed_from_labels(self, drawn: Examples) -> Tensor:
+        self._record(drawn.image)
         return self.net.embed_from_labels(drawn)  # pyright: ignore[reportAttributeAccessIssue]: asked for before
 
-    def _look(self, images: Tensor) -> None:
+    def _record(self, images: Tensor) -> None:
         if self.keep:
-            self.thumbs += [shrunk(image, THUMB).copy() for image in pixels(images)]
-        self.each(len(images))
+            self.thumbnails += [shrunk(image, THUMBNAIL_SIZE).copy() for image in pixels(images)]
+        self.callback(len(images))
 
 
 def _features(run: RunFolder, policy: Policy, net: FeatureNet, draws_per_structure: int, num: int, seed: int) -> Tensor:
-    """``(num, D)`` features of scenes, seen as the fit has seen them; the same for the same seed."""
+    """``(num, D)`` features of scenes, rendered as in the fit; the same for the same seed."""
     view = RenderedFeatures(run.model, run.record["threads"])
     observe, parts = view.observe(net, draws_per_structure), []
     for chunk in range(-(-num // CHUNK)):
@@ -217,10 +224,10 @@ def _features(run: RunFolder, policy: Policy, net: FeatureNet, draws_per_structu
     return torch.cat(parts)[:num]
 
 
-def _real(run: RunFolder, target: Images, net: FeatureNet, each) -> Tensor:
+def _real(run: RunFolder, target: Images, net: FeatureNet, callback: Callable[[int], None]) -> Tensor:
     """The features that the fit kept where the images are the fit's, else new ones."""
     kept = kept_features(run, target)
     if kept is None:
-        return features_in(run, target, net, each)
-    each(len(target))
+        return features_in(run, target, net, callback)
+    callback(len(target))
     return kept

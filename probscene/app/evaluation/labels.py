@@ -26,9 +26,9 @@ from ..labels.counts import read_table
 from ..labels.naming import Entry, match_target
 from ..labels.reading import has_boxes
 from ..labels.text import text_of
-from .structure_counts import Counts, StructureCounts, count
+from .structure_counts import Counts, StructureCounts, count_structures
 
-SEEN = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
+VISIBLE_NOTE = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
 
 
 class Labels(NamedTuple):
@@ -77,7 +77,7 @@ def read_labels(path: Path, model: SceneModel, target: Images, some: bool = Fals
     if has_boxes(path):
         boxes = read_boxes(path, model, target, some, min_height)
         low = min_height * float(np.median(target.scales))
-        counts, notes = StructureCounts(boxes.counts, {}), (SEEN, *boxes.notes)
+        counts, notes = StructureCounts(boxes.counts, {}), (VISIBLE_NOTE, *boxes.notes)
         whole = None if min_height else boxes
         return Labels(counts, None, boxes.classes, notes, low, boxes.rows, whole)
     if min_height:
@@ -98,7 +98,7 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
         for line in map(json.loads, file):
             names.append(Path(line["image"]).name)
             rules.append(line["rules"])
-    return names, count(model, Derivation.from_rules(model.grammar, _padded(rules))).counts
+    return names, count_structures(model, Derivation.from_rules(model.grammar, _padded(rules))).counts
 
 
 def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool) -> Labels:
@@ -124,7 +124,7 @@ def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool)
     if not whole:
         names = (target.paths[i].name for i, row in zip(found.entries, rules, strict=True) if not _is_whole(model, row))
         raise DataError(f"expected structures of model {model.name!r} in {path}, got another of {next(names)}.")
-    return Labels(count(model, derivation), derivation, notes=found.notes, rows=list(found.entries))
+    return Labels(count_structures(model, derivation), derivation, notes=found.notes, rows=list(found.entries))
 
 
 def _rules(model: SceneModel, rules: list[Any], spelt: str, where: str) -> list[int]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 
 from probscene.derivation import Derivation
-from probscene.inference.statistics.tally import Interval, mean_interval, resamples
+from probscene.inference.statistics.count_metrics import Interval, mean_interval, resamples
 from probscene.policy import Policy
 from probscene.support import MASKED_LOGIT
 from probscene.threads import threads

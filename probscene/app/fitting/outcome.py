@@ -16,7 +16,7 @@ from torch import Tensor
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.features.photographs.readability import MIN_LABELS, histogram_scores, scores
 from probscene.inference.guides.base import Guide
-from probscene.inference.statistics.bootstrap_test import bootstrap_test
+from probscene.inference.statistics.energy import bootstrap_test
 from probscene.inference.training import batch_seed
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
@@ -82,8 +82,13 @@ def conclude(
         found.append(torch.cat(parts)[:, which].double().numpy())
         numbers.append(torch.cat(counts).double())
     apart = bootstrap_test(found[0], found[1], real[:, which].double().numpy())
-    record: dict[str, Any] = {"kept": "learnt", "scenes": number, "learnt": apart.one, "prior": apart.other}
-    if not apart.sure:
+    record: dict[str, Any] = {
+        "kept": "learnt",
+        "scenes": number,
+        "learnt": apart.distance,
+        "prior": apart.baseline_distance,
+    }
+    if not apart.significant:
         unread = run.unread
         kinds = {kind: i for i, kind in enumerate(run.model.grammar.kinds) if kind in unread}
         changed = moved(numbers[0], numbers[1], kinds)
@@ -93,8 +98,8 @@ def conclude(
         run.write_tensors("guide", guide.state_dict() | beside(run.read_tensors(NAME) or {}))
         return " ".join(filter(None, (_said(changed), _worse_said(worse))))
     because = (
-        f"Learnt scenes are farther from the target than the prior's, {apart.one:.2f} against {apart.other:.2f} in "
-        "energy distance of the features"
+        f"Learnt scenes are farther from the target than the prior's, {apart.distance:.2f} against "
+        f"{apart.baseline_distance:.2f} in energy distance of the features"
     )
     run.write_tensors(REJECTED, guide.state_dict())
     _keep_prior(run, record | {"kept": "prior", "because": because})

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from probscene.dataset import ImageFolder, Images
 from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.inference.features.base import FeatureNet, embed_all
-from probscene.inference.statistics.two_sample import NEEDED, check_features
+from probscene.inference.statistics.energy import MIN_IMAGES, check_features
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
@@ -258,9 +258,9 @@ def check_target(target: Images) -> None:
     Raises:
         DataError: too few, or all the same.
     """
-    if len(target) < NEEDED:
+    if len(target) < MIN_IMAGES:
         raise DataError(
-            f"expected at least {NEEDED} images in {target.path}, from which the distribution of their features is "
+            f"expected at least {MIN_IMAGES} images in {target.path}, from which the distribution of their features is "
             f"estimated, got {len(target)}; add images."
         )
     if target.distinct == 1:

@@ -14,7 +14,7 @@ from probscene.dataset import Images
 from probscene.errors import RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
-from probscene.inference.statistics.domain_shift import outside
+from probscene.inference.statistics.domain_shift import support_outliers
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.threads import threads
@@ -57,9 +57,10 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
 
 
 def domain_shift(model: SceneModel, target: Images, progress: Callable[[int, int], None] | None = None) -> float:
-    """The share of the target's images that lie ``outside`` renders, by EfficientNet-Lite's pooled features or by the
-    texture in its finest maps, whichever is less. Images of other structures and layouts lie among renders of the
-    pretraining policy, at least in part; a camera's do not. Fewer renders do where they hold half of the images.
+    """The share of the target's images that lie outside the support of renders (``support_outliers``), by
+    EfficientNet-Lite's pooled features or by the texture in its finest maps, whichever is less. Images of other
+    structures and layouts lie among renders of the pretraining policy, at least in part; a camera's do not. Fewer
+    renders do where they hold half of the images.
 
     Args:
         progress: told how many of how many images are looked at.
@@ -74,7 +75,9 @@ def domain_shift(model: SceneModel, target: Images, progress: Callable[[int, int
             of_renders.append(look.looks(images))
             drawn = [torch.cat(some).double().numpy() for some in zip(*of_renders, strict=True)]
             sides = zip(of_target, drawn, strict=True)
-            share = min(float(outside(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in sides)
+            share = min(
+                float(support_outliers(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in sides
+            )
             done = len(rows) + len(drawn[0])
             total = done if share < ALIKE else total
             if progress is not None:

@@ -18,8 +18,7 @@ from probscene.inference.parameters.checkpoint_selection import HeldOutSet, unin
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.tilting.learning import TiltingLearning
-from probscene.inference.statistics.bootstrap_test import SURE, BootstrapTest, bootstrap_test
-from probscene.inference.statistics.two_sample import Features
+from probscene.inference.statistics.energy import CONFIDENCE, BootstrapTest, Features, bootstrap_test
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
@@ -78,7 +77,7 @@ def select_sites(
         return bootstrap_test(drawn("learnt", learnt.with_parameters(run.model)), of_prior, real)
 
     apart = compared()
-    kept, because = "learnt" if apart.one < apart.other else "prior", dict[str, str]()
+    kept, because = "learnt" if apart.distance < apart.baseline_distance else "prior", dict[str, str]()
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         well = frozenset(
             learning.select_prior_sites(learning, True) if learning.prior_sites is None else learning.prior_sites
@@ -90,15 +89,15 @@ def select_sites(
         learnt.prior_sites = well | badly
         if learnt.prior_sites:
             apart = compared()
-        if apart.sure and judge is not None:
+        if apart.significant and judge is not None:
             learnt.prior_sites = uninformative_sites(learnt, judge) | because.keys()
             apart = compared()
-        kept = "prior" if apart.sure or len(learnt.prior_sites) == len(learnt.sites) else "learnt"
+        kept = "prior" if apart.significant or len(learnt.prior_sites) == len(learnt.sites) else "learnt"
         if kept == "prior":
             learnt.prior_sites = frozenset()
     if isinstance(learning, TiltingLearning) and not learning.learnt:
         kept = "prior"
-    distances = {"kept": kept, "learnt": apart.one, "prior": apart.other}
+    distances = {"kept": kept, "learnt": apart.distance, "prior": apart.baseline_distance}
     if not isinstance(learning, ParameterLearning):  # which reads nothing
         return SiteSelection(distances, {}, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
@@ -149,7 +148,7 @@ def settling(
         judge = learning.best.held
         looks = judge.looks(learning.guide, frozenset())
         apart = bootstrap_test(looks, of_prior(), judge.real)
-        if apart.one < apart.other:
+        if apart.distance < apart.baseline_distance:
             names = passed(learning, read, False)
         return redundant_resets(learning.guide, judge, looks, names)
 
@@ -172,7 +171,9 @@ def redundant_resets(
     ``looks``: what is read of an object and of its sibling before hardly shows that a row is even, which whole images
     do."""
     without = {name: judge.looks(guide, frozenset((name,))) for name in sorted(names)}
-    return frozenset(name for name, found in without.items() if not bootstrap_test(found, looks, judge.real).sure)
+    return frozenset(
+        name for name, found in without.items() if not bootstrap_test(found, looks, judge.real).significant
+    )
 
 
 def passed(
@@ -187,12 +188,12 @@ def passed(
         read: of ``"learnt"``, ``"prior"`` and ``"target"``, see ``ParameterLearning.site_rows``.
     """
     clear = {name: of for name, of in read.items() if name not in learning.calibrated.low_skill_sites}
-    chance = (1 - SURE) / max(1, len(clear))
+    chance = (1 - CONFIDENCE) / max(1, len(clear))
 
     def passes(of: dict[str, tuple[Tensor, Tensor]]) -> bool:
         if careful:
             return _share(of, "prior", "learnt") < 1 - chance
-        return _share(of, "learnt", "prior") >= SURE
+        return _share(of, "learnt", "prior") >= CONFIDENCE
 
     return frozenset(name for name, of in clear.items() if passes(of))
 
@@ -226,8 +227,10 @@ def of_unclear(
             because[site.name] = f"it would be {moved:.2f} of u from its prior, no farther than it may be misread"
     renders = {"without": without.drawn.image, "learnt": learnt.drawn.image}
     read = learning.site_rows(renders | {"target": images})
-    likely = [name for name in sorted(unclear - because.keys()) if _share(read[name], "without", "learnt") >= SURE]
-    others, chance = unclear - set(likely), (1 - SURE) / max(1, len(likely))
+    likely = [
+        name for name in sorted(unclear - because.keys()) if _share(read[name], "without", "learnt") >= CONFIDENCE
+    ]
+    others, chance = unclear - set(likely), (1 - CONFIDENCE) / max(1, len(likely))
     if not likely:
         return others, because
     renders = {name: learning.guide_scenes(kept | others | {name}).drawn.image for name in likely}
@@ -244,7 +247,7 @@ def _share(of: dict[str, tuple[Tensor, Tensor]], far: str, near: str) -> float:
     if not min(map(len, (one, other, target))):
         return 0.0
     apart = bootstrap_test(one, other, target, images=(images[0], images[1], images[2]))
-    return apart.share if apart.one > apart.other else 0.0
+    return apart.probability if apart.distance > apart.baseline_distance else 0.0
 
 
 def _compared(run: RunFolder, model: SceneModel, guide: Guide, number: int, name: str) -> Tensor:

@@ -21,7 +21,7 @@ from probscene.inference.objective import ScoreFunction
 from probscene.inference.parameters.reader_counts import ReaderCounts
 from probscene.inference.pretrain import pretrain
 from probscene.inference.render_cache import RenderCache
-from probscene.inference.statistics.bootstrap_test import bootstrap_test
+from probscene.inference.statistics.energy import bootstrap_test
 from probscene.inference.structure_training import StructureTraining
 from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
@@ -132,7 +132,7 @@ def learn_structure_again(
     which = feature_mask(net)
     which = slice(None) if which is None else which
     now, then, target = (part[:, which].double().numpy() for part in (_seen(run, observer, net, guide), seen, real))
-    if bootstrap_test(now, then, target).sure:
+    if bootstrap_test(now, then, target).significant:
         guide.load_state_dict(before)
 
 

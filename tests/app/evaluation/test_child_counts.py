@@ -15,7 +15,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.likelihood import likelihood
-from probscene.app.evaluation.structure_counts import label
+from probscene.app.evaluation.structure_counts import group_label
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.views.report import report, write
@@ -146,7 +146,7 @@ def test_the_command_shows_what_depends_on_context(call, plates, found, tmp_path
     assert json.loads((tmp_path / "e.json").read_text()) == json.loads(json.dumps(found.record()))
     for group in ("all", "first", "others"):
         value = found.distance("prior", "truth")["children"]["mug per plate"][group]["total_variation"]["value"]
-        name = label(PAIR, group)[:12]  # a long name goes on in the line below
+        name = group_label(PAIR, group)[:12]  # a long name goes on in the line below
         assert any(name in line and f"{value:.3f}" in line for line in shown.out.splitlines())
     assert "impossible" in shown.out and "log q" in shown.out
     plain = call(*words)
@@ -158,14 +158,14 @@ def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
     lines = [line for line in shown.out.splitlines() if not line.startswith("Warning: ")]
     titles = [line.strip() for line in lines if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
-        "Distance to the truth", "TV: total variation", "Distance to what the feature network sees *",
+        "Distance to the truth", "TV: total variation", "Distance to what the feature network reads *",
         "Images by number of objects", "Objects by class", "Counts read in each labelled image"]  # fmt: skip
 
 
 def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_path):
     text = write(plates.run, found, plates.opened, tmp_path / "r.html").read_text(encoding="utf-8")
     for group in ("all", "first", "second", "others"):
-        assert text.count(label(PAIR, group)) >= 2  # a chart and a table
+        assert text.count(group_label(PAIR, group)) >= 2  # a chart and a table
     assert "log q of the labelled structures" in text and "impossible" in text
     from probscene.app.progress import Display
 

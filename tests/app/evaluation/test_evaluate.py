@@ -20,7 +20,7 @@ from probscene.app.evaluation.count_errors import count_errors
 from probscene.app.evaluation.evaluate import evaluate, network_counts
 from probscene.app.evaluation.labels import Labels, counts_of_dataset
 from probscene.app.evaluation.sources import Source
-from probscene.app.evaluation.structure_counts import StructureCounts, sampled
+from probscene.app.evaluation.structure_counts import StructureCounts, sample_counts
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.counts import read_table, write_counts
 from probscene.app.loading import load_model
@@ -37,7 +37,7 @@ def quiet(*_):
 
 
 def structure_counts(model, policy, num, seed, each=None):
-    return sampled(model, policy, num, seed, each).counts
+    return sample_counts(model, policy, num, seed, each).counts
 
 
 def labels(counts) -> Labels:
@@ -208,7 +208,7 @@ def test_where_fits_set_out_from_another_policy_it_is_a_source(fitted, target, t
     json.dumps(found.record())
     console = Console(width=200, file=io.StringIO())
     show(found, console)
-    assert console.file.getvalue().count("start") >= 4
+    assert console.file.getvalue().count("initialisation") >= 4
     several = compare({"one": run}, opened(target.images), None, quiet, num=50)
     assert list(several.sources) == ["prior", "start", "one", "estimate"]
     assert list(several.distances()["estimate"]) == ["prior", "start", "one"]
@@ -308,9 +308,9 @@ def test_rows_of_bad_files_are_passed_over(target, tmp_path):
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=30))
 def test_a_sources_histograms_are_shares(rows):
-    source = Source.of(np.array(rows))
+    source = Source.from_counts(np.array(rows))
     assert source.total.tolist() == [a + b for a, b in rows]
     assert source.number().share.sum() == pytest.approx(1)
     assert source.classes().share.sum() == pytest.approx(1 if any(map(any, rows)) else 0)
     random.Random(0).shuffle(rows)
-    assert np.allclose(Source.of(np.array(rows)).number().share, source.number().share)
+    assert np.allclose(Source.from_counts(np.array(rows)).number().share, source.number().share)

@@ -6,9 +6,10 @@ import math
 import pytest
 import torch
 
-from probscene.app.evaluation.image_distances import as_of, image_distances
+from probscene.app.evaluation.image_distances import caveat, extrapolate, image_distances
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import features_in, features_of, own_net
+from probscene.app.views.tables import sample_sizes
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.statistics.image_metrics import fid, kid
@@ -57,14 +58,14 @@ def test_all_images_where_asked(run, images):
     halves = [distance(real[:20], real[20:], "run", seed=2) for distance in (kid, fid)]
     assert floor.value == pytest.approx(halves[0].value, rel=1e-3, abs=1e-6) and floor.images == 20
     assert biased.value == pytest.approx(halves[1].value / 2, rel=1e-3) and biased.images == 40
-    assert "estimated from 20 images" in biased.note
+    assert "estimated from 20 images" in caveat(biased)
 
 
 def test_fid_of_two_samples_of_one_distribution_falls_as_one_over_their_number():
     sampled = torch.randn(4, 2000, 6, generator=torch.Generator().manual_seed(0))
     few = [fid(one[:400], one[400:800], "noise", size=2) for one in sampled]
     many = sum(fid(one[:1000], one[1000:], "noise", size=2).value for one in sampled) / 4
-    assert sum(as_of(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
+    assert sum(extrapolate(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_fid_takes_no_more_than_half_of_the_target_and_kid_all_that_is_asked_for
     assert numbers.pop("floor") == [(20, 20), (a_side, a_side)]
     assert list(numbers.values()) == 2 * [[(real, generated), (a_side, a_side)]]
     said = f"{real} images a side" if real == generated else f"{real} real, {generated} generated images"
-    assert [figure.of_images for figure in found["prior"]] == [said, f"{a_side} images a side"]
+    assert [sample_sizes(figure) for figure in found["prior"]] == [said, f"{a_side} images a side"]
 
 
 def test_faults_come_before_any_work(run, images, target, tmp_path):

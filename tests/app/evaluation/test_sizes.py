@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.components import KINDS, VerdictComponent, VerdictComponents
-from probscene.app.evaluation.sizes import SCENES, Boxed, _medians, compared, given_boxes, sizes, with_sizes
+from probscene.app.evaluation.sizes import NUM_SCENES, BoxSizes, _medians, compare_sizes, given_boxes, sizes, with_sizes
 from probscene.dataset import ImageFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
@@ -28,11 +28,11 @@ def side(number: int, scale: float = 1.0, seed: int = 0):
     """Boxes of about 20 x 30 pixels, some in each of 50 images."""
     rng = np.random.default_rng(seed)
     size = scale * np.array([20.0, 30.0]) * np.exp(0.2 * rng.normal(size=(number, 2)))
-    return Boxed(size, rng.integers(0, 50, number), 50)
+    return BoxSizes(size, rng.integers(0, 50, number), 50)
 
 
 @pytest.mark.parametrize(
-    ("number", "prior", "learnt", "word", "worse"),
+    ("number", "prior", "learnt", "grade", "worse"),
     [
         (600, 1.5, 1.0, Grade.GOOD, False),
         (600, 1.0, 1.0, Grade.GOOD, False),  # sizes that are right are right, whoever made them so
@@ -44,9 +44,9 @@ def side(number: int, scale: float = 1.0, seed: int = 0):
         (12, 1.05, 1.1, None, False),
     ],
 )
-def test_the_word_for_sizes_is_right_where_they_are_known(number, prior, learnt, word, worse):
-    found = compared(side(number), side(800, prior, 1), side(800, learnt, 2))
-    assert (found.word, found.worse, found.boxes) == (word, worse, number)
+def test_the_grade_of_sizes_is_right_where_they_are_known(number, prior, learnt, grade, worse):
+    found = compare_sizes(side(number), side(800, prior, 1), side(800, learnt, 2))
+    assert (found.grade, found.worse, found.boxes) == (grade, worse, number)
     assert found.low[0] <= found.given[0] <= found.high[0] and found.off_low <= found.off_high
     assert found.learnt == pytest.approx((20 * learnt, 30 * learnt), rel=0.05)
 
@@ -54,7 +54,7 @@ def test_the_word_for_sizes_is_right_where_they_are_known(number, prior, learnt,
 @given(st.lists(st.tuples(st.integers(1, 9), st.integers(0, 3)), min_size=1, max_size=20))
 def test_medians_are_those_of_the_boxes_and_a_resample_has_whole_images(rows):
     size, image = np.array([[a, 10.0 - a] for a, _ in rows]), np.array([i for _, i in rows])
-    found = _medians(Boxed(size, image, 4), np.random.default_rng(0))
+    found = _medians(BoxSizes(size, image, 4), np.random.default_rng(0))
     assert found.shape == (1 + RESAMPLES, 2)
     assert found[0].tolist() == [np.quantile(size[:, k], 0.5, method="inverted_cdf") for k in (0, 1)]
     if len(set(image.tolist())) == 1:  # its boxes are then all that a resample has
@@ -63,12 +63,12 @@ def test_medians_are_those_of_the_boxes_and_a_resample_has_whole_images(rows):
 
 @given(st.sampled_from([*Grade, None]), st.booleans())
 def test_looks_are_no_better_than_the_priors_where_sizes_are_worse(looks, worse):
-    size = compared(side(600), side(600), side(600, 1.3 if worse else 1.0))
-    words = {"structure": Grade.GOOD, "layout": Grade.GOOD, "looks": looks}
-    before = VerdictComponents({k: VerdictComponent(words[k], f"{k}.", verdict=str(words[k])) for k in KINDS}, {}, {})
+    size = compare_sizes(side(600), side(600), side(600, 1.3 if worse else 1.0))
+    grades = {"structure": Grade.GOOD, "layout": Grade.GOOD, "looks": looks}
+    before = VerdictComponents({k: VerdictComponent(grades[k], f"{k}.", verdict=str(grades[k])) for k in KINDS}, {}, {})
     found = with_sizes(before, {"red": size})
-    assert with_sizes(before, {}) is before and found.parts["sizes"].word is (Grade.NO_BETTER if worse else Grade.GOOD)
-    assert found.parts["looks"].word is (Grade.NO_BETTER if worse and looks is not None else looks)
+    assert with_sizes(before, {}) is before and found.parts["sizes"].grade is (Grade.NO_BETTER if worse else Grade.GOOD)
+    assert found.parts["looks"].grade is (Grade.NO_BETTER if worse and looks is not None else looks)
     assert found.overall is Grade.NO_BETTER or not worse
     assert "infer={'learn': False}" in found.parts["sizes"].remedy or not worse
 
@@ -98,8 +98,8 @@ def test_boxes_of_labels_are_held_beside_those_of_scenes(tmp_path):
     run = SimpleNamespace(model=model, guide=guide, record={"labels": labels}, visible_shares=dict)
     boxes, told = given_boxes(run, target), []
     found = sizes(run, boxes, told.append)
-    assert found["red"].word is Grade.NO_BETTER and found["red"].worse and sum(told) == 2 * SCENES
-    assert found["blue"].word is Grade.GOOD and found["blue"].given == found["blue"].prior == found["blue"].learnt
+    assert found["red"].grade is Grade.NO_BETTER and found["red"].worse and sum(told) == 2 * NUM_SCENES
+    assert found["blue"].grade is Grade.GOOD and found["blue"].given == found["blue"].prior == found["blue"].learnt
     assert found["red"].boxes == sum(int((each[:, 0] == 0).sum()) for each in boxes.boxes)
     assert given_boxes(SimpleNamespace(model=model, record={}), target) is None
     labels["path"] = str(tmp_path / "gone.json")

@@ -11,7 +11,7 @@ from probscene.app.fitting import store as storage
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
-from probscene.inference.statistics.bootstrap_test import BootstrapTest
+from probscene.inference.statistics.energy import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"steps": 4, "scenes": 6, "values": 10, "rate": 0.05, "feature_size": 96, "images": 20, "hidden": 8}

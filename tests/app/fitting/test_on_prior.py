@@ -4,7 +4,7 @@ import torch
 
 from probscene import load_model
 from probscene.app.api.fit import fit
-from probscene.app.evaluation.sources import PRIOR, START, before
+from probscene.app.evaluation.sources import PRIOR, START, baseline_policies
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL, QUICK
 from probscene.app.fitting.run import RunFolder
@@ -23,10 +23,12 @@ def begun(config, folder):
 def test_the_prior_is_where_it_starts(tmp_path):
     run = begun(PAPER_AERIAL, tmp_path)
     for opened in (run, RunFolder.at(run.path)):
-        assert opened.model.pretraining_policy is opened.model.prior and list(before(opened.model)) == [PRIOR]
+        assert opened.model.pretraining_policy is opened.model.prior and list(baseline_policies(opened.model)) == [
+            PRIOR
+        ]
         assert opened.new_guide().support is None
     other = begun(DEFAULT, tmp_path / "other")
-    assert list(before(other.model)) == [PRIOR, START] and other.new_guide().support is not None
+    assert list(baseline_policies(other.model)) == [PRIOR, START] and other.new_guide().support is not None
 
 
 def test_its_guide_reaches_lists_that_the_prior_never_has(tmp_path):

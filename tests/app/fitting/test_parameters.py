@@ -22,7 +22,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.parameters import learning, reader, skill
-from probscene.inference.statistics.bootstrap_test import BootstrapTest
+from probscene.inference.statistics.energy import BootstrapTest
 from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
 from probscene.structure import StructurePrior, counts

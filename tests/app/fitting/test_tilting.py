@@ -12,7 +12,7 @@ from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.tilting import learning
-from probscene.inference.statistics.bootstrap_test import BootstrapTest
+from probscene.inference.statistics.energy import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"rounds": 3, "first": 50, "scenes": 20, "steps": 4, "images": 20}

@@ -15,9 +15,9 @@ from PIL import Image
 from pycocotools.coco import COCO
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.labels import SEEN, read_labels
-from probscene.app.evaluation.structure_counts import sampled
-from probscene.app.evaluation.visible import SHOWN, Seen, counted, shown
+from probscene.app.evaluation.labels import VISIBLE_NOTE, read_labels
+from probscene.app.evaluation.structure_counts import sample_counts
+from probscene.app.evaluation.visible import MAX_RENDERED, Visibility, count_scenes, count_visible
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.boxes import read_boxes
 from probscene.app.labels.kitti import read_objects
@@ -164,7 +164,7 @@ def test_a_written_dataset_is_read_back(tmp_path):
     seen = [Counter(dataset.cats[a["category_id"]]["name"] for a in dataset.imgToAnns[i]) for i in range(40)]
     target = ImageFolder(tmp_path / "out" / "images", model.canvas, model.channels)
     read = read_labels(tmp_path / "out" / "Kitti" / "raw" / "training" / "label_2", model, target)
-    assert read.classes == model.classes and read.notes == (SEEN,)
+    assert read.classes == model.classes and read.notes == (VISIBLE_NOTE,)
     assert read.structures.counts.tolist() == [[found[name] for name in model.classes] for found in seen]
 
 
@@ -182,25 +182,28 @@ def test_scenes_are_counted_as_the_labels_that_would_be_written_of_them(file, tm
         target = ImageFolder(tmp_path / "out" / "images", model.canvas, model.channels)
         labels = read_labels(folder, model, target, min_height=low)
         told = []
-        counts = shown(model, model.prior, 70, 4, Seen(labels.min_height), told.append)
+        counts = count_visible(model, model.prior, 70, 4, Visibility(labels.min_height), told.append)
         assert told == [64, 6] and labels.classes == model.classes
         assert np.array_equal(counts, labels.structures.counts)
-        assert np.array_equal(counted(model, model.prior, 70, 4, Seen(labels.min_height)).counts, counts)
+        assert np.array_equal(count_scenes(model, model.prior, 70, 4, Visibility(labels.min_height)).counts, counts)
         assert counts.sum() != seen
         seen = counts.sum()
         target = ImageFolder(double, model.canvas, model.channels)
         assert read_labels(folder, model, target, min_height=2 * low).min_height == pytest.approx(low)
-    assert sampled(model, model.prior, 200, 4).counts.mean() > shown(model, model.prior, 200, 4, Seen()).mean()
+    assert (
+        sample_counts(model, model.prior, 200, 4).counts.mean()
+        > count_visible(model, model.prior, 200, 4, Visibility()).mean()
+    )
 
 
 def test_no_more_scenes_are_rendered_than_it_takes(monkeypatch, discs):
     model, asked = load_model(str(discs.file)), []
     none = np.zeros((1, 2), np.int64)
-    monkeypatch.setattr("probscene.app.evaluation.visible.shown", lambda *given: asked.append(given[2]) or none)
+    monkeypatch.setattr("probscene.app.evaluation.visible.count_visible", lambda *given: asked.append(given[2]) or none)
     for num in (5, 10_000):
-        counted(model, model.prior, num, 0, Seen())
-    assert asked == [5, SHOWN]
-    assert len(counted(model, model.prior, 50, 0, None)) == 50
+        count_scenes(model, model.prior, num, 0, Visibility())
+    assert asked == [5, MAX_RENDERED]
+    assert len(count_scenes(model, model.prior, 50, 0, None)) == 50
 
 
 @pytest.fixture
@@ -223,8 +226,11 @@ def test_the_commands_take_the_folder(call, fitted, target, labelled, tmp_path):
         record = json.loads((tmp_path / "e.json").read_text())
         assert record["sources"]["truth"]["mean_number"] == target.counts.sum() / 40
         model = RunFolder.at(fitted).model
-        assert record["sources"]["prior"]["mean_number"] == shown(model, model.prior, 100, 0, Seen()).sum() / 100
-        assert SEEN in record["notes"] and SEEN in done.out
+        assert (
+            record["sources"]["prior"]["mean_number"]
+            == count_visible(model, model.prior, 100, 0, Visibility()).sum() / 100
+        )
+        assert VISIBLE_NOTE in record["notes"] and VISIBLE_NOTE in done.out
         said = "40 of 40 images have regions marked DontCare"
         assert said in record["notes"][-1] and said in " ".join(done.out.split())
         done = call(command, fitted, *words, *more, "--min-height", 9)

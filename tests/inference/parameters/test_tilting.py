@@ -23,7 +23,7 @@ from probscene.inference.parameters.tilting.learning import (
     witness,
 )
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
-from probscene.inference.statistics.two_sample import energy_distance
+from probscene.inference.statistics.energy import energy_distance
 from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 

@@ -9,8 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene.errors import ProbsceneError
-from probscene.inference.statistics import metrics
-from probscene.inference.statistics.tally import around, mean_interval, resamples, tally, tally_images
+from probscene.inference.statistics import count_metrics as metrics
+from probscene.inference.statistics.count_metrics import (
+    bootstrap_interval,
+    mean_interval,
+    resamples,
+    tally,
+    tally_images,
+)
 
 IMAGES = st.lists(st.lists(st.integers(0, 6), max_size=4), min_size=1, max_size=12)  # the counts of each one's units
 
@@ -103,8 +109,8 @@ def test_a_rare_unit_that_most_resamples_lack():
 
 
 def test_figures_without_resamples_have_no_width():
-    assert around(0.3, [math.nan]) == (0.3, 0.3, 0.3)
-    assert around(0.1, [0.0, 1.0], least=0.0).low == 0.0
+    assert bootstrap_interval(0.3, [math.nan]) == (0.3, 0.3, 0.3)
+    assert bootstrap_interval(0.1, [0.0, 1.0], minimum=0.0).low == 0.0
 
 
 @pytest.mark.parametrize("count, image", [([-1], [0]), ([1], [2]), ([1], [-1]), ([1, 2], [0])])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from probscene.errors import ProbsceneError
-from probscene.inference.statistics import metrics
+from probscene.inference.statistics import count_metrics as metrics
 
 VALUES = st.lists(st.integers(0, 12), min_size=1, max_size=60)
 COUNTS = st.tuples(st.integers(1, 20), st.integers(1, 5)).flatmap(
@@ -64,7 +64,7 @@ def test_both_distances_are_metrics(p, q, r):
 
 def test_the_interval_of_a_bin_is_that_of_a_binomial():
     values = np.repeat([0, 1, 3], [50, 120, 30])
-    found = metrics.histogram_interval(values, level=0.9, resamples=20000)
+    found = metrics.histogram_interval(values, level=0.9, size=20000)
     for k, number in enumerate([50, 120, 0, 30]):
         low, high = scipy.stats.binom.interval(0.9, 200, number / 200)
         assert found.low[k] * 200 == pytest.approx(low, abs=1)
@@ -74,7 +74,7 @@ def test_the_interval_of_a_bin_is_that_of_a_binomial():
 def test_the_interval_of_class_shares_agrees_with_scipys_bootstrap():
     rng = np.random.default_rng(0)
     counts = rng.poisson([1.0, 3.0], (80, 2)) * rng.integers(1, 4, (80, 1))  # what one image shows belongs together
-    found = metrics.pooled_shares_interval(counts, resamples=3000)
+    found = metrics.pooled_shares_interval(counts, size=3000)
     ours = scipy.stats.bootstrap(
         (counts[:, 0], counts[:, 1]), lambda a, b, axis: a.sum(axis) / (a + b).sum(axis), paired=True, vectorized=True,
         n_resamples=3000, method="percentile", rng=np.random.default_rng(1),
@@ -85,9 +85,9 @@ def test_the_interval_of_class_shares_agrees_with_scipys_bootstrap():
 
 @given(VALUES, st.integers(0, 5))
 def test_an_interval_is_the_same_for_the_same_seed(values, seed):
-    found = metrics.histogram_interval(values, resamples=200, seed=seed)
+    found = metrics.histogram_interval(values, size=200, seed=seed)
     assert (found.low <= found.high).all() and found.share.sum() == pytest.approx(1)
-    again = metrics.histogram_interval(values, resamples=200, seed=seed)
+    again = metrics.histogram_interval(values, size=200, seed=seed)
     assert all(np.array_equal(a, b) for a, b in zip(found, again, strict=True))
 
 
@@ -108,9 +108,12 @@ def test_wrong_arguments_are_refused():
         metrics.histogram_interval([1], level=1.0)
 
 
-@given(st.lists(st.lists(st.integers(0, 400), min_size=1, max_size=60), min_size=1, max_size=4), st.integers(3, 20))
+@given(
+    st.lists(st.lists(st.integers(0, 400), min_size=1, max_size=60), min_size=1, max_size=4),
+    st.integers(3, 20),
+)
 def test_ranges_are_few_and_hold_every_count_once(samples, most):
-    found = metrics.ranges(samples, most)
+    found = metrics.bin_ranges(samples, most)
     assert len(found) <= most
     assert [k for first, last in found for k in range(first, last + 1)] == list(range(max(map(max, samples)) + 1))
     if max(map(max, samples)) < most:
@@ -120,7 +123,7 @@ def test_ranges_are_few_and_hold_every_count_once(samples, most):
 @given(st.integers(0, 2**31), st.integers(5, 60))
 def test_ranges_merge_tails_alone_where_the_rest_has_room(seed, mean):
     samples = [np.random.default_rng(seed + i).poisson(mean, 2000) for i in range(3)]
-    found = metrics.ranges(samples)
+    found = metrics.bin_ranges(samples)
     widths = {last + 1 - first for first, last in found[1:-2]}
     assert len(widths) <= 1  # of one width, but for the tails and what is left over
     for first, last in (found[0], found[-1]):

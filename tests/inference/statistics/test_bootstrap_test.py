@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from probscene.inference.statistics.bootstrap_test import RESAMPLES, bootstrap_test
-from probscene.inference.statistics.two_sample import energy_distance
+from probscene.inference.statistics.energy import RESAMPLES, bootstrap_test, energy_distance
 
 
 def test_distances_are_energy_distances():
     rng = np.random.default_rng(0)
     one, other, real = rng.normal(1, 1, (80, 3)), rng.normal(0, 2, (60, 3)), rng.normal(0, 1, (90, 3))
     found = bootstrap_test(one, other, real)
-    assert found.one == pytest.approx(energy_distance(one, real)) and found.other == pytest.approx(
+    assert found.distance == pytest.approx(energy_distance(one, real)) and found.baseline_distance == pytest.approx(
         energy_distance(other, real)
     )
 
@@ -22,7 +21,7 @@ def test_only_what_is_farther_beyond_chance_is_sure(shift, sure):
     rng = np.random.default_rng(1)
     real = rng.normal(0, 1, (200, 2))
     other = rng.normal(0.5, 1, (200, 2))
-    assert bootstrap_test(rng.normal(0.5 + shift, 1, (200, 2)), other, real).sure == sure
+    assert bootstrap_test(rng.normal(0.5 + shift, 1, (200, 2)), other, real).significant == sure
 
 
 def test_whole_images_are_resampled():
@@ -31,8 +30,8 @@ def test_whole_images_are_resampled():
     one, other, real = rng.normal(0.4, 1, (40, 1)), rng.normal(0, 1, (40, 1)), rng.normal(0, 1, (40, 1))
     copies, image = [np.repeat(x, 20, 0) for x in (one, other, real)], np.repeat(np.arange(40), 20)
     single, together = bootstrap_test(one, other, real), bootstrap_test(*copies, images=(image,) * 3)
-    assert together.one == pytest.approx(single.one) and abs(together.share - single.share) < 0.1
-    assert bootstrap_test(*copies).share > together.share
+    assert together.distance == pytest.approx(single.distance) and abs(together.probability - single.probability) < 0.1
+    assert bootstrap_test(*copies).probability > together.probability
 
 
 def test_a_share_is_that_of_resamples_row_by_row():
@@ -52,4 +51,4 @@ def test_a_share_is_that_of_resamples_row_by_row():
         a, b, c = (each[i][image] for each, image in zip(times, of, strict=True))
         larger += squared(one, real, a, c) > squared(other, real, b, c)
     found = bootstrap_test(one, other, real, images=images)
-    assert 0.1 < found.share < 0.9 and found.share == pytest.approx(larger / RESAMPLES, abs=1e-9)
+    assert 0.1 < found.probability < 0.9 and found.probability == pytest.approx(larger / RESAMPLES, abs=1e-9)

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from probscene.errors import DataError
-from probscene.inference.statistics.two_sample import (
-    apart,
+from probscene.inference.statistics.energy import (
     check_features,
     energy_distance,
+    energy_test,
     marginal_distances,
-    marginals,
-    permutation_p,
-    principal,
+    marginal_test,
+    permutation_p_value,
+    principal_components,
 )
 
 # Whole numbers and halves, as counts are: ties are the rule.
@@ -63,12 +63,12 @@ def test_the_permutation_test_is_scipys():
     theirs = scipy.stats.permutation_test(
         (a[:, 0], b[:, 0]), statistic, n_resamples=999, alternative="greater", rng=np.random.default_rng(0)
     )
-    assert permutation_p(a, b, permutations=1999) == pytest.approx(theirs.pvalue, abs=0.03)
+    assert permutation_p_value(a, b, permutations=1999) == pytest.approx(theirs.pvalue, abs=0.03)
     assert 0.005 < theirs.pvalue < 0.3  # so that the comparison says something
 
 
 def test_p_values_of_one_distribution_are_uniform():
-    found = [permutation_p(normal(s, 40), normal(1000 + s, 50), permutations=99) for s in range(60)]
+    found = [permutation_p_value(normal(s, 40), normal(1000 + s, 50), permutations=99) for s in range(60)]
     assert scipy.stats.kstest(found, "uniform").pvalue > 1e-3
 
 
@@ -77,18 +77,18 @@ def test_samples_of_one_distribution_are_at_the_floor():
     close = []
     for seed in range(20):
         a, b = normal(seed, 400), normal(1000 + seed, 600)
-        joint, single = apart(a, b), marginals(a, b)
-        assert 0.6 < joint.ratio < 1.6 and joint.low <= joint.floor <= joint.high and joint.judged == 300
+        joint, single = energy_test(a, b), marginal_test(a, b)
+        assert 0.6 < joint.ratio < 1.6 and joint.low <= joint.floor <= joint.high and joint.split_size == 300
         assert joint.close == (joint.rank > 0.05)
-        assert single.each[single.worst] == pytest.approx(single.largest.distance)
-        assert single.worst == single.each.argmax() and single.largest.distance < 2
+        assert single.distances[single.feature] == pytest.approx(single.largest.distance)
+        assert single.feature == single.distances.argmax() and single.largest.distance < 2
         close.append((joint.close, single.largest.close))
     assert np.sum(close, 0).min() >= 16
 
 
 def test_the_farther_the_features_the_less_they_are_taken_for_real():
     real = normal(0, 800)
-    shifts = [apart(normal(1, 500, shift), real) for shift in (0.0, 0.2, 0.4, 0.8, 1.6)]
+    shifts = [energy_test(normal(1, 500, shift), real) for shift in (0.0, 0.2, 0.4, 0.8, 1.6)]
     distances, ranks = [x.distance for x in shifts], [x.rank for x in shifts]
     assert distances == sorted(distances) and ranks == sorted(ranks, reverse=True)
     assert shifts[0].close and not shifts[-1].close and ranks[-1] == 0
@@ -100,26 +100,26 @@ def test_a_feature_that_is_constant_in_the_real_images_has_a_floor():
     for share, close in ((0.0, True), (0.004, True), (0.4, False)):
         generated = np.pad(normal(1, 600), ((0, 0), (0, 1)))
         generated[:, 3] = rng.random(600) < share
-        found = marginals(generated, real)
-        assert np.isfinite(found.each).all() and found.largest.close == close
-    assert found.worst == 3
-    both = marginals(np.zeros((100, 1)), np.zeros((100, 1)))
-    assert both.each.tolist() == [0] and both.largest.close
+        found = marginal_test(generated, real)
+        assert np.isfinite(found.distances).all() and found.largest.close == close
+    assert found.feature == 3
+    both = marginal_test(np.zeros((100, 1)), np.zeros((100, 1)))
+    assert both.distances.tolist() == [0] and both.largest.close
 
 
 def test_no_unit_changes_the_judgement():
     a, b = normal(0, 300, 0.3), normal(1, 300)
-    one, other = apart(a, b), apart(1000 * a + 7, 1000 * b + 7)
+    one, other = energy_test(a, b), energy_test(1000 * a + 7, 1000 * b + 7)
     assert one.ratio == pytest.approx(other.ratio) and one.rank == other.rank
-    assert marginals(a, b).each == pytest.approx(marginals(1000 * a, 1000 * b).each)
+    assert marginal_test(a, b).distances == pytest.approx(marginal_test(1000 * a, 1000 * b).distances)
 
 
 def test_principal_components_keep_what_varies():
     rng = np.random.default_rng(0)
     wide = rng.normal(size=(200, 5)) @ rng.normal(size=(5, 90))
-    a, b = principal([wide[:120], wide[120:]], 32)
+    a, b = principal_components([wide[:120], wide[120:]], 32)
     assert a.shape == (120, 32) and energy_distance(a, b) == pytest.approx(energy_distance(wide[:120], wide[120:]))
-    assert principal([wide[:, :7]])[0].shape == (200, 7)
+    assert principal_components([wide[:, :7]])[0].shape == (200, 7)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Lists with a longest, and the counts that a model can have, against enumeration."""
+"""Lists with a longest, and the extreme counts of derivations, against enumeration."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,6 @@ from probscene.lists import (
     lengths,
     share_from,
 )
-from probscene.reach import Reach
 from probscene.structure import StructurePrior, counts, ranked, support_of_policies, weights
 
 NESTED = Grammar("Scene -> bg Items | bg\nItems -> Item Items | ε\nItem -> x(Things) | y\nThings -> z Things | ε")
@@ -51,33 +50,32 @@ def enumerated(grammar, prior):
 
 
 @settings(max_examples=40)
-@given(priors(), st.data())
-def test_reach_is_what_enumeration_finds(pair, data):
+@given(priors())
+def test_extreme_counts_are_those_of_enumeration(pair):
     grammar, prior = pair
     found, every = enumerated(grammar, prior)
     assume(len(found))
-    reach = Reach(grammar, support_of_policies(grammar, [prior]), STEPS, [[kind] for kind in range(len(grammar.kinds))])
-    for kind in range(len(grammar.kinds)):
-        assert (reach.least(kind), reach.most(kind)) == (every[:, kind].min(), every[:, kind].max())
+    process = Branching(grammar, support_of_policies(grammar, [prior]).uniform_table())
     rules = found.lengths.numpy()
-    for _ in range(4):
-        wanted = np.array(
-            data.draw(st.lists(st.integers(-1, 5), min_size=len(grammar.kinds), max_size=len(grammar.kinds)))
-        )
-        for at_least in (False, True):
-            fits = (wanted < 0) | ((every >= wanted) if at_least else (every == wanted))
-            fewest = rules[fits.all(1)].min(initial=10**6)
-            assert reach.fewest_rules(wanted, at_least) == (np.inf if fewest == 10**6 else fewest)
+    for kind in range(len(grammar.kinds)):
+        objects = (grammar.objects.numpy()[process.rule] == kind).sum(1)
+        for sign in (1, -1):
+            total = process.max_totals(sign * objects, STEPS)
+            for steps in range(STEPS + 1):
+                assert total[steps] == (sign * every[rules <= steps, kind].astype(float)).max(initial=-np.inf)
+            largest = process.max_total(sign * objects)
+            assert largest >= total[-1] and (np.isinf(largest) or largest == process.max_totals(sign * objects, 60)[-1])
 
 
-def test_what_hangs_together_with_nothing_does_not_count():
-    """A list without an end of its own below an object that is not there could feed itself."""
-    grammar = Grammar("Scene -> x | y(Loop)\nLoop -> z Loop | ε")
-    support = support_of_policies(grammar, [StructurePrior(grammar, Loop=weights(1, 1))])
-    reach = Reach(grammar, support, 20, [[grammar.kind(name)] for name in "xyz"])
-    assert reach.fewest_rules(np.array([1, 0, 3])) == np.inf and len(reach.cuts)
-    assert reach.fewest_rules(np.array([0, 1, 3])) == 5
-    assert reach.most(2) == 18
+def test_counts_without_a_largest():
+    """Nor does it matter that another branch has more at first, or that one has no end."""
+    grammar = Grammar("Scene -> x | Many | Loop\nMany -> z z z z z z z z z | ε\nLoop -> z Loop | ε")
+    process = Branching(grammar, StructurePrior(grammar, Loop=weights(1, 1)).table)
+    objects = (grammar.objects.numpy()[process.rule] == grammar.kind("z")).sum(1)
+    assert process.max_total(objects) == np.inf and process.max_total(-objects) == 0
+    assert process.max_totals(objects, 20)[[1, 2, 12, 20]].tolist() == [0, 9, 10, 18]
+    alone = (grammar.objects.numpy()[process.rule] == grammar.kind("x")).sum(1)
+    assert process.max_total(alone) == 1
 
 
 @settings(max_examples=30)

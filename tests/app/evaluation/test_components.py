@@ -17,17 +17,17 @@ from rich.console import Console
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation import source_features as looked
-from probscene.app.evaluation.advice import of_structure, remedy
+from probscene.app.evaluation import source_features
 from probscene.app.evaluation.components import (
     KINDS,
     VerdictComponent,
     VerdictComponents,
-    called,
     doubtful_sites,
-    unread_sites,
+    prior_sites,
+    structure_grade,
 )
 from probscene.app.evaluation.diagnose import diagnose
+from probscene.app.evaluation.explain import component_remedy, structure_remedy
 from probscene.app.fitting.config import LIKELIHOOD, META_SIM, TILTING, FitConfig
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
@@ -38,7 +38,7 @@ from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.features import pretrained
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.statistics.residual import Grade, worst
+from probscene.inference.statistics.residual import Grade, worst_grade
 from probscene.inference.statistics.verdict import Verdict
 from probscene.model import SceneModel, scene_model
 from probscene.structure import StructurePrior, counts, weights
@@ -73,7 +73,7 @@ def quiet(*_):
 @pytest.fixture(scope="module", autouse=True)
 def fewer_images():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(looked, "IMAGES", 100)
+        patch.setattr(source_features, "NUM_IMAGES", 100)
         patch.setattr(pretrained, "EfficientNetLite", functools.partial(pretrained.EfficientNetLite, 96))
         yield
 
@@ -111,13 +111,13 @@ def guided(fitted, *, learnt: SceneModel | None, structure=TRUTH):
     return Guided.at(fitted.path, model=dots(24.0))
 
 
-def words(found) -> dict[str, str | None]:
-    return {name: part.word for name, part in found.aspects.parts.items()}
+def grades(found) -> dict[str, str | None]:
+    return {name: part.grade for name, part in found.components.parts.items()}
 
 
 def test_a_sample_of_the_target_is_good_in_every_part(fitted):
     found = diagnose(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
-    assert set(words(found).values()) == {Grade.GOOD} and found.aspects.verdict == "good"
+    assert set(grades(found).values()) == {Grade.GOOD} and found.components.verdict == "good"
     record = json.loads(json.dumps(found.record(), allow_nan=False))
     assert record["verdict"] == record["overall"] == "good" and list(record["parts"]) == list(KINDS)
     for name in ("layout", "looks"):
@@ -131,10 +131,10 @@ def test_a_sample_of_the_target_is_good_in_every_part(fitted):
 @pytest.mark.parametrize("learnt", [None, dots(24.0)])
 def test_layout_and_looks_of_the_prior_are_not_good_however_good_the_structure(fitted, learnt):
     found = diagnose(guided(fitted, learnt=learnt), fitted.images, quiet, 300)
-    found_words = words(found)
-    assert found_words.pop("looks") in (Grade.NO_BETTER, None)  # dots are small, and images few
-    assert found_words.pop("structure") in (Grade.GOOD, Grade.BETTER)  # dots that lie in a line are counted otherwise
-    assert found_words == {"layout": Grade.NO_BETTER}
+    found_grades = grades(found)
+    assert found_grades.pop("looks") in (Grade.NO_BETTER, None)  # dots are small, and images few
+    assert found_grades.pop("structure") in (Grade.GOOD, Grade.BETTER)  # dots that lie in a line are counted otherwise
+    assert found_grades == {"layout": Grade.NO_BETTER}
     record = found.record()
     assert record["overall"] == "no better than the prior" and record["verdict"] != "good"
     assert "--learn structure,parameters" in record["parts"]["layout"]["remedy"]
@@ -143,26 +143,26 @@ def test_layout_and_looks_of_the_prior_are_not_good_however_good_the_structure(f
 
 def test_halfway_is_better_than_the_prior(fitted):
     found = diagnose(guided(fitted, learnt=dots(11.0)), fitted.images, quiet, 300)
-    assert words(found)["layout"] is Grade.BETTER and found.aspects.overall is not Grade.GOOD
+    assert grades(found)["layout"] is Grade.BETTER and found.components.overall is not Grade.GOOD
 
 
 def test_a_class_whose_layout_is_the_priors_is_named(fitted):
     found = diagnose(guided(fitted, learnt=dots(0.0, 24.0)), fitted.images, quiet, 300)
-    layout = {name: each["layout"] for name, each in found.aspects.classes.items()}
-    assert layout == {"red": Grade.GOOD, "blue": Grade.NO_BETTER} and words(found)["layout"] is not Grade.GOOD
+    layout = {name: each["layout"] for name, each in found.components.classes.items()}
+    assert layout == {"red": Grade.GOOD, "blue": Grade.NO_BETTER} and grades(found)["layout"] is not Grade.GOOD
     assert "Layout by class: good for red; no better than the prior for blue." in printed(found)
 
 
 def test_what_looks_unlike_the_target_is_no_better_than_the_prior(fitted):
     found = diagnose(guided(fitted, learnt=dots(0.0, bright=0.3)), fitted.images, quiet, 300)
-    assert words(found)["looks"] is not Grade.GOOD and "scene.photo(...)" in found.aspects.parts["looks"].remedy
+    assert grades(found)["looks"] is not Grade.GOOD and "scene.photo(...)" in found.components.parts["looks"].remedy
 
 
 def test_features_that_do_not_say_where_objects_are(fitted, monkeypatch):
     monkeypatch.delattr(CountNet, "cells")
     found = diagnose(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
-    assert words(found) == {"structure": Grade.GOOD, "layout": None, "looks": Grade.GOOD}
-    assert "do not say where objects are" in printed(found) and found.aspects.verdict == "not judged"
+    assert grades(found) == {"structure": Grade.GOOD, "layout": None, "looks": Grade.GOOD}
+    assert "do not say where objects are" in printed(found) and found.components.verdict == "not judged"
     assert found.record()["overall"] == "not judged"
 
 
@@ -178,7 +178,7 @@ def test_sites_that_could_not_be_read_are_named(fitted):
     finally:
         (run.path / "parameters.json").unlink()
     assert "Sites that keep the prior: dot.x, as it cannot be read in renders." in printed(found)
-    said = found.aspects.parts["layout"].remedy
+    said = found.components.parts["layout"].remedy
     assert "dot.off (0.120, floor 0.020)" in said and "Not learnt: dot.x" in said
 
 
@@ -189,8 +189,8 @@ def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, l
     site = {"name": "light", "kinds": [], "learnt": learnt, "skill": None, "because": ""}
     chosen = preset("quick").set(f"parameters={method}")
     run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]}, config=chosen)
-    figures = SimpleNamespace(left=None, high=None)
-    said = remedy(run, "looks", Grade.NO_BETTER, figures, "More photographs would tell.")
+    figures = SimpleNamespace(ratio=None, high=None)
+    said = component_remedy(run, "looks", Grade.NO_BETTER, figures, "More photographs would tell.")
     named = re.findall(r"--set ([\w.]+)=(\d+)", said)
     assert said.count("--set") == len(named) and learnt <= bool(named)
     assert all(int(value) == 2 * chosen.flat()[path] for path, value in named)
@@ -199,12 +199,16 @@ def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, l
 @pytest.mark.parametrize("verdict", Verdict)
 @pytest.mark.parametrize("labelled", [True, False])
 def test_structure_that_is_read_wrongly_needs_labels_and_what_is_to_be_set_has_a_value(verdict, labelled):
-    run = SimpleNamespace(config=preset("quick"), record={"labels": {}} if labelled else {})
-    said = of_structure(run, SimpleNamespace(verdict=verdict, remedy="Use it."))
-    assert "train" not in said and ("--set structure.batches=120" in said) is (
-        verdict in (Verdict.NOT_FITTED, Verdict.APART)
+    features = SimpleNamespace(pretrained=True)
+    run = SimpleNamespace(config=preset("quick"), record={"labels": {}} if labelled else {}, features=features)
+    said = structure_remedy(run, verdict)
+    assert "train the" not in said and ("--set structure.batches=120" in said) is (
+        verdict in (Verdict.NOT_FITTED, Verdict.UNDERFIT)
     )
-    if verdict is Verdict.APART:
+    assert "pretrained" not in said  # which it has
+    features.pretrained = False
+    assert (structure_remedy(run, verdict) == said) is (verdict is not Verdict.DOMAIN_SHIFT)
+    if verdict is Verdict.UNDERFIT:
         assert ("label more images than this fit had" if labelled else "label ten images") in said
 
 
@@ -214,11 +218,11 @@ def printed(found) -> str:
     return out.getvalue()
 
 
-def aspects_of(*found) -> VerdictComponents:
+def components_of(*found) -> VerdictComponents:
     parts = zip(KINDS, found, strict=True)
 
     def component(kind, word):
-        verdict = "still apart" if word and kind == "structure" and word != "good" else str(word)
+        verdict = "underfit" if word and kind == "structure" and word != "good" else str(word)
         return VerdictComponent(word, f"{kind}.", verdict=verdict)
 
     return VerdictComponents({kind: component(kind, word) for kind, word in parts}, {}, {})
@@ -227,13 +231,13 @@ def aspects_of(*found) -> VerdictComponents:
 @given(st.sampled_from(Grade), st.sampled_from([*Grade, None]), st.sampled_from([*Grade, None]), st.booleans())
 def test_the_whole_is_never_better_than_its_worst_part(structure, layout, looks, doubt):
     found = structure, layout, looks
-    whole = replace(aspects_of(*found), doubtful=("dot.x",) if doubt else ())
+    whole = replace(components_of(*found), doubtful=("dot.x",) if doubt else ())
     good = not doubt and set(found) == {Grade.GOOD}
-    assert good is (whole.verdict == "good") is (whole.overall is Grade.GOOD) is (whole.head.word is Grade.GOOD)
+    assert good is (whole.verdict == "good") is (whole.overall is Grade.GOOD) is (whole.head.grade is Grade.GOOD)
     if not doubt or set(found) != {Grade.GOOD}:
-        assert whole.overall is worst(found)
+        assert whole.overall is worst_grade(found)
     elif doubt:
-        assert whole.verdict == "not judged" and "dot.x kept the prior" in whole.head.because
+        assert whole.verdict == "not judged" and "dot.x kept the prior" in whole.head.reason
     if structure is Grade.GOOD:
         assert (whole.verdict == "not judged") is (whole.overall is None)
     assert json.loads(json.dumps(whole.record()))["sites_in_doubt"] == list(whole.doubtful)
@@ -261,7 +265,7 @@ def site(learnt, because="", skill=0.9, prior=None):
 def test_a_site_is_in_doubt_where_it_keeps_a_prior_that_may_not_be_the_targets(of, kept, doubtful):
     run = SimpleNamespace(parameters={"kept": kept, "sites": [of]})
     assert bool(doubtful_sites(run)) is doubtful
-    assert bool(unread_sites(run)) is (kept == "prior" or not of["learnt"])
+    assert bool(prior_sites(run)) is (kept == "prior" or not of["learnt"])
 
 
 @pytest.mark.parametrize("config", [FitConfig(parameters=None), FitConfig()], ids=["structure", "both"])
@@ -272,9 +276,9 @@ def test_sites_that_were_to_be_learnt_by_features_that_read_none_are_in_doubt(co
 
 @given(st.sampled_from([*Grade, None]), st.sampled_from(Verdict))
 def test_structure_is_good_only_by_its_verdict(word, verdict):
-    assert (called(word, verdict) is Grade.GOOD) is (verdict is Verdict.GOOD)
-    if verdict in (Verdict.NOT_FITTED, Verdict.ANOTHER_DOMAIN):
-        assert called(word, verdict) is Grade.NO_BETTER
+    assert (structure_grade(word, verdict) is Grade.GOOD) is (verdict is Verdict.GOOD)
+    if verdict in (Verdict.NOT_FITTED, Verdict.DOMAIN_SHIFT):
+        assert structure_grade(word, verdict) is Grade.NO_BETTER
 
 
 def test_each_image_is_the_one_that_generate_writes(fitted, tmp_path):
@@ -285,8 +289,8 @@ def test_each_image_is_the_one_that_generate_writes(fitted, tmp_path):
             seen.append(images)
             return torch.zeros(len(images), 1), torch.zeros(len(images), 2, 1)
 
-    found = looked.look(run, fitted.images, run.network(), Kept(), lambda _: None, 20, 3)
-    assert set(found) == {looked.TARGET, looked.LEARNT, looked.PRIOR}
+    found = source_features.embed_sources(run, fitted.images, run.network(), Kept(), lambda _: None, 20, 3)
+    assert set(found) == {source_features.TARGET, source_features.LEARNT, source_features.PRIOR}
     generate_scenes(run.model, TRUTH, 20, tmp_path / "again", 3, "images")
     again = ImageFolder(tmp_path / "again" / "images", (64, 64), 3)
     assert torch.equal(seen[1], torch.stack([again.load(i) for i in range(20)]))

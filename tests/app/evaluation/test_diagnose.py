@@ -15,6 +15,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation import diagnose as verdict
 from probscene.app.evaluation.diagnose import diagnose
 from probscene.app.evaluation.evaluate import evaluate
+from probscene.app.evaluation.explain import structure_reason
 from probscene.app.evaluation.label_agreement import DISAGREE, agreement
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.sources import Source
@@ -24,7 +25,7 @@ from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features import pretrained
-from probscene.inference.statistics.residual import Grade, worst
+from probscene.inference.statistics.residual import Grade, worst_grade
 from probscene.inference.statistics.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
 
@@ -96,9 +97,9 @@ def guided(path, policy) -> Guided:
 CASES = {
     "a good fit": (lambda m: m.target(0).prior, "target", Verdict.GOOD),
     "the prior": (lambda m: m.prior, "target", Verdict.NOT_FITTED),
-    "one mode": (lambda m: structure(m, (0, 1), (4, 1)), "target", Verdict.MODES_LOST),
-    "more than can be made": (lambda m: structure(m, (0, 0, 0, 1), (1, 1)), "crowd", Verdict.OUT_OF_REACH),
-    "another domain": (lambda m: m.target(0).prior, "aerial", Verdict.ANOTHER_DOMAIN),
+    "one mode": (lambda m: structure(m, (0, 1), (4, 1)), "target", Verdict.MODE_COLLAPSE),
+    "more than can be made": (lambda m: structure(m, (0, 0, 0, 1), (1, 1)), "crowd", Verdict.OUT_OF_SUPPORT),
+    "another domain": (lambda m: m.target(0).prior, "aerial", Verdict.DOMAIN_SHIFT),
 }
 
 
@@ -108,12 +109,11 @@ def test_the_verdict_on_renders_is_right(case, seeing, drawn):
     target = getattr(drawn, folder)
     told = []
     found = diagnose(guided(seeing, policy), target, lambda *said: told.append(said), SCENES)
-    assert found.trust.verdict == expected, found.trust.because
+    assert found.structure.verdict == expected, structure_reason(found.structure)
     assert told[-1][0] == "judging" and told[-1][1] == told[-1][2]
-    assert len(found.real_unmatched) == len(found.generated_unmatched) == verdict.SHOWN
-    assert found.names == tuple(target.paths[i].name for i in found.real_unmatched)
-    assert all(picture.shape == (64, 64, 3) for picture in found.generated_unmatched)
-    assert not found.trust.pretrained
+    assert len(found.real_uncovered) == len(found.generated_uncovered) == verdict.NUM_EXAMPLES
+    assert found.names == tuple(target.paths[i].name for i in found.real_uncovered)
+    assert all(picture.shape == (64, 64, 3) for picture in found.generated_uncovered)
     record = json.loads(json.dumps(found.record(), allow_nan=False))
     assert record["parts"]["structure"]["verdict"] == str(expected) and "labels" not in record
     # Discs stand and look as the prior's, which few images can tell from the target's: the structure is not the whole.
@@ -126,7 +126,7 @@ def test_the_same_run_has_the_same_verdict(seeing, drawn):
     run = RunFolder.at(seeing)
     one, other = (diagnose(run, drawn.target, quiet, 100) for _ in range(2))
     assert one.record() == other.record()
-    assert all(np.array_equal(a, b) for a, b in zip(one.generated_unmatched, other.generated_unmatched, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(one.generated_uncovered, other.generated_uncovered, strict=True))
 
 
 @pytest.mark.parametrize(("some", "close"), [(True, True), (False, False)])
@@ -138,7 +138,7 @@ def test_labels_say_whether_the_verdict_was_right(some, close, seeing, drawn, tm
     assert len(labels.structures) == (60 if some else IMAGES)
     run = guided(seeing, lambda m: m.target(0).prior if close else m.prior)
     found = diagnose(run, drawn.target, quiet, SCENES, evaluate(run, drawn.target, labels, quiet, 2000))
-    assert found.agreement.close == close and found.agreement.agrees(found.trust.verdict)
+    assert found.agreement.close == close and found.agreement.agrees(found.structure.verdict)
     record = json.loads(json.dumps(found.record(), allow_nan=False))["labels"]
     assert record["agree"] and record["because"].startswith("The labels agree")
     assert record["images"] == len(labels.structures)
@@ -147,14 +147,17 @@ def test_labels_say_whether_the_verdict_was_right(some, close, seeing, drawn, tm
 
 def test_labels_disagree_where_the_network_counts_wrongly():
     rng = np.random.default_rng(0)
-    truth = Source.of(rng.multinomial(6, [0.5, 0.5], 300))
-    same, other = Source.of(rng.multinomial(6, [0.5, 0.5], 5000)), Source.of(rng.multinomial(6, [0.8, 0.2], 5000))
+    truth = Source.from_counts(rng.multinomial(6, [0.5, 0.5], 300))
+    same, other = (
+        Source.from_counts(rng.multinomial(6, [0.5, 0.5], 5000)),
+        Source.from_counts(rng.multinomial(6, [0.8, 0.2], 5000)),
+    )
     right, wrong = (agreement(side, truth, ("a", "b"), "label ten images") for side in (same, other))
-    assert right.close and right.agrees(Verdict.GOOD) and not right.agrees(Verdict.APART)
-    assert not wrong.close and wrong.agrees(Verdict.APART) and not wrong.agrees(Verdict.GOOD)
+    assert right.close and right.agrees(Verdict.GOOD) and not right.agrees(Verdict.UNDERFIT)
+    assert not wrong.close and wrong.agrees(Verdict.UNDERFIT) and not wrong.agrees(Verdict.GOOD)
     said = wrong.sentence(Verdict.GOOD)
     assert "Wrongly read in the images: a, b. Label ten images" in said and "train" not in said
-    assert "it is the features" in right.sentence(Verdict.APART)
+    assert "it is the features" in right.sentence(Verdict.UNDERFIT)
     assert wrong.worst != "number of objects"  # that is always six
 
 
@@ -162,11 +165,11 @@ def test_labels_disagree_where_the_network_counts_wrongly():
 def test_what_the_labels_disagree_with_is_nowhere_good(structure, layout, counts, close):
     """And what they do not disagree with stays as it is."""
     rng = np.random.default_rng(0)
-    truth = Source.of(rng.poisson([2, 4], (300, 2)))
-    learnt = Source.of(rng.poisson([2 if close else 4, 4], (3000, 2)))
+    truth = Source.from_counts(rng.poisson([2, 4], (300, 2)))
+    learnt = Source.from_counts(rng.poisson([2 if close else 4, 4], (3000, 2)))
     found = agreement(learnt, truth, ("a", "b"), "label ten images")
     parts = {"structure": structure, "layout": layout}
-    overall = worst(parts.values())
+    overall = worst_grade(parts.values())
     record = {"overall": str(overall), "verdict": str(overall), "because": "", "remedy": ""}
     record |= {"parts": {name: {"word": str(word)} for name, word in parts.items()}}
     record |= {"classes": {name: {"counts": str(counts), "layout": "good"} for name in "ab"}}
@@ -177,14 +180,14 @@ def test_what_the_labels_disagree_with_is_nowhere_good(structure, layout, counts
         assert found.wrong == ("number of objects", "a")
         words = said["overall"], said["verdict"], said["parts"]["structure"]["word"], said["classes"]["a"]["counts"]
         assert "good" not in words and (said["verdict"] == DISAGREE) is (structure is Grade.GOOD)
-        assert said["overall"] == str(worst([overall, Grade.BETTER]))
+        assert said["overall"] == str(worst_grade([overall, Grade.BETTER]))
 
 
 def test_labels_of_one_distribution_rarely_disagree():
     rng = np.random.default_rng(0)
     close = 0
     for seed in range(40):
-        truth, learnt = (Source.of(rng.poisson([2, 0.3, 5], (n, 3))) for n in (120, 3000))
+        truth, learnt = (Source.from_counts(rng.poisson([2, 0.3, 5], (n, 3))) for n in (120, 3000))
         close += agreement(learnt, truth, ("a", "b", "c"), "", seed).close
     assert close >= 38
 
@@ -235,7 +238,7 @@ def test_images_that_are_all_the_same_have_no_verdict(seeing, drawn, tmp_path):
     for i in range(40):
         (tmp_path / f"{i}.png").write_bytes(drawn.target.paths[0].read_bytes())
     found = diagnose(RunFolder.at(seeing), ImageFolder(tmp_path, (64, 64), 3), quiet, 64)
-    assert found.trust is None and "identical" in found.absent
+    assert found.structure is None and "identical" in found.absent
 
 
 def test_wrong_numbers_and_no_labels_at_all(call, seeing, drawn, tmp_path):
