@@ -258,7 +258,7 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
 
 def embed_real(net: FeatureNet, images: Tensor) -> Tensor:
     """Features ``(L, D)`` of target images, which a network may look at in another way than at renders."""
-    return getattr(net, "embed_photographs", net.embed)(images)
+    return getattr(net, "embed_real", net.embed)(images)
 
 
 @torch.no_grad()

@@ -65,7 +65,7 @@ class PretrainedCountNet(nn.Module):
 
     uses_labels = True
     unit: Tensor
-    target_fingerprint: Tensor
+    taught_by: Tensor
     rules: Tensor
     scope: Tensor
     apart: Tensor
@@ -116,12 +116,12 @@ class PretrainedCountNet(nn.Module):
 
     @property
     def taught_by_fingerprint(self) -> str:
-        """``target_fingerprint`` in hexadecimal; empty for none."""
-        return bytes(self.target_fingerprint.tolist()).hex() if self.target_fingerprint.any() else ""
+        """``taught_by`` in hexadecimal; empty for none."""
+        return bytes(self.taught_by.tolist()).hex() if self.taught_by.any() else ""
 
     def bind(self, fingerprint: str) -> None:
-        """Say which images heads and rules are suited to, see ``target_fingerprint``; in hexadecimal."""
-        self.target_fingerprint.copy_(torch.tensor(list(bytes.fromhex(fingerprint)), dtype=torch.uint8))
+        """Say which images heads and rules are suited to, see ``taught_by``; in hexadecimal."""
+        self.taught_by.copy_(torch.tensor(list(bytes.fromhex(fingerprint)), dtype=torch.uint8))
 
     def places(self, stride: int) -> tuple[int, int]:
         """h and w of places so far apart."""

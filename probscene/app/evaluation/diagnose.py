@@ -189,9 +189,9 @@ class _Eyes:
     def __init__(self, net: FeatureNet, each, keep: bool):
         self.net, self.each, self.keep = net, each, keep
         self.names, self.thumbs = net.names, []
-        if hasattr(net, "embed_drawn"):
+        if hasattr(net, "embed_from_labels"):
             self.embed_from_labels = self._embed_drawn
-            self.uses_labels = not keep and getattr(net, "by_labels", False)
+            self.uses_labels = not keep and getattr(net, "uses_labels", False)
 
     def embed(self, images: Tensor) -> Tensor:
         self._look(images)

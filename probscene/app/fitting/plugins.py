@@ -88,7 +88,7 @@ def as_features(given: Any) -> Features:
     """
     made = _made(given, "features")
     if callable(getattr(made, "build", None)) and isinstance(getattr(made, "name", None), str):
-        methods = ("training", "adapt", "divergence", "taught_by", "settings")
+        methods = ("training", "adapt", "divergence", "target_fingerprint", "settings")
         missing = [name for name in methods if not callable(getattr(made, name, None))]
         missing += [name for name in ("resolution", "pretrained", "takes_labels") if not hasattr(made, name)]
         if missing:

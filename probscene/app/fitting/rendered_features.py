@@ -99,7 +99,7 @@ class RenderedFeatures:
                 network that goes by labels counts what can be seen, of one drawing.
         """
 
-        embed_from_labels, pictured = getattr(net, "embed_drawn", None), not getattr(net, "by_labels", False)
+        embed_from_labels, pictured = getattr(net, "embed_from_labels", None), not getattr(net, "uses_labels", False)
 
         def features(scenes: Scenes) -> Tensor:
             with threads(self.threads):

@@ -21,7 +21,7 @@ LEARN = ("--learn", "structure,parameters", "--parameters", "meta-sim", "--set",
 
 
 def it_is_kept(patch):
-    patch.setattr(select_sites, "farther", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
 
 
 @pytest.fixture(scope="module")

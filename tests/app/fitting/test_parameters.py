@@ -34,7 +34,7 @@ def anything_is_read(patch):
     """Also what a reader of six steps says; and it is kept."""
     patch.setattr(skill, "READABLE", -1e9)
     patch.setattr(reader, "LEAST_MASS", (1e-3,))
-    patch.setattr(select_sites, "farther", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(select_sites, "passed", lambda *_: frozenset())
     patch.setattr(select_sites, "of_unclear", lambda *_: (frozenset(), {}))
     for renders in ("TRIED", "ASSEMBLED", "MISSED"):
@@ -266,7 +266,7 @@ def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
 @pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
 def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
-    monkeypatch.setattr(select_sites, "farther", lambda *_: BootstrapTest(1.0, 1.0, 0.0))
+    monkeypatch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(1.0, 1.0, 0.0))
     monkeypatch.setattr(select_sites, "passed", lambda *_: frozenset(passed))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *LEARN)

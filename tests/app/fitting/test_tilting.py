@@ -36,7 +36,7 @@ def lit(tmp_path_factory, discs) -> Path:
 
 
 def it_is_kept(patch):
-    patch.setattr(select_sites, "farther", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(learning, "CHANCE", 1.1)  # of so few scenes, whatever they say
 
 
