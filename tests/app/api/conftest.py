@@ -12,7 +12,8 @@ def quick(discs) -> Callable[..., ps.Run]:
     """``ps.fit`` with a quick preset, made shorter, one thread and no cache, unless said otherwise."""
 
     def fit(model, target, **options):
-        short = {"preset": "quick", "settings": discs.short, "threads": 1, "cache": False, "progress": False}
+        short = {"preset": "quick", "settings": discs.short, "features": "count", "learn": "structure"}
+        short |= {"threads": 1, "cache": False, "progress": False}
         return ps.fit(model, target, **{**short, **options})
 
     return fit

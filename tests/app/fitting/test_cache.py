@@ -60,7 +60,7 @@ def test_the_second_fit_takes_it_and_has_the_same_bytes(fit, discs, whole, fitte
 
 
 def test_python_takes_it_too(discs, target, whole, fitted, capsys):
-    options = {"settings": discs.short, "threads": 1, "cache": whole}
+    options = {"settings": discs.short, "features": "count", "learn": "structure", "threads": 1, "cache": whole}
     run = ps.fit(discs.file, target.images, "quick", **options)
     assert "was trained before" in " ".join(capsys.readouterr().err.split()) and same(run, fitted)
 
@@ -82,7 +82,7 @@ OTHERS = {
 @pytest.mark.parametrize("what", OTHERS)
 def test_another_one_is_another_entry(fit, discs, whole, what):
     unread = ("count", "width") if what == "network" else ()
-    words = [word for word in discs.without(*unread) if word != "--no-cache"]
+    words = [word for word in discs.without("parameters", *unread) if word != "--no-cache"] + ["--learn", "structure"]
     assert not fit(discs.file, *OTHERS[what], words=words)[1]
     assert fit(discs.file, *OTHERS[what], words=words)[1]
     assert len(list((whole / "features").glob("*.safetensors"))) == 2
@@ -207,8 +207,8 @@ def test_a_cache_that_cannot_be_written_does_no_harm(fit, discs, fitted, tmp_pat
 
 def test_models_and_features_in_memory_are_not_kept(discs, target, tmp_path):
     model = replace(ps.load_model(discs.file), name="in memory")
-    options = {"settings": discs.short, "threads": 1, "progress": False, "cache": tmp_path / "cache"}
-    ps.fit(model, target.images, "quick", **options)
+    options = {"settings": discs.short, "features": "count", "learn": "structure", "threads": 1, "progress": False}
+    ps.fit(model, target.images, "quick", cache=tmp_path / "cache", **options)
     assert not (tmp_path / "cache").exists()
 
 

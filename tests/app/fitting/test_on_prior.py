@@ -46,8 +46,9 @@ def test_its_guide_reaches_lists_that_the_prior_never_has(tmp_path):
 
 def test_without_batches_structures_stay_the_pretrained_ones(discs, target, tmp_path):
     """The paper's table 1, row 2: parameters are learnt in structures of the prior."""
-    settings = {**discs.short, "batches": 0, "batches_again": 0, "on_prior": True, "prior_if_worse": False}
-    learn = {"learn": BOTH, "threads": 1, "cache": False, "progress": False}
+    settings = {**discs.short, **discs.parameters, "batches": 0, "batches_again": 0, "on_prior": True}
+    settings["prior_if_worse"] = False
+    learn = {"learn": BOTH, "features": "count", "threads": 1, "cache": False, "progress": False}
     run = fit(str(discs.file), target.images, "quick", settings=settings, out=tmp_path / "run", **learn)
     seed_everything(batch_seed(run.record["seed"], 2))
     expected = run.new_guide()

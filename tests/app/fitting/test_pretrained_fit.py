@@ -17,10 +17,18 @@ from probscene.errors import RunError
 from probscene.inference.divergence import SHARE
 from probscene.inference.features.base import embed_all
 from probscene.inference.features.photographs import readability
+from probscene.inference.features.photographs.heads import PretrainedCountNet
 
 FEW = {"batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
 WORDS = ["--preset", "quick", "--threads", "1", "--no-verdict"]
 WORDS += [word for key, value in FEW.items() for word in ("--set", f"{key}={value}")]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_images_enter_the_heads():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PretrainedCountNet.__init__, "__defaults__", ((), 150, (128, 128)))
+        yield
 
 
 @pytest.fixture(scope="module")
