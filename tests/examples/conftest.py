@@ -1,5 +1,7 @@
 """Each example of a part of one's own, in a fit of a few seconds: by the command line and from Python."""
 
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,6 +10,8 @@ from typer.testing import CliRunner
 
 import probscene as ps
 from probscene.app.cli import app
+from probscene.app.modules import import_file
+from probscene.inference.features.pretrained import EfficientNetLite
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLETOP = EXAMPLES / "tabletop.py"
@@ -22,6 +26,7 @@ SHORT = {
     "learn": "structure",
     "batches": 2,
     "num_scenes": 20,
+    "draws_per_structure": 1,
 }
 FILES = ("features.safetensors", "real.safetensors", "guide.safetensors", "log.jsonl")
 
@@ -41,9 +46,35 @@ def _own_cache(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _few_and_small_images_are_looked_at():
+    """By a verdict."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
+        patch.setattr("probscene.app.evaluation.source_features.IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.SCENES", 60)
+        yield
+
+
 @pytest.fixture(scope="session")
 def call():
     return probscene
+
+
+@pytest.fixture
+def script(monkeypatch, capsys):
+    """``script(file, *words)``: its ``main`` here, without seconds of imports, as ``subprocess.run`` gives it."""
+
+    def run(file, *words):
+        monkeypatch.setattr(sys, "argv", [str(file), *map(str, words)])
+        try:
+            code = import_file(file).main()
+        except SystemExit as end:
+            code = end.code
+        said = capsys.readouterr()
+        return subprocess.CompletedProcess(words, code or 0, said.out, said.err)
+
+    return run
 
 
 @pytest.fixture(scope="session")
@@ -70,12 +101,10 @@ def both_ways(tmp_path_factory, tables):
     def fitted(words, options, model=TABLETOP, target=tables):
         folder = tmp_path_factory.mktemp("ways")
         short = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
-        common = ["--preset", "quick", "--threads", 1, "--seed", 3, "--no-cache", *short]
-        probscene("fit", model, "--target", target, "--out", folder / "command", *common, *words)
-        fit = ps.fit(
-            model, target, "quick", 3, settings=SHORT, threads=1, cache=False, progress=False,
-            out=folder / "python", **options,
-        )  # fmt: skip
+        common = ["--preset", "quick", "--features", "count", "--threads", 1, "--seed", 3, "--no-cache", "--no-verdict"]
+        probscene("fit", model, "--target", target, "--out", folder / "command", *common, *short, *words)
+        options = {"features": "count", "settings": SHORT, "threads": 1, "cache": False, "progress": False, **options}
+        fit = ps.fit(model, target, "quick", 3, out=folder / "python", **options)
         for name in FILES:
             assert (folder / "command" / name).read_bytes() == (fit.path / name).read_bytes(), name
         return SimpleNamespace(command=folder / "command", python=fit)
@@ -98,7 +127,8 @@ def goes_on(tmp_path, tables, monkeypatch):
             if line is not None and line["stage"] == stage:
                 raise Interrupted
 
-        options = {"preset": "quick", "settings": SHORT, "threads": 1, "cache": False, "progress": False, **options}
+        options = {"features": "count", "settings": SHORT, "threads": 1, "cache": False, "progress": False, **options}
+        options = {"preset": "quick", **options}
         whole = ps.fit(TABLETOP, tables, out=tmp_path / "whole", **options)
         kept = checkpoints.Checkpointer.__call__
         with monkeypatch.context() as patch:
