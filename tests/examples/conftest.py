@@ -1,5 +1,7 @@
 """Each example of a part of one's own, in a fit of a few seconds: by the command line and from Python."""
 
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +11,8 @@ from typer.testing import CliRunner
 import probscene as ps
 from probscene.app.cli import app
 from probscene.app.fitting.config import configuration
+from probscene.app.modules import import_file
+from probscene.inference.features.pretrained import EfficientNetLite
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLETOP = EXAMPLES / "tabletop.py"
@@ -23,6 +27,7 @@ SHORT = {
     "parameters": "none",
     "structure.batches": 2,
     "structure.num_scenes": 20,
+    "structure.draws_per_structure": 1,
 }
 EXECUTION = ps.Execution(threads=1, cache=False, progress=False)
 FILES = ("features.safetensors", "real.safetensors", "guide.safetensors", "log.jsonl")
@@ -48,9 +53,35 @@ def _own_cache(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _few_and_small_images_are_looked_at():
+    """By a verdict."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
+        patch.setattr("probscene.app.evaluation.source_features.IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.SCENES", 60)
+        yield
+
+
 @pytest.fixture(scope="session")
 def call():
     return probscene
+
+
+@pytest.fixture
+def script(monkeypatch, capsys):
+    """``script(file, *words)``: its ``main`` here, without seconds of imports, as ``subprocess.run`` gives it."""
+
+    def run(file, *words):
+        monkeypatch.setattr(sys, "argv", [str(file), *map(str, words)])
+        try:
+            code = import_file(file).main()
+        except SystemExit as end:
+            code = end.code
+        said = capsys.readouterr()
+        return subprocess.CompletedProcess(words, code or 0, said.out, said.err)
+
+    return run
 
 
 @pytest.fixture(scope="session")
@@ -78,9 +109,9 @@ def both_ways(tmp_path_factory, tables):
         folder = tmp_path_factory.mktemp("ways")
         settings = settings_for(options.get("features"))
         short = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-        common = ["--preset", "quick", "--threads", 1, "--seed", 3, "--no-cache", *short]
-        probscene("fit", model, "--target", target, "--out", folder / "command", *common, *words)
-        config = configuration(ps.preset("quick"), **options, settings=settings)
+        common = ["--preset", "quick", "--features", "count", "--threads", 1, "--seed", 3, "--no-cache", "--no-verdict"]
+        probscene("fit", model, "--target", target, "--out", folder / "command", *common, *short, *words)
+        config = configuration(ps.preset("quick"), **{"features": "count", **options}, settings=settings)
         fit = ps.fit(model, target, config, seed=3, out=folder / "python", execution=EXECUTION)
         for name in FILES:
             assert (folder / "command" / name).read_bytes() == (fit.path / name).read_bytes(), name
@@ -104,7 +135,8 @@ def goes_on(tmp_path, tables, monkeypatch):
             if line is not None and line["stage"] == stage:
                 raise Interrupted
 
-        config = configuration(ps.preset("quick"), **options, settings=settings_for(options.get("features")))
+        settings = settings_for(options.get("features"))
+        config = configuration(ps.preset("quick"), **{"features": "count", **options}, settings=settings)
         whole = ps.fit(TABLETOP, tables, config, out=tmp_path / "whole", execution=EXECUTION)
         kept = checkpoints.Checkpointer.__call__
         with monkeypatch.context() as patch:

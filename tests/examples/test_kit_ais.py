@@ -77,19 +77,19 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_bad_frames_are_named(fault, frames, tmp_path):
+def test_bad_frames_are_named(fault, frames, tmp_path, script):
     spoil, part = FAULTS[fault]
     spoil(frames)
-    done = run(frames, "--out", tmp_path / "out", "--held-out", "B3")
+    done = script(EXAMPLE, frames, "--out", tmp_path / "out", "--held-out", "B3")
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert part in done.stderr and done.stderr.startswith("kit_ais: expected ")
 
 
-def test_the_real_frames(data_dir, tmp_path):
+def test_the_real_frames(data_dir, tmp_path, script):
     data = data_dir / "aerial" / "kit_ais"
     if not data.is_dir():
         pytest.skip(f"no KIT AIS frames in {data}")
-    done = run(data, "--out", tmp_path, "--stride", "256")
+    done = script(EXAMPLE, data, "--out", tmp_path, "--stride", "256")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("frames times") == 3
     model = load_model("aerial2d")

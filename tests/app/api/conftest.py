@@ -14,7 +14,8 @@ def quick(discs) -> Callable[..., ps.Run]:
     ``configuration`` and ``TargetImages`` are its own."""
 
     def fit(model, target, preset="quick", settings=discs.short, threads=1, skip_bad=None, **options):
-        chosen = {name: options.pop(name) for name in ("features", "divergence", "guide") if name in options}
+        chosen = {"features": "count", "parameters": "none"} if isinstance(preset, str) else {}
+        chosen |= {name: options.pop(name) for name in ("features", "divergence", "guide") if name in options}
         if chosen.get("features", "count") != "count" and isinstance(settings, dict):
             settings = {key: value for key, value in settings.items() if not key.startswith("features.schedule.")}
             settings.pop("features.width", None)

@@ -116,8 +116,8 @@ def test_kitti_boxes_of_whole_silhouettes_have_none(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_workers_and_the_command_line_take_it(fitted, call, tmp_path):
+def test_the_command_line_takes_it(fitted, call, tmp_path):
     generate(RunFolder.at(fitted), 70, tmp_path / "one", options=DatasetOptions(box_margin=3))
-    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--box-margin", 3, "--workers", 2)
+    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--box-margin", 3)
     assert done.code == 0, done.err
     assert contents(tmp_path / "one") == contents(tmp_path / "two")

@@ -148,9 +148,9 @@ def test_what_is_no_fraction_is_refused(drawn, tmp_path, wrong):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_and_worker_processes_leave_out_the_same(call, fitted, tmp_path):
+def test_the_command_leaves_out_the_same(call, fitted, tmp_path):
     generate(RunFolder.at(fitted), 70, tmp_path / "one", options=DatasetOptions(min_visible=0.9))
-    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--min-visible", 0.9, "--workers", 2)
+    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--min-visible", 0.9)
     assert done.code == 0, done.err
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     refused = call("generate", fitted, "--num", 70, "--out", tmp_path / "two")

@@ -44,8 +44,8 @@ def test_the_whole_makes_what_shards_lack(run, undisturbed, tmp_path):
     assert contents(tmp_path / "out") == contents(undisturbed)
 
 
-def test_shards_at_once_two_of_them_killed_and_run_again(run, tmp_path):
-    out, num, shards = tmp_path / "out", 1000, 8
+def test_shards_at_once_one_of_them_killed_and_run_again(run, tmp_path):
+    out, num, shards = tmp_path / "out", 390, 3
     environment = {**os.environ, "PYTHONPATH": str(Path(probscene.__file__).parents[1])}
     command = [sys.executable, "-m", "probscene", "generate", run.path, "--num", num, "--out", out]
 
@@ -54,7 +54,7 @@ def test_shards_at_once_two_of_them_killed_and_run_again(run, tmp_path):
         return subprocess.Popen(shard, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     crew = [start(number) for number in range(shards)]
-    killed, waiting = (2, 5), {2, 5}
+    killed, waiting = (1,), {1}
     while waiting:
         for number in sorted(waiting):
             if crew[number].poll() is not None or list(out.glob(f"images/{64 * number:06d}.png")):

@@ -1,6 +1,5 @@
 """Structure, layout and looks: right where one knows how the target was drawn, and the whole is its worst part."""
 
-import functools
 import io
 import json
 import re
@@ -36,7 +35,6 @@ from probscene.app.views import verdict_text
 from probscene.dataset import ImageFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
-from probscene.inference.features import pretrained
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.statistics.residual import Grade, worst_grade
 from probscene.inference.statistics.verdict import Verdict
@@ -74,7 +72,6 @@ def quiet(*_):
 def fewer_images():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(source_features, "NUM_IMAGES", 100)
-        patch.setattr(pretrained, "EfficientNetLite", functools.partial(pretrained.EfficientNetLite, 96))
         yield
 
 

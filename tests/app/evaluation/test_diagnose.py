@@ -1,6 +1,5 @@
 """The verdict on real renders: right where one knows it, held against labels, shown by both commands."""
 
-import functools
 import html
 import json
 import re
@@ -24,7 +23,6 @@ from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.features import pretrained
 from probscene.inference.statistics.residual import Grade, worst_grade
 from probscene.inference.statistics.verdict import Verdict
 from probscene.structure import StructurePrior, counts, weights
@@ -34,13 +32,6 @@ IMAGES, SCENES = 200, 300
 
 def quiet(*_):
     pass
-
-
-@pytest.fixture(scope="module", autouse=True)
-def fewer_and_smaller_looks():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pretrained, "EfficientNetLite", functools.partial(pretrained.EfficientNetLite, 96))
-        yield
 
 
 class Guided(RunFolder):

@@ -60,7 +60,10 @@ def test_the_second_fit_takes_it_and_has_the_same_bytes(fit, discs, whole, fitte
 
 
 def test_python_takes_it_too(discs, target, whole, fitted, capsys):
-    config, execution = ps.preset("quick").set(discs.short), ps.Execution(threads=1, cache=whole)
+    config, execution = (
+        ps.preset("quick").set("features=count", "parameters=none", discs.short),
+        ps.Execution(threads=1, cache=whole),
+    )
     run = ps.fit(discs.file, target.images, config, execution=execution)
     assert "was trained before" in " ".join(capsys.readouterr().err.split()) and same(run, fitted)
 
@@ -82,7 +85,7 @@ OTHERS = {
 @pytest.mark.parametrize("what", OTHERS)
 def test_another_one_is_another_entry(fit, discs, whole, what):
     unread = ("features",) if what == "network" else ()
-    words = [word for word in discs.without(*unread) if word != "--no-cache"]
+    words = [word for word in discs.without("parameters", *unread) if word != "--no-cache"] + ["--learn", "structure"]
     assert not fit(discs.file, *OTHERS[what], words=words)[1]
     assert fit(discs.file, *OTHERS[what], words=words)[1]
     assert len(list((whole / "features").glob("*.safetensors"))) == 2
@@ -122,7 +125,8 @@ def test_features_in_a_file_are_known_by_its_bytes_and_their_weights(fit, discs,
     part.write_text(PART.format(weights=str(weights)))
     weights.write_text("0.5")
     own = ["--features", f"{part}:Own"]
-    words = [word for word in discs.without("features") if word != "--no-cache"]
+    words = [word for word in discs.without("features", "parameters") if word != "--no-cache"]
+    words += ["--learn", "structure"]
     assert not fit(discs.file, *own, words=words)[1] and fit(discs.file, *own, words=words)[1]
     weights.write_text("0.25")  # as where pretrained ones are another version's
     assert not fit(discs.file, *own, words=words)[1]
@@ -209,7 +213,12 @@ def test_a_cache_that_cannot_be_written_does_no_harm(fit, discs, fitted, tmp_pat
 def test_models_and_features_in_memory_are_not_kept(discs, target, tmp_path):
     model = replace(ps.load_model(discs.file), name="in memory")
     execution = ps.Execution(threads=1, progress=False, cache=tmp_path / "cache")
-    ps.fit(model, target.images, ps.preset("quick").set(discs.short), execution=execution)
+    ps.fit(
+        model,
+        target.images,
+        ps.preset("quick").set("features=count", "parameters=none", discs.short),
+        execution=execution,
+    )
     assert not (tmp_path / "cache").exists()
 
 

@@ -46,13 +46,8 @@ def test_its_guide_reaches_lists_that_the_prior_never_has(tmp_path):
 
 def test_without_batches_structures_stay_the_pretrained_ones(discs, target, tmp_path):
     """The paper's table 1, row 2: parameters are learnt in structures of the prior."""
-    settings = {
-        **discs.short,
-        "structure.batches": 0,
-        "refine.batches": 0,
-        "pretrain.on_prior": True,
-        "fallback_to_prior": False,
-    }
+    settings = {"features": "count", **discs.short, **discs.parameters, "structure.batches": 0, "refine.batches": 0}
+    settings |= {"pretrain.on_prior": True, "fallback_to_prior": False}
     execution = Execution(1, cache=False, progress=False)
     run = fit(str(discs.file), target.images, QUICK.set(settings), out=tmp_path / "run", execution=execution)
     seed_everything(batch_seed(run.record["seed"], 2))

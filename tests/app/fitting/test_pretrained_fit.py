@@ -17,11 +17,19 @@ from probscene.errors import RunError
 from probscene.inference.divergence import SELF_SHARE
 from probscene.inference.features.base import embed_all
 from probscene.inference.features.photographs import readability
+from probscene.inference.features.photographs.net import PretrainedCountNet
 from probscene.inference.statistics.verdict import Verdict
 
 FEW = {"structure.batches": 2, "structure.num_scenes": 25, "pretrain.derivations": 50, "pretrain.epochs": 1}
 WORDS = ["--preset", "quick", "--threads", "1", "--no-verdict"]
 WORDS += [word for key, value in FEW.items() for word in ("--set", f"{key}={value}")]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_images_enter_the_heads():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PretrainedCountNet.__init__, "__defaults__", ((), 150, (128, 128)))
+        yield
 
 
 @pytest.fixture(scope="module")

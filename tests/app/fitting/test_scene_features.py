@@ -14,6 +14,7 @@ from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.image_array import ImageArray
 from probscene.inference.features.base import embed_all
+from probscene.inference.features.pretrained import EfficientNetLite
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +51,9 @@ def test_the_target_is_seen_as_the_fit_has_seen_it(run, target):
 
 
 @pytest.mark.parametrize("name", ["multi_mnist", "aerial2d"])
-def test_other_structures_and_layouts_do_not_look_unlike_and_photographs_do(name):
+def test_other_structures_and_layouts_do_not_look_unlike_and_photographs_do(name, monkeypatch):
     """Of these rows of upright digits each image's nearest neighbour is another one, not a render."""
+    monkeypatch.setattr(EfficientNetLite.__init__, "__defaults__", (224,))
     model = load_model(name)
     target = model.target(0)
     drawn = torch.cat(list(seen.images_of(target, target.prior, seen.ASKED, seed=2)))
