@@ -142,7 +142,7 @@ def _of_nodes(name: str, kinds: list[str], grammar: Grammar, classes: tuple[str,
 
 def occurs_once(grammar: Grammar, kinds: list[str]) -> bool:
     """Whether every scene that a grammar derives has exactly one node of some kinds."""
-    process = Branching(grammar, Support(grammar, grammar.legal[:, None, None]).uniform().table)
+    process = Branching(grammar, Support(grammar, grammar.legal[:, None, None]).uniform_table())
     numbers = [grammar.kind(kind) for kind in kinds]
     nodes = np.isin(grammar.objects.numpy()[process.rule], numbers).sum(1)
     return process.max_total(nodes) == -process.max_total(-nodes) == 1
