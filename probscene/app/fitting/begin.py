@@ -9,7 +9,7 @@ from typing import Any
 import probscene
 from probscene.dataset import Images
 from probscene.decoding import checked_range
-from probscene.errors import ModelError, ProbsceneError, RunError
+from probscene.errors import DataError, ModelError, ProbsceneError, RunError
 from probscene.inference.features.base import Features
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
@@ -114,7 +114,7 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
     """
     model, target, config = request.model, request.target, request.config
     if model is None or target is None or target.source is None or config is None:
-        raise ProbsceneError(
+        raise DataError(
             "expected a model and target images (MODEL and --target DIR), got one missing; only a run that is resumed "
             "goes without them."
         )

@@ -8,8 +8,6 @@ import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from pathlib import Path
-from types import ModuleType
 from typing import Any, ClassVar, Union, cast, get_args, get_origin, get_type_hints
 
 from probscene.errors import ModelError, ProbsceneError
@@ -305,10 +303,12 @@ class FitConfig:
             elif key.startswith("divergence.") and not _has(changed, key.split(".")):
                 continue  # of a kernel that the divergence does not have
             else:
-                try:
-                    changed = _with(changed, key.split("."), value)
-                except ProbsceneError as error:
-                    raise ModelError(f"In {type(made).__name__}.settings: {error}") from error
+                if not _has(changed, key.split(".")):
+                    raise ModelError(
+                        f"expected paths of a configuration from {type(made).__name__}.settings, such as "
+                        f"'structure.batches', got {key!r}."
+                    )
+                changed = _with(changed, key.split("."), value)
         return changed
 
     def with_divergence(self, choice: str | Divergence) -> "FitConfig":
@@ -376,18 +376,17 @@ class FitConfig:
         return next((word for word, made in METHODS.items() if isinstance(self.parameters, made)), None)
 
     def plugins(self) -> Plugins:
-        """The user's own parts, checked; a file of several is executed once. None for the library's, and for what was
+        """The user's own parts, checked. None for the library's, and for what was
         in memory alone.
 
         Raises:
             ModelError: one that is no such part, or see ``load_part``.
         """
-        imported: dict[Path, ModuleType] = {}
         own: dict[str, Any] = {}
         for name, check in (("features", as_features), ("divergence", as_divergence), ("guide", as_guide_maker)):
             part = getattr(self, name)
             if isinstance(part, str):
-                part = load_part(part, imported) if is_file_part(part) else None
+                part = load_part(part) if is_file_part(part) else None
             elif isinstance(part, _CHOICES[name]):
                 part = None
             own[name] = None if part is None else check(part)

@@ -7,6 +7,7 @@ product an hour later. Axis letters: N scenes, L images, D features, T steps, K 
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -24,7 +25,7 @@ from probscene.inference.features.base import FeatureNet, Features, Fixed
 from probscene.inference.guides.base import Guide
 from probscene.policy import Policy
 
-from ..modules import import_file
+from ..modules import file_digest, import_file, module_digests
 
 IN_MEMORY = "object:"  # begins the word that a run records of a part that is no file's
 
@@ -61,22 +62,24 @@ def lasting_word(word: str) -> str:
     return f"{part_file(word).resolve()}:{word.rpartition(':')[2]}" if is_file_part(word) else word
 
 
-def load_part(word: str, imported: dict[Path, ModuleType] | None = None) -> Any:
-    """What ``FILE.py:NAME`` names.
-
-    Args:
-        imported: modules by file, so that a file of several parts is executed once; it is added to them.
+def load_part(word: str) -> Any:
+    """What ``FILE.py:NAME`` names. A file is executed once, as long as neither it nor what it imports from beside it
+    changes.
 
     Raises:
         ModelError: the file does not import, or has no such name.
     """
     file, name = part_file(word), word.rpartition(":")[2]
-    modules = {} if imported is None else imported
-    if file not in modules:
-        modules[file] = import_file(file)
-    if not hasattr(modules[file], name):
+    digests = {"": file_digest(file), **module_digests(file)} if file.is_file() else {}
+    module = _imported(file.resolve(), tuple(sorted(digests.items())))
+    if not hasattr(module, name):
         raise ModelError(f"expected {name!r} in {file}, got none; write FILE.py:NAME with a name that it has.")
-    return getattr(modules[file], name)
+    return getattr(module, name)
+
+
+@cache
+def _imported(file: Path, digests: tuple[tuple[str, str], ...]) -> ModuleType:
+    return import_file(file)
 
 
 def as_features(given: Any) -> Features:

@@ -89,7 +89,7 @@ class Storage:
         record, config, preset = self.record, self.record.get("config", {}), self.record.get("preset", {})
         parts = {"features": preset.get("features"), "divergence": preset.get("objective")}
         parts["guide"] = record.get("guide", {}).get("kind")
-        parts = {"model": record.get("model"), **(config or parts)}
+        parts = {"model": record.get("model")} | {name: (config or parts).get(name) for name in parts}
         words = {name: word for name, word in parts.items() if isinstance(word, str)}
         return {name: word[len(IN_MEMORY) :] for name, word in words.items() if word.startswith(IN_MEMORY)}
 

@@ -125,7 +125,7 @@ PARTS = {
     "no network": ({"features": 5}, r"features with a name and build\(model\), .* got int"),
     "half of them": ({"features": Half()}, r"Half without training, adapt, .*; subclass probscene\.Features"),
     "built no network": ({"features": NoNet()}, r"NoNet\.build a network with names.* got Linear"),
-    "odd settings": ({"features": OddSettings()}, r"OddSettings\.settings a dict .* got batchs"),
+    "odd settings": ({"features": OddSettings()}, r"paths .* OddSettings\.settings.* got 'batchs'"),
     "a class": ({"features": NeedsMore}, r"without arguments, got NeedsMore\(size\)"),
     "one cost": ({"divergence": lambda g, r: (g.mean() - r.mean()).abs()}, r"one cost a generated scene \(N,\).* \(\)"),
     "of features": ({"features": OddDivergence()}, r"one cost a generated scene \(N,\)"),
@@ -190,7 +190,7 @@ TARGETS = {
     "a generator": ((image for image in IMAGES), "with a length .* got generator"),
     "a dictionary": (dict(enumerate(IMAGES)), "images by number, got dict"),
     "a set": ({"a.png", "b.png"}, "images by number, got set"),
-    "nothing": (None, "expected as target a folder, .* got NoneType"),
+    "nothing": (None, "expected a model and target images .* got one missing"),
     "a missing folder": ("nowhere", "got nowhere, which is not there"),
     "missing files": (["a.png", "b.png"], "got 2 of 2 bad: a.png cannot be read"),
 }
