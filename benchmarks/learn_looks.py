@@ -32,7 +32,7 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.learnt_parameters import NAME, beside, learnt_by
+from probscene.app.fitting.learnt_parameters import NAME, learnt_by, prefixed
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.store import timing
@@ -109,7 +109,7 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
     run = fit(args.model, folder / "images", config, out=out, seed=seed, resume=True, execution=execution)
     tensors = run.read_tensors(NAME)
     learnt = (
-        learnt_by(model, run.config, run.parameters, run.guide, beside(tensors)).with_parameters(model)
+        learnt_by(model, run.config, run.parameters, run.guide, prefixed(tensors)).with_parameters(model)
         if tensors
         else model
     )

@@ -30,7 +30,7 @@ from probscene.app.api.fit import fit
 from probscene.app.chunks import CHUNK, draw_chunk
 from probscene.app.files import write_json
 from probscene.app.fitting.config import LIKELIHOOD
-from probscene.app.fitting.learnt_parameters import NAME, beside, learnt_by
+from probscene.app.fitting.learnt_parameters import NAME, learnt_by, prefixed
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
@@ -116,7 +116,7 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
     panels, tensors = [], run.read_tensors(NAME)
     suits = None
     if tensors:
-        suits = learnt_by(run.model, run.config, run.parameters, run.guide, beside(tensors)).with_parameters
+        suits = learnt_by(run.model, run.config, run.parameters, run.guide, prefixed(tensors)).with_parameters
     for source in SOURCES:
         policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
         policy.suits = suits if source in ("parameters", "both") else None

@@ -31,7 +31,7 @@ class Divergence(Protocol):
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor: ...
 
 
-def anscombe(features: Tensor) -> Tensor:
+def anscombe_transform(features: Tensor) -> Tensor:
     """``2 sqrt(x + 3/8)`` less its value at 0, of the same shape: Poisson counts come out with a variance of about 1,
     whatever their mean [4]. Below 0, where networks may read, it is odd."""
     return 2 * features.sign() * ((features.abs() + 0.375).sqrt() - math.sqrt(0.375))
@@ -72,7 +72,7 @@ class KDELogRatio:
             rare: the paper keeps it in.
         equal_sizes: estimate both densities from as many scenes. The larger sample is split into parts about as large
             as the smaller one, and the log densities of the parts are averaged, which are all too low by as much.
-        stabilised: compare counts after Anscombe's transformation (not in the paper). A network is farther off the more
+        anscombe: compare counts after Anscombe's transformation (not in the paper). A network is farther off the more
             there is, so that one kernel in counts is too wide for what is rare or too narrow for what there is much of.
             Near a count x a variance v is then about one of ``v x`` in counts.
 
@@ -84,10 +84,10 @@ class KDELogRatio:
     marginal_variance: float | None = 0.1
     leave_one_out: bool = True
     equal_sizes: bool = False
-    stabilised: bool = False
+    anscombe: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        generated, real = _transformed(generated, real, self.stabilised)
+        generated, real = _transformed(generated, real, self.anscombe)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         cost = self.cost_of_log_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
         if self.marginal_variance is not None and generated.shape[1] > 1:
@@ -129,15 +129,15 @@ class MMD:
         variance: of the kernel; None is the feature dimension.
         shared: every scene pays the one discrepancy of the batch (the baseline of [1], which cannot assign credit);
             otherwise each pays its own witness value ``2 (E k(x, G) - E k(x, R))``, the same gradient in expectation.
-        stabilised: as of ``KDELogRatio``.
+        anscombe: as of ``KDELogRatio``.
     """
 
     variance: float | None = 1.0
     shared: bool = True
-    stabilised: bool = False
+    anscombe: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        generated, real = _transformed(generated, real, self.stabilised)
+        generated, real = _transformed(generated, real, self.anscombe)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         N, L = len(generated), len(real)
         within = torch.exp(-0.5 / variance * _squared_distances(generated, generated)).fill_diagonal_(0.0)
@@ -230,10 +230,10 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
     return (a.square().sum(1, keepdim=True) + b.square().sum(1) - 2 * a @ b.T).clamp_(min=0.0)
 
 
-def _transformed(generated: Tensor, real: Tensor, stabilised: bool) -> tuple[Tensor, Tensor]:
-    """Features, checked, and transformed where they are to be stabilised."""
+def _transformed(generated: Tensor, real: Tensor, anscombe: bool) -> tuple[Tensor, Tensor]:
+    """Features, checked, and transformed where they are to be transformed."""
     _check_features(generated, real)
-    return (anscombe(generated), anscombe(real)) if stabilised else (generated, real)
+    return (anscombe_transform(generated), anscombe_transform(real)) if anscombe else (generated, real)
 
 
 def _check_features(generated: Tensor, real: Tensor) -> None:

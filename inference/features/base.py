@@ -295,6 +295,6 @@ def slow_settings(config: Any) -> dict[str, Any]:
         "structure.draws_per_structure": 1,
         "structure.learning_rate": min(config.structure.learning_rate, 5e-3),
         "divergence.marginal_variance": None,
-        "divergence.stabilised": False,
+        "divergence.anscombe": False,
         "divergence.variance": None if getattr(config.divergence, "variance", 1.0) is None else 1.0,
     }

@@ -90,5 +90,5 @@ class PretrainedCountFeatures(Features):
             "structure.prior_kl_weight": max(weight, 0.1) if weight else 0.0,
             "divergence.variance": None if getattr(config.divergence, "variance", 1.0) is None else 1.0,
             "divergence.marginal_variance": 0.1,
-            "divergence.stabilised": False,
+            "divergence.anscombe": False,
         }

@@ -145,7 +145,7 @@ class TiltingLearning(TrainingLoop):
         if self.chosen.any():
             of = values.scene[:, self.chosen]
             v, sure = explained_part(of, normalised_sum(of, freed))
-            weight = tilted_weights(v, 1 - sure * (1 - self.schedule.kept))
+            weight = tilted_weights(v, 1 - sure * (1 - self.schedule.ess_fraction))
             _Weighted(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
         return sum(apart for _, apart in each)
 
@@ -226,7 +226,7 @@ def basis(u: Tensor) -> Features:
     return x - x.mean(0)
 
 
-def tilted_weights(w: Features, kept: float) -> Features:
+def tilted_weights(w: Features, ess_fraction: float) -> Features:
     """Weights ``(N,)`` in proportion to exp(-eta w), of which so many are effective as ``kept`` says, a share."""
     z = -(w - w.mean()) / max(float(w.std()), 1e-12)
 
@@ -235,9 +235,9 @@ def tilted_weights(w: Features, kept: float) -> Features:
         return found / found.sum()
 
     def more(eta: float) -> float:
-        return 1 / np.square(weight(eta)).sum() / len(w) - kept
+        return 1 / np.square(weight(eta)).sum() / len(w) - ess_fraction
 
-    if kept >= 1:
+    if ess_fraction >= 1:
         return weight(0.0)
     return weight(root_scalar(more, bracket=(0.0, MAX_ETA)).root if more(MAX_ETA) < 0 else MAX_ETA)
 

@@ -140,7 +140,7 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
     if images.value_range is not None:
         record["value_range"] = list(images.value_range)
     if files := {part_file(word) for word in config.words().values() if is_file_part(word)}:
-        files |= {beside for file in files for beside in neighbours(file).values()}
+        files |= {prefixed for file in files for prefixed in neighbours(file).values()}
         record["parts"] = {str(file): file_digest(file) for file in sorted(files)}
     # Built before the folder is, so that a wrong one leaves none behind.
     run, labels = make(out, record, loaded, plugins), None

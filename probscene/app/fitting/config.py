@@ -693,7 +693,16 @@ def _flat(record: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield from _flat(value, f"{path}.{name}".lstrip("."))
 
 
-_FORMER_NAMES = {"candidates": "draws_per_structure", "leak": "incompletion_weight", "anchor": "prior_kl_weight"}
+_FORMER_NAMES = {
+    "candidates": "draws_per_structure",
+    "leak": "incompletion_weight",
+    "anchor": "prior_kl_weight",
+    "kept": "ess_fraction",
+}
+
+
+def _renamed(record: dict[str, Any]) -> dict[str, Any]:
+    return {_FORMER_NAMES.get(key, key): _tuples(value) for key, value in record.items()}
 
 
 def from_flat_preset(record: dict[str, Any], guide: dict[str, Any]) -> FitConfig:
@@ -703,21 +712,19 @@ def from_flat_preset(record: dict[str, Any], guide: dict[str, Any]) -> FitConfig
         record: its ``preset``.
         guide: its ``guide``.
     """
-    old: dict[str, Any] = {
-        _FORMER_NAMES.get(key, key): tuple(v) if isinstance(v, list) else v for key, v in record.items()
-    }
+    old = _renamed(record)
 
     def some(made: type, **names: str) -> dict[str, Any]:
         """Arguments of a class: those of its fields that the record has, under their names of then."""
         known = {one.name: names.get(one.name, one.name) for one in fields(made)}
         return {name: old[then] for name, then in known.items() if then in old}
 
-    kernel = some(KDELogRatio)
+    kernel = some(KDELogRatio, anscombe="stabilised")
     word = old.get("objective", "kde")
     divergence: Any = word
     if word in ("mmd", "witness"):
         divergence = MMD(
-            shared=word == "mmd", **{name: kernel[name] for name in ("variance", "stabilised") if name in kernel}
+            shared=word == "mmd", **{name: kernel[name] for name in ("variance", "anscombe") if name in kernel}
         )
     elif word in DIVERGENCES:
         divergence = (JensenShannon if word == "js" else KDELogRatio)(**kernel)
@@ -725,7 +732,9 @@ def from_flat_preset(record: dict[str, Any], guide: dict[str, Any]) -> FitConfig
     settings = {name: value for name, value in guide.items() if name != "kind"}
     schedules = {LIKELIHOOD: "parameters", TILTING: "tilting", META_SIM: "meta_sim"}
     method = old.get("parameter_method", LIKELIHOOD)
-    parameters = METHODS[method](**old.get(schedules[method], {})) if old.get("learn", STRUCTURE) == BOTH else None
+    parameters = (
+        METHODS[method](**_renamed(old.get(schedules[method], {}))) if old.get("learn", STRUCTURE) == BOTH else None
+    )
     return FitConfig(
         features=_former_features(old, some),
         divergence=divergence,

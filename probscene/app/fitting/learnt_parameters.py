@@ -16,12 +16,12 @@ from .config import META_SIM, FitConfig
 NAME = "parameters"  # of the file with the record, and before the names of tensors beside a guide's
 
 
-def beside(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def prefixed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Tensors of learnt parameters under the names that they have beside a guide's."""
     return {f"{NAME}.{key}": value for key, value in tensors.items()}
 
 
-def apart(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def split_tensors(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """A guide's own tensors, and those of parameters beside them."""
     own = {key: value for key, value in tensors.items() if not key.startswith(f"{NAME}.")}
     return own, {key: value for key, value in tensors.items() if key not in own}
@@ -47,7 +47,7 @@ def learnt_by(
         config: of the run.
         record: of the run's parameters, see ``Storage.parameters``.
         policy: of the structures.
-        tensors: see ``beside``.
+        tensors: see ``prefixed``.
     """
     fitted = [site for site in record["sites"] if site.get("fitted", site["learnt"])]
     sites = tuple(Site(site["name"], tuple(site["kinds"])) for site in fitted)

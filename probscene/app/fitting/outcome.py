@@ -23,7 +23,7 @@ from probscene.sampling import sample, seed_everything
 
 from ..labels.partial_labels import PartialLabels
 from ..progress import Progress
-from .learnt_parameters import NAME, beside
+from .learnt_parameters import NAME, prefixed
 from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import PRIOR_KEPT, RunFolder
 
@@ -63,7 +63,7 @@ def conclude(
         labels: of some of the images.
     """
     if not run.config.fallback_to_prior:
-        run.write_tensors("guide", guide.state_dict() | beside(run.read_tensors(NAME) or {}))
+        run.write_tensors("guide", guide.state_dict() | prefixed(run.read_tensors(NAME) or {}))
         return ""
     which = feature_mask(net)
     which = slice(None) if which is None else which
@@ -81,25 +81,25 @@ def conclude(
             progress("outcome", i * number + first + len(parts[-1]), 2 * number, "")
         found.append(torch.cat(parts)[:, which].double().numpy())
         numbers.append(torch.cat(counts).double())
-    apart = bootstrap_test(found[0], found[1], real[:, which].double().numpy())
+    test = bootstrap_test(found[0], found[1], real[:, which].double().numpy())
     record: dict[str, Any] = {
         "kept": "learnt",
         "scenes": number,
-        "learnt": apart.distance,
-        "prior": apart.baseline_distance,
+        "learnt": test.distance,
+        "prior": test.baseline_distance,
     }
-    if not apart.significant:
+    if not test.significant:
         unread = run.unread
         kinds = {kind: i for i, kind in enumerate(run.model.grammar.kinds) if kind in unread}
         changed = moved(numbers[0], numbers[1], kinds)
         worse = {} if labels is None else worse_than_labels(labels, _class_counts(net, found[0], which))
         more = {"moved": changed, "worse_than_labels": worse}
         run.write_outcome(record | {name: what for name, what in more.items() if what})
-        run.write_tensors("guide", guide.state_dict() | beside(run.read_tensors(NAME) or {}))
+        run.write_tensors("guide", guide.state_dict() | prefixed(run.read_tensors(NAME) or {}))
         return " ".join(filter(None, (_said(changed), _worse_said(worse))))
     because = (
-        f"Learnt scenes are farther from the target than the prior's, {apart.distance:.2f} against "
-        f"{apart.baseline_distance:.2f} in energy distance of the features"
+        f"Learnt scenes are farther from the target than the prior's, {test.distance:.2f} against "
+        f"{test.baseline_distance:.2f} in energy distance of the features"
     )
     run.write_tensors(REJECTED, guide.state_dict())
     _keep_prior(run, record | {"kept": "prior", "because": because})

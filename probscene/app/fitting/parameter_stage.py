@@ -27,11 +27,11 @@ from probscene.scenarios import JointGrammar
 from ..progress import Progress
 from .config import LIKELIHOOD
 from .image_level import ImageLevelTraining, meta_sim_learning, sites_record, tilting_learning
-from .learnt_parameters import NAME, beside, with_parameters
+from .learnt_parameters import NAME, prefixed, with_parameters
 from .plugins import inner
 from .rendered_features import RenderedFeatures
 from .run import RunFolder
-from .site_selection import held_out, select_sites, settling
+from .site_selection import held_out, prior_site_selector, select_sites
 from .store import Checkpointer
 
 READER = "reader"  # of the file with what finds objects, until structure was learnt again
@@ -81,7 +81,9 @@ def learn_parameters(
                 schedule,
                 batch_seed(run.record["seed"], 5),
                 held_out(run, guide, _some(target, held, JUDGED)),
-                settling(run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED), schedule.sure),
+                prior_site_selector(
+                    run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED), schedule.sure
+                ),
             )
         elif isinstance(schedule, MetaSimSchedule):
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
@@ -104,7 +106,7 @@ def learn_parameters(
         run.write_tensors(NAME, kept)
         (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
     say(_said(run.parameters))
-    with_parameters(run.model, run.config, run.parameters, guide, beside(kept))
+    with_parameters(run.model, run.config, run.parameters, guide, prefixed(kept))
 
 
 def _some(images: Images, which: Tensor, most: int) -> Tensor:

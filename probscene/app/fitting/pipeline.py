@@ -36,7 +36,7 @@ from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import RunFolder
 from .scene_features import fingerprint
 from .store import OTHER, TIMING, Checkpointer, load_state, state_of, timing
-from .structure_stage import AGAIN, FIRST, learn_structure, learn_structure_again
+from .structure_stage import AGAIN, FIRST, learn_structure, refine_structure
 
 STAGES = (
     "reading", "likeness", "looking", "features", "readings", "target", "pretraining", "structure", "parameters",
@@ -128,7 +128,7 @@ def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, clust
             if run.config.parameters is not None:
                 with threads(run.record["threads"]):
                     learn_parameters(run, observer, net.net, guide, images, show, show.say)
-                learn_structure_again(run, net.net, real, guide, images, show, cluster)
+                refine_structure(run, net.net, real, guide, images, show, cluster)
             message = conclude(run, observer, net.net, real[: len(images())], guide, begun.labels, show)
     for name in (f"{FIRST}-checkpoint", f"{AGAIN}-checkpoint", READER):
         (run.path / f"{name}.safetensors").unlink(missing_ok=True)

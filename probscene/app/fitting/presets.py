@@ -41,7 +41,7 @@ STREET = FitConfig(
             blocks=(1, 3),
         )
     ),
-    divergence=JensenShannon(stabilised=True),
+    divergence=JensenShannon(anscombe=True),
     structure=ScoreFunctionTraining(prior_kl_weight=0.03, draws_per_structure=1),
     parameters=ParameterSchedule(scene_renders=12288, round_scene_renders=4096, sure=True),
 )

@@ -20,7 +20,7 @@ from ..loading import BUILT_IN, assets_record, lasting_reference, load_model, re
 from ..modules import file_digest
 from ..neighbours import neighbours
 from .config import FitConfig, GuideConfig, from_flat_preset
-from .learnt_parameters import apart, with_parameters
+from .learnt_parameters import split_tensors, with_parameters
 from .plugins import (
     IN_MEMORY,
     Plugins,
@@ -81,24 +81,24 @@ class RunFolder(Storage):
         check_free(path := Path(path))
         if isinstance(model, SceneModel):
             reference, file, digest, loaded = f"{IN_MEMORY}{model.name}", None, None, model
-            beside = {}
+            prefixed = {}
         else:
             loaded = loaded or load_model(model, assets)
             reference, name = lasting_reference(model), split_reference(model)[0]
             file = None if name in BUILT_IN else Path(name)
             digest = None if file is None else file_digest(file)
-            beside = {} if file is None else neighbours(file)
+            prefixed = {} if file is None else neighbours(file)
         make_folder(path)
         about: dict[str, Any] = {"format": FORMAT, "model": reference, "model_sha256": digest}
-        if beside:
-            about["modules"] = {name: file_digest(each) for name, each in beside.items()}
+        if prefixed:
+            about["modules"] = {name: file_digest(each) for name, each in prefixed.items()}
         about |= assets_record(loaded, assets)
         about |= {"within_support": not record.get("config", {}).get("pretrain", {}).get("on_prior")}
         run = cls(path, record | about, loaded, plugins)
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
         if file is not None:
             write_whole(path / "model.py", lambda temporary: shutil.copyfile(file, temporary))
-            for name, each in {file.name: file, **beside}.items() if beside else ():
+            for name, each in {file.name: file, **prefixed}.items() if prefixed else ():
                 make_folder((path / WHOLE_MODEL / name).parent)
                 write_whole(path / WHOLE_MODEL / name, partial(shutil.copyfile, each))
         return run
@@ -261,10 +261,10 @@ class RunFolder(Storage):
             return self.model.prior
         guide = self.new_guide()
         try:
-            guide.load_state_dict(apart(tensors)[0])
+            guide.load_state_dict(split_tensors(tensors)[0])
         except RuntimeError as error:
             raise RunError(f"expected a guide for model {self.model.name} in {self.path}, got another.") from error
-        return with_parameters(self.model, self.config, self.parameters, guide.eval(), apart(tensors)[1])
+        return with_parameters(self.model, self.config, self.parameters, guide.eval(), split_tensors(tensors)[1])
 
     def check_finished(self) -> None:
         """See that there is a learnt guide.

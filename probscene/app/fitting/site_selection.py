@@ -41,7 +41,7 @@ class SiteSelection(NamedTuple):
             it is not surely nearer. Unless the schedule says so, none is passed without which renders are surely
             farther. Where they are surely farther all the same, all are passed but those that bring them nearer alone.
             With the others the guide is kept, unless its renders are surely farther then.
-        because: by learnt site that keeps its prior whatever else is learnt, why; see ``of_unclear``.
+        because: by learnt site that keeps its prior whatever else is learnt, why; see ``reset_low_skill_sites``.
         sites: by learnt site, what is read of u with the prior's parameters, with the learnt ones, and in the images:
             21 quantiles of each, and Wasserstein-1 distances from the images; the floor is that of their two halves.
     """
@@ -59,7 +59,7 @@ def select_sites(
     more: Callable[[], Tensor],
 ) -> SiteSelection:
     """By images ``held (L, C, H, W)`` and as many renders of each; their looks are EfficientNet's pooled features.
-    Which sites are learnt takes ``more`` of them to tell, see ``settling`` and ``of_unclear``."""
+    Which sites are learnt takes ``more`` of them to tell, see ``prior_site_selector`` and ``reset_low_skill_sites``."""
     learnt = learning.guide
     if learnt is None:
         return SiteSelection({"kept": "prior"}, {}, {})
@@ -68,7 +68,7 @@ def select_sites(
     real = look(held) if judge is None else judge.real
 
     def drawn(name: str, model: SceneModel) -> Features:
-        images[name] = _compared(run, model, guide, len(held), name)
+        images[name] = _renders_of(run, model, guide, len(held), name)
         return look(images[name])
 
     of_prior = drawn("prior", run.model)
@@ -76,8 +76,8 @@ def select_sites(
     def compared() -> BootstrapTest:
         return bootstrap_test(drawn("learnt", learnt.with_parameters(run.model)), of_prior, real)
 
-    apart = compared()
-    kept, because = "learnt" if apart.distance < apart.baseline_distance else "prior", dict[str, str]()
+    test = compared()
+    kept, because = "learnt" if test.distance < test.baseline_distance else "prior", dict[str, str]()
     if isinstance(learning, ParameterLearning) and isinstance(learnt, ParameterGuide):
         well = frozenset(
             learning.select_prior_sites(learning, True) if learning.prior_sites is None else learning.prior_sites
@@ -85,19 +85,19 @@ def select_sites(
         badly = frozenset[str]()
         if learning.calibrated.low_skill_sites:
             seed_everything(batch_seed(run.record["seed"], 6, 4))
-            badly, because = of_unclear(learning, more(), well)
+            badly, because = reset_low_skill_sites(learning, more(), well)
         learnt.prior_sites = well | badly
         if learnt.prior_sites:
-            apart = compared()
-        if apart.significant and judge is not None:
+            test = compared()
+        if test.significant and judge is not None:
             learnt.prior_sites = uninformative_sites(learnt, judge) | because.keys()
-            apart = compared()
-        kept = "prior" if apart.significant or len(learnt.prior_sites) == len(learnt.sites) else "learnt"
+            test = compared()
+        kept = "prior" if test.significant or len(learnt.prior_sites) == len(learnt.sites) else "learnt"
         if kept == "prior":
             learnt.prior_sites = frozenset()
     if isinstance(learning, TiltingLearning) and not learning.learnt:
         kept = "prior"
-    distances = {"kept": kept, "learnt": apart.distance, "prior": apart.baseline_distance}
+    distances = {"kept": kept, "learnt": test.distance, "prior": test.baseline_distance}
     if not isinstance(learning, ParameterLearning):  # which reads nothing
         return SiteSelection(distances, {}, {})
     seed_everything(batch_seed(run.record["seed"], 6, 2))
@@ -113,7 +113,7 @@ def select_sites(
     return SiteSelection(distances, because, sites)
 
 
-def settling(
+def prior_site_selector(
     run: RunFolder, guide: Guide, held: Callable[[bool], Tensor], sure: bool
 ) -> Callable[[ParameterLearning, bool], frozenset[str]]:
     """What names sites that keep their prior, of those that are read well, as ``select_sites`` will have it: after each
@@ -131,7 +131,7 @@ def settling(
     def constant(many: bool) -> dict[str, Tensor]:
         """Images of the target and of the prior, which stay as they are."""
         images = {"target": held(many)}
-        return images | {"prior": _compared(run, run.model, guide, len(images["target"]), "prior")}
+        return images | {"prior": _renders_of(run, run.model, guide, len(images["target"]), "prior")}
 
     @cache
     def of_prior() -> Features:
@@ -140,16 +140,16 @@ def settling(
     def named(learning: ParameterLearning, many: bool) -> frozenset[str]:
         assert learning.guide is not None and learning.best is not None
         images = constant(many)
-        learnt = _compared(run, learning.guide.with_parameters(run.model), guide, len(images["target"]), "learnt")
+        learnt = _renders_of(run, learning.guide.with_parameters(run.model), guide, len(images["target"]), "learnt")
         read = learning.site_rows(images | {"learnt": learnt})
-        names = passed(learning, read, True)
+        names = sites_to_reset(learning, read, True)
         if sure or not names:  # what is passed where one is not careful is a part of it
             return names
         judge = learning.best.held
         looks = judge.looks(learning.guide, frozenset())
-        apart = bootstrap_test(looks, of_prior(), judge.real)
-        if apart.distance < apart.baseline_distance:
-            names = passed(learning, read, False)
+        test = bootstrap_test(looks, of_prior(), judge.real)
+        if test.distance < test.baseline_distance:
+            names = sites_to_reset(learning, read, False)
         return redundant_resets(learning.guide, judge, looks, names)
 
     def settled(learning: ParameterLearning, last: bool) -> frozenset[str]:
@@ -176,7 +176,7 @@ def redundant_resets(
     )
 
 
-def passed(
+def sites_to_reset(
     learning: ParameterLearning, read: dict[str, dict[str, tuple[Tensor, Tensor]]], careful: bool
 ) -> frozenset[str]:
     """Sites that keep their prior, of those that are read well, by what is read in learnt renders, in the prior's and
@@ -199,7 +199,7 @@ def passed(
 
 
 @torch.no_grad()
-def of_unclear(
+def reset_low_skill_sites(
     learning: ParameterLearning, images: Tensor, kept: frozenset[str]
 ) -> tuple[frozenset[str], dict[str, str]]:
     """Sites that keep their prior, of those that are read with little skill; and why, of those among them that have no
@@ -246,11 +246,11 @@ def _share(of: dict[str, tuple[Tensor, Tensor]], far: str, near: str) -> float:
     images = tuple(image.numpy() for _, image in sources)
     if not min(map(len, (one, other, target))):
         return 0.0
-    apart = bootstrap_test(one, other, target, images=(images[0], images[1], images[2]))
-    return apart.probability if apart.distance > apart.baseline_distance else 0.0
+    test = bootstrap_test(one, other, target, images=(images[0], images[1], images[2]))
+    return test.probability if test.distance > test.baseline_distance else 0.0
 
 
-def _compared(run: RunFolder, model: SceneModel, guide: Guide, number: int, name: str) -> Tensor:
+def _renders_of(run: RunFolder, model: SceneModel, guide: Guide, number: int, name: str) -> Tensor:
     """Renders with learnt parameters, or with the prior's."""
     seed_everything(batch_seed(run.record["seed"], 6, int(name == "prior")))
     return _renders(run, model, guide, number)

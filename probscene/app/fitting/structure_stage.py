@@ -31,7 +31,7 @@ from ..progress import Progress
 from ..workers.actor_pool import ActorPool
 from ..workers.cluster import Cluster
 from .config import ScoreFunctionTraining
-from .learnt_parameters import NAME, beside, with_parameters
+from .learnt_parameters import NAME, prefixed, with_parameters
 from .outcome import feature_mask
 from .parameter_stage import READER
 from .plugins import inner
@@ -90,7 +90,7 @@ def learn_structure(
     return guide
 
 
-def learn_structure_again(
+def refine_structure(
     run: RunFolder,
     net: FeatureNet,
     real: Tensor,
@@ -185,7 +185,7 @@ def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> C
     model, net = run.model, run.network()
     assert net is not None
     if again:
-        tensors = beside(run.read_tensors(NAME) or {})
+        tensors = prefixed(run.read_tensors(NAME) or {})
         suits = with_parameters(model, run.config, run.parameters, run.new_guide(), tensors).suits
         model = model if suits is None else suits(model)
     net = (_reader_counts(run, net) if finder else None) or net

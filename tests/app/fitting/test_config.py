@@ -143,13 +143,13 @@ def test_divergences_and_their_settings():
 def test_pretrained_features_bring_their_own_unit():
     """A kernel that was chosen for counts is none for features in units of their bandwidth."""
     street = preset("street")
-    assert street.divergence == JensenShannon(1.0, 0.1, stabilised=True)
+    assert street.divergence == JensenShannon(1.0, 0.1, anscombe=True)
     for features, single in (("efficientnet", None), ("count=efficientnet", 0.1)):
         assert street.with_features(features).divergence == JensenShannon(1.0, single)
         assert QUICK.with_features(features).divergence == KDELogRatio(1.0, single)
         assert preset("paper").with_features(features).divergence.variance is None
     assert street.with_features("count").divergence == street.divergence
-    assert street.with_divergence("witness").divergence == MMD(1.0, shared=False, stabilised=True)
+    assert street.with_divergence("witness").divergence == MMD(1.0, shared=False, anscombe=True)
     assert street.for_photographs().structure.prior_kl_weight > street.structure.prior_kl_weight > 0
     assert QUICK.for_photographs().structure.prior_kl_weight == 0
 

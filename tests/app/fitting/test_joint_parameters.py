@@ -69,7 +69,7 @@ def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
     ]
     assert all(site["learnt"] for site in record["sites"]) and record["kept"] == "learnt"
 
-    def beside(policy):
+    def prefixed(policy):
         seed_everything(0)
         scenes = sample(run.model, policy, 300)
         values = [(scenes.parameters[name], scenes.site_mask[name]) for name in scenes.parameters]
@@ -79,6 +79,6 @@ def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
             for name in NUMBERS
         }
 
-    prior, learnt = beside(run.model.prior), beside(run.guide)
+    prior, learnt = prefixed(run.model.prior), prefixed(run.guide)
     for name in NUMBERS:
         assert learnt[name][0] < 0.3 * prior[name][0] and learnt[name][1] > 0.8 > 0.7 > prior[name][1], name

@@ -33,8 +33,8 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
             }
 
     images = dict.fromkeys(("learnt", "prior", "target"), torch.zeros(0))
-    assert select_sites.passed(Learning(), Learning().site_rows(images), careful=True) == {"y", "z", "w"}
-    assert select_sites.passed(Learning(), Learning().site_rows(images), careful=False) == {"w"}
+    assert select_sites.sites_to_reset(Learning(), Learning().site_rows(images), careful=True) == {"y", "z", "w"}
+    assert select_sites.sites_to_reset(Learning(), Learning().site_rows(images), careful=False) == {"w"}
 
 
 class Renders:
@@ -71,27 +71,28 @@ class Renders:
 def test_unclear_sites_are_learnt_where_renders_without_them_are_farther():
     """``u`` and ``v`` are as the target has them; ``w`` is not, nor ``lost``, which would be nearer."""
     learning = Renders({"u": 1.0, "v": 1.0, "w": -1.0, "lost": 1.0}, {})
-    kept, because = select_sites.of_unclear(learning, torch.zeros(400), frozenset("k"))
+    kept, because = select_sites.reset_low_skill_sites(learning, torch.zeros(400), frozenset("k"))
     assert kept == {"w", "lost"}
     assert because == {"lost": "in renders that look like the target 10% of its variance can be read"}
     assert all("k" in each for each in learning.asked) and len(learning.asked) == 5
     nothing = Renders({"w": -1.0, "lost": 1.0}, {})
     assert (
-        select_sites.of_unclear(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"} and len(nothing.asked) == 2
+        select_sites.reset_low_skill_sites(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"}
+        and len(nothing.asked) == 2
     )
 
 
 def test_an_unclear_site_of_scenes_that_hardly_moves_keeps_its_prior():
     """As ``u`` does, and as ``v`` does not; ``w`` moves as little, but is of objects."""
     learning = Renders({"u": 0.9, "v": 1.1, "w": 0.9}, {}, of_scenes=("v", "u"))
-    kept, because = select_sites.of_unclear(learning, torch.zeros(400), frozenset())
+    kept, because = select_sites.reset_low_skill_sites(learning, torch.zeros(400), frozenset())
     assert kept == {"u"} and because["u"] == "it would be 0.09 of u from its prior, no farther than it may be misread"
 
 
 def test_what_is_learnt_wrongly_is_not_in_the_way_of_the_others():
     """What is read of ``u`` is moved by ``w``, which is learnt wrongly: with it ``u`` comes hardly nearer."""
     learning = Renders({"u": 1.0, "w": -1.0}, {"w": 0.4})
-    assert select_sites.of_unclear(learning, torch.zeros(400), frozenset())[0] == {"w"}
+    assert select_sites.reset_low_skill_sites(learning, torch.zeros(400), frozenset())[0] == {"w"}
     assert learning.asked[-1] == {"w"}
 
 
@@ -108,7 +109,9 @@ def test_of_many_sites_none_is_learnt_by_chance():
             return nothing | {"x": {name: rows(float(name == "prior"), 120) for name in images}}
 
     images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert select_sites.passed(Learning(), Learning().site_rows(images), careful=True) == {f"n{i}" for i in range(40)}
+    assert select_sites.sites_to_reset(Learning(), Learning().site_rows(images), careful=True) == {
+        f"n{i}" for i in range(40)
+    }
 
 
 @pytest.mark.parametrize(
@@ -158,7 +161,7 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
     run = SimpleNamespace(record={"seed": 0}, model="prior")
     torch.manual_seed(0)
     target = torch.randn(150, 4)
-    settle = select_sites.settling(run, None, lambda many: target[: 150 if many else 140], sure)
+    settle = select_sites.prior_site_selector(run, None, lambda many: target[: 150 if many else 140], sure)
     learning, found = Learning(), []
     first = learning.guide.net.weight.data
     for last in (False, False, True):

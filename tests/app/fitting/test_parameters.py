@@ -37,8 +37,8 @@ def anything_is_read(patch):
     patch.setattr(skill, "MIN_SKILL", -1e9)
     patch.setattr(reader, "SCORE_THRESHOLDS", (1e-3,))
     patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
-    patch.setattr(select_sites, "passed", lambda *_: frozenset())
-    patch.setattr(select_sites, "of_unclear", lambda *_: (frozenset(), {}))
+    patch.setattr(select_sites, "sites_to_reset", lambda *_: frozenset())
+    patch.setattr(select_sites, "reset_low_skill_sites", lambda *_: (frozenset(), {}))
     for renders in ("CALIBRATION_RENDERS", "BUILDER_RENDERS", "MISSED_RENDERS"):
         patch.setattr(learning, renders, 40)
 
@@ -71,7 +71,7 @@ def learnt(path, copy):
     for weight in net.parameters():
         torch.nn.init.normal_(weight, std=0.3)
     own = parameters.apart(run.read_tensors("guide"))[0]
-    run.write_tensors("guide", own | parameters.beside(net.state_dict()))
+    run.write_tensors("guide", own | parameters.prefixed(net.state_dict()))
     return RunFolder.at(copy)
 
 
@@ -235,7 +235,7 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     assert [site["learnt"] for site in record["sites"]] == [True, True, False] and record["kept"] == "learnt"
     assert "cannot be read" in record["sites"][2]["because"]
 
-    def beside(policy):
+    def prefixed(policy):
         seed_everything(0)
         scenes = sample(run.model, policy, 300)
         count = scenes.site_mask["dot.z"].sum(1, keepdim=True)
@@ -245,7 +245,7 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
         up = (scenes.parameters["dot.a"] - 32)[scenes.site_mask["dot.a"]].abs().mean()
         return float(off), float(up)
 
-    prior, after = beside(run.model.prior), beside(run.guide)
+    prior, after = prefixed(run.model.prior), prefixed(run.guide)
     assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
 
 
@@ -263,7 +263,7 @@ def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
         return site_rows(learning, images)
 
     monkeypatch.setattr(parameters.ParameterLearning, "site_rows", noted)
-    monkeypatch.setattr(select_sites, "passed", lambda *_: frozenset())
+    monkeypatch.setattr(select_sites, "sites_to_reset", lambda *_: frozenset())
     settings = (*discs.without(), *LEARN, "--set", f"parameters.sure={str(sure).lower()}")
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *settings)
     assert done.code == 0, done.err
@@ -276,7 +276,7 @@ def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
 def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
     monkeypatch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(1.0, 1.0, 0.0))
-    monkeypatch.setattr(select_sites, "passed", lambda *_: frozenset(passed))
+    monkeypatch.setattr(select_sites, "sites_to_reset", lambda *_: frozenset(passed))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.without(), *LEARN)
     assert done.code == 0, done.err
@@ -293,7 +293,7 @@ def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, tar
 
 def test_a_site_that_cannot_be_read_where_the_target_is_keeps_the_prior(call, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
-    monkeypatch.setattr(select_sites, "of_unclear", lambda *_: (frozenset("x"), {"x": "it is dark there"}))
+    monkeypatch.setattr(select_sites, "reset_low_skill_sites", lambda *_: (frozenset("x"), {"x": "it is dark there"}))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.without(), *LEARN)
     assert done.code == 0, done.err
