@@ -30,7 +30,9 @@ def text(name: str) -> str:
 FEWER = {
     "tutorial.md": {
         '400, "hidden"': '60, "hidden"',
-        '"count.steps": 300, "batches": 20, "num_scenes": 100': '"count.steps": 16, "batches": 2, "num_scenes": 20',
+        '"features.schedule.steps": 300': '"features.schedule.steps": 16',
+        '"structure.batches": 20': '"structure.batches": 2',
+        '"structure.num_scenes": 100': '"structure.num_scenes": 20',
         "fit.generate(200,": "fit.generate(20,",
     },
     "pyro.md": {
@@ -49,8 +51,8 @@ def test_python_prints_what_the_page_says(page, tmp_path, monkeypatch, capsys):
         shorter = shorter.replace(words, fewer)
     (tmp_path / page.name).write_text(shorter, encoding="utf-8")
     monkeypatch.setenv("PROBSCENE_CACHE", "")  # the script sets it
-    monkeypatch.setattr(source_features, "IMAGES", 60)
-    monkeypatch.setattr(diagnose, "SCENES", 60)
+    monkeypatch.setattr(source_features, "NUM_IMAGES", 60)
+    monkeypatch.setattr(diagnose, "NUM_SCENES", 60)
     monkeypatch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
     monkeypatch.setattr(sys, "argv", ["run_page.py", str(tmp_path / page.name), "--check"])
     assert import_file(ROOT / "docs" / "run_page.py").main() == 0, capsys.readouterr().err
