@@ -26,7 +26,11 @@ def test_python_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PROBSCENE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 40)
     fit = ps.fit
-    monkeypatch.setattr(ps, "fit", lambda model, target, config: fit(model, target, ps.preset(config).set(TINY)))
+
+    def tiny(model, target, config, **options):
+        return fit(model, target, ps.preset(config).set(TINY), **options)
+
+    monkeypatch.setattr(ps, "fit", tiny)
     monkeypatch.setattr(ps.Run, "report", functools.partialmethod(ps.Run.report, num=200, scenes=60))
     (block,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names = {}
