@@ -176,8 +176,8 @@ def test_resume_takes_the_settings_of_the_run_or_none(call, discs, fitted, targe
         (["--threads", 7], "threads"),
         (["--skip-bad"], "skip_bad"),
         ([*discs.settings, "--set", "structure.batches=5"], "batches", "(4), got 5"),
-        ([*discs.settings, "--objective", "mmd"], "(kde), got mmd"),
-        ([*discs.settings, "--guide", "pcfg"], "the guide", "(lstm), got pcfg"),
+        ([*discs.settings, "--divergence", "mmd"], "the divergence.kind", "(KDELogRatio), got MMD"),
+        ([*discs.settings, "--guide", "pcfg"], "the guide.kind", "(LSTMConfig), got PCFGConfig"),
     ):
         check_fault(call(*words, *other), 2, *parts)
 
@@ -195,7 +195,7 @@ def test_numbers_out_of_range(call, discs, fitted, target, tmp_path):
         check_fault(call(*fitting, "--threads", number), 2, "threads")
     check_fault(call(*fitting, "--seed", -1), 2, "seed of 0 or more")
     check_fault(call("generate", fitted, "--num", 1, "--out", out, "--format", "voc"), 2, "'voc'")
-    check_fault(call("fit", "--out", out), 2, "expected MODEL and --target")
+    check_fault(call("fit", "--out", out), 2, "expected a model and target images (MODEL and --target DIR)")
     assert not out.exists()
 
 

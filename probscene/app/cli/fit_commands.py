@@ -87,9 +87,9 @@ def fit(
         config = configuration(named(str(preset or DEFAULT)), features, divergence, guide, method, settings or [])
     if model is None and scenarios is not None:
         raise ProbsceneError("expected MODEL with --scenarios, got none; a run knows its own.")
-    source = None if model is None else ModelFile(with_scenarios(model, scenarios), assets)
+    source = None if model is None else with_scenarios(model, scenarios)
     images = TargetImages(target, skip_bad, range_given(value_range))
-    request = fit_request(source, images, config, seed, labels, threads)
+    request = fit_request(ModelFile(source, assets), images, config, seed, labels, threads)
     execution = Execution(threads, cluster, False if no_cache else cache or True)
     try:
         done = fit_and_diagnose(request, out, resume, execution, not no_verdict)

@@ -38,11 +38,11 @@ class ModelFile:
     """A model by its name or file, drawn with a folder of assets.
 
     Args:
-        reference: a built-in model's name, or a Python file.
+        reference: a built-in model's name, or a Python file; None for that of a run that is resumed.
         assets: of meshes or pictures, see ``load_model``.
     """
 
-    reference: str
+    reference: str | None
     assets: Path | None = None
 
 
@@ -94,7 +94,7 @@ def checked_model(model: SceneModel | ModelFile) -> SceneModel:
     Raises:
         ModelError: it does not load, or ``check_model`` finds faults.
     """
-    loaded = model if isinstance(model, SceneModel) else load_model(model.reference, model.assets)
+    loaded = model if isinstance(model, SceneModel) else load_model(str(model.reference), model.assets)
     if faults := check_model(loaded, *QUICK).faults:
         name = loaded.name if isinstance(model, SceneModel) else model.reference
         raise ModelError(f"expected a model without faults, got {name}: {' '.join(faults)}")
@@ -113,7 +113,8 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
             ``RunFolder.create``.
     """
     model, target, config = request.model, request.target, request.config
-    if model is None or target is None or target.source is None or config is None:
+    nameless = model is None or (isinstance(model, ModelFile) and model.reference is None)
+    if nameless or target is None or target.source is None or config is None:
         raise DataError(
             "expected a model and target images (MODEL and --target DIR), got one missing; only a run that is resumed "
             "goes without them."
@@ -122,6 +123,7 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
         raise ProbsceneError(f"expected a positive number of threads, got {request.threads}.")
     check_free(out)
     plugins = config.plugins()
+    assert model is not None
     loaded = checked_model(model)
     images = open_images(target.source, loaded, bool(target.skip_bad), show, target.value_range)
     check_target(images)
@@ -153,7 +155,7 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
     net = run.build_network()
     if "guide" in config.words():
         run.new_guide()
-    source = loaded if isinstance(model, SceneModel) else model.reference
+    source = model.reference if isinstance(model, ModelFile) and model.reference else loaded
     return Begun(make.create(out, source, record, request.assets, loaded, plugins), images, labels, net)
 
 
@@ -202,9 +204,7 @@ def _asked(request: FitRequest, run: RunFolder) -> dict[str, Any]:
     """What a request names, as the record has it."""
     model, target = request.model, request.target
     found: dict[str, Any] = {
-        "model": in_memory(model.name)
-        if isinstance(model, SceneModel)
-        else model and lasting_reference(model.reference),
+        "model": _lasting_model(model),
         "assets_folder": None if request.assets is None else os.path.abspath(request.assets),
         "labels": None if request.labels is None else str(Path(request.labels).resolve()),
         "seed": request.seed,
@@ -220,6 +220,12 @@ def _asked(request: FitRequest, run: RunFolder) -> dict[str, Any]:
         return found
     photographs = type(config.for_photographs().features) is type(run.config.features)
     return found | (config.for_photographs() if photographs else config.for_renders()).flat()
+
+
+def _lasting_model(model: SceneModel | ModelFile | None) -> str | None:
+    if isinstance(model, SceneModel):
+        return in_memory(model.name)
+    return None if model is None or model.reference is None else lasting_reference(model.reference)
 
 
 def _begun_with(run: RunFolder) -> dict[str, Any]:
@@ -265,7 +271,7 @@ def _relocate(run: RunFolder, request: FitRequest, show: Display) -> Images | No
         The images, where they had to be opened for that.
     """
     record, model, assets = run.record, request.model, request.assets
-    if isinstance(model, ModelFile) and lasting_reference(model.reference) != record["model"]:
+    if isinstance(model, ModelFile) and model.reference and lasting_reference(model.reference) != record["model"]:
         (file, names), (_, begun) = split_reference(model.reference), split_reference(record["model"])
         if names != begun or not Path(file).is_file() or file_digest(Path(file)) != record["model_sha256"]:
             return None

@@ -757,7 +757,7 @@ def _former_features(old: dict[str, Any], some: Callable[..., dict[str, Any]]) -
     if is_file_part(word) or word.startswith(IN_MEMORY):
         return word
     if word == COUNT:
-        return CountFeatures(CountSchedule(**old["count"]), **some(CountFeatures, schedule=""))
+        return CountFeatures(CountSchedule(**old.get("count", {})), **some(CountFeatures, schedule=""))
     if word == COUNT_ON_PRETRAINED:
         return PretrainedCountFeatures(**some(PretrainedCountFeatures, epochs="head_epochs", scenes=""))
     if word in (PRESENCE, PRESENCE_COUNTS):

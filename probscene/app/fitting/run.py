@@ -165,7 +165,7 @@ class RunFolder(Storage):
         """How the run learns. Parts that were in memory alone are words in it, see ``objects``."""
         if "config" in self.record:
             return FitConfig.from_record(self.record["config"])
-        return from_flat_preset(self.record["preset"], self.record["guide"])
+        return from_flat_preset(self.record.get("preset", {}), self.record.get("guide", {}))
 
     @property
     def _on_prior(self) -> bool:

@@ -1,6 +1,5 @@
 """Runs side by side: the figures are those of evaluate and of plain loops, and the picture shows them."""
 
-import dataclasses
 import json
 import re
 import shutil
@@ -42,7 +41,7 @@ def two(call, discs, fitted, target, tmp_path_factory) -> list[Path]:
 
 def untrained(folder: Path, model: str, seed: int, target: str = "images", assets: Path | None = None) -> Path:
     """A run whose guide learnt nothing, and which has seen no image."""
-    record = {"guide": QUICK.guide_settings(), "preset": dataclasses.asdict(QUICK), "target": target, "seed": seed}
+    record = {"config": QUICK.for_renders().to_record(), "target": target, "seed": seed}
     run = RunFolder.create(folder, model, record, assets)
     torch.manual_seed(seed)
     guide = run.new_guide()

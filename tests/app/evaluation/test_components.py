@@ -98,6 +98,8 @@ def guided(fitted, *, learnt: SceneModel | None, structure=TRUTH):
     """The run as if it had learnt a structure, and to draw it as ``learnt`` does."""
 
     class Guided(RunFolder):
+        config = preset("quick")
+
         @property
         def guide(self):
             policy = StructurePrior.__new__(StructurePrior)

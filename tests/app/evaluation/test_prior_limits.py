@@ -239,15 +239,8 @@ def test_a_finished_fit_warns_and_evaluate_repeats_it(call, discs, target, tmp_p
     text = discs.file.read_text(encoding="utf-8")
     text = text.replace("model((1, 1, 1, 1), (1, 1), target", "model((1, 1), (1, 1), target") + LIT
     model.write_text(text, encoding="utf-8")
-    settings = [
-        *discs.settings,
-        "--features",
-        f"{model}:Lit",
-        "--set",
-        "structure.batches=30",
-        "--set",
-        "structure.learning_rate=0.05",
-    ]
+    settings = [*discs.without("features", "parameters"), "--learn", "structure", "--features", f"{model}:Lit"]
+    settings += ["--set", "structure.batches=30", "--set", "structure.learning_rate=0.05"]
     out = tmp_path / "run"
     done = call("fit", model, "--target", target.images, "--out", out, *settings)
     assert done.code == 0, done.err

@@ -66,7 +66,7 @@ def test_a_run_is_bound_to_the_digits_it_was_begun_with(tmp_path, monkeypatch, i
 @pytest.mark.parametrize("kind", [*GUIDES, None])
 def test_the_guide_is_rebuilt_from_the_record(tmp_path, kind):
     """A record that names no kind is of a version that had LSTMs alone."""
-    settings = QUICK.with_guide(kind or "lstm").guide_settings()
+    settings = QUICK.with_guide(kind or "lstm").guide_record()
     if kind is None:
         del settings["kind"]
     run = RunFolder.create(tmp_path / "run", str(DISCS), {"guide": settings})

@@ -156,7 +156,7 @@ def test_a_site_of_the_scene_has_quantiles_of_what_it_was_and_what_it_became(lea
 
 def test_the_page_of_a_run_without_parameters_says_so(fitted, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
-    (tmp_path / "run" / "parameters.json").unlink()
+    assert not (tmp_path / "run" / "parameters.json").exists()
     made = report(RunFolder.at(tmp_path / "run"), Display(), num=100, judged_by=0).read_text(encoding="utf-8")
     assert "Parameters were not learnt" in made
 

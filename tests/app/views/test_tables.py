@@ -136,7 +136,7 @@ def labels_apart(axes) -> None:
 bins = st.integers(1, 400).map(range) | st.lists(st.text("abwmi", min_size=1, max_size=10), min_size=1, max_size=60)
 
 
-@settings(max_examples=60)
+@settings(max_examples=20)
 @given(bins, st.sampled_from([charts.WIDE, charts.NARROW, (2.6, 2.6)]), st.sampled_from([7.5, 10, 14]))
 def test_labels_of_bins_never_touch_and_are_those_of_their_bins(bins, size, points):
     with matplotlib.rc_context({"xtick.labelsize": points}):
