@@ -65,7 +65,7 @@ def learnt(path, copy):
     record = json.loads((copy / "parameters.json").read_text())
     (copy / "parameters.json").write_text(json.dumps({**record, "kept": "learnt"}))
     run = RunFolder.at(copy)
-    sites = tuple(parameters.Site(site["name"], ("red", "blue")) for site in record["sites"])
+    sites = tuple(Site(site["name"], ("red", "blue")) for site in record["sites"])
     seed_everything(0)
     net = parameters.ParameterGuide(run.model, sites).net
     for weight in net.parameters():
@@ -189,9 +189,9 @@ def test_structure_is_learnt_again_in_the_learnt_layout(both):
 
 
 def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_path):
-    words = ("--target", target.images, "--out", tmp_path / "run", "--features", "presence")
-    short = ["--set", "features.images=40", "--set", "features.epochs=1"]
-    done = call("fit", discs.file, *words, *discs.without("features"), *LEARN, *short)
+    words = ("--target", target.images, "--out", tmp_path / "run", *discs.without("features"), *LEARN)
+    short = ("--features", "presence", "--set", "features.images=40", "--set", "features.epochs=1")
+    done = call("fit", discs.file, *words, *short)
     assert done.code == 0, done.err
     assert "keeps the prior: presence features are not read for it yet" in " ".join(done.err.split())
     assert RunFolder.at(tmp_path / "run").parameters == {}

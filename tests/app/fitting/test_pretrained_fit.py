@@ -69,7 +69,7 @@ def test_it_goes_on_to_the_same_result(run, call, tmp_path, discs, target):
     for name in ("guide", "real"):
         (again / f"{name}.safetensors").unlink()
     done = call("fit", "--out", again, "--resume", "--features", "count", *WORDS)
-    assert done.code == 2 and "features" in done.err and "efficientnet" in done.err
+    assert done.code == 2 and "the features.kind" in done.err and "(ProjectedFeatures)" in done.err
     done = call("fit", "--out", again, "--resume", "--no-verdict")
     assert done.code == 0, done.err
     assert (again / "guide.safetensors").read_bytes() == guide
@@ -203,7 +203,7 @@ def test_labels_choose_how_classes_are_read(counting, call, discs, target, tmp_p
 
 def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs, target, tmp_path, monkeypatch):
     """No heads are good enough; parameters are learnt as well."""
-    monkeypatch.setattr(readability, "SKILL", 1.1)
+    monkeypatch.setattr(readability, "MIN_CORRELATION", 1.1)
     few = {"features.pairs": 12, "features.epochs": 1, "refine.batches": 2} | {
         f"parameters.{k}": 20 for k in ("first", "scenes")
     }
