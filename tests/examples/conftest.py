@@ -58,8 +58,8 @@ def _few_and_small_images_are_looked_at():
     """By a verdict."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
-        patch.setattr("probscene.app.evaluation.source_features.IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.diagnose.SCENES", 60)
+        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
         yield
 
 

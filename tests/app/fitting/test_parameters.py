@@ -22,6 +22,8 @@ from probscene.app.fitting.run import RunFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.parameters import learning, reader, skill
+from probscene.inference.parameters.guide import ParameterGuide
+from probscene.inference.parameters.sites import Site
 from probscene.inference.statistics.energy import BootstrapTest
 from probscene.model import SceneModel, scene_model
 from probscene.sampling import sample, seed_everything
@@ -67,7 +69,7 @@ def learnt(path, copy):
     run = RunFolder.at(copy)
     sites = tuple(Site(site["name"], ("red", "blue")) for site in record["sites"])
     seed_everything(0)
-    net = parameters.ParameterGuide(run.model, sites).net
+    net = ParameterGuide(run.model, sites).net
     for weight in net.parameters():
         torch.nn.init.normal_(weight, std=0.3)
     own = parameters.apart(run.read_tensors("guide"))[0]
