@@ -58,7 +58,7 @@ def _own_cache(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _few_and_small_images_are_looked_at():
     """By a verdict; EfficientNet takes a fifth of the pixels, which tells these models' scenes apart as well."""
     with pytest.MonkeyPatch.context() as patch:

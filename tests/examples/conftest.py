@@ -53,7 +53,7 @@ def _own_cache(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _few_and_small_images_are_looked_at():
     """By a verdict."""
     with pytest.MonkeyPatch.context() as patch:

@@ -398,7 +398,8 @@ ALL = {"format": "coco,panoptic,yolo,yolo-seg,yolo-obb,yolo-pose,webdataset", "a
 
 def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path, monkeypatch):
     """With every option, those of other files too."""
-    every = ALL | {"min_visible": 0.3, "box_margin": 3}
+    options = DatasetOptions(amodal=True, values=ALL["values"], min_visible=0.3, box_margin=3)
+    every = {"format": ALL["format"], "options": options}
     torch.manual_seed(0)
     run = RunFolder.create(tmp_path / "run", str(FILES["cars"]), {"guide": {"hidden": 8}})
     run.write_tensors("guide", LSTMGuide(run.model.grammar, run.model.max_steps, hidden=8).state_dict())
@@ -413,7 +414,7 @@ def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path,
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     assert generate(run, 70, tmp_path / "one", **every).made == 0  # it is seen to be finished
     with pytest.raises(ProbsceneError, match=r"begun with \(amodal True\), got amodal False"):
-        generate(run, 70, tmp_path / "one", **every | {"amodal": False})
+        generate(run, 70, tmp_path / "one", **every | {"options": replace(options, amodal=False)})
     found = json.loads((tmp_path / "one" / "annotations.json").read_text())
     assert found["info"]["values"] == "car.x,light" and found["info"]["amodal"] is True
     sharded = []

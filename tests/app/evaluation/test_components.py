@@ -98,8 +98,6 @@ def guided(fitted, *, learnt: SceneModel | None, structure=TRUTH):
     """The run as if it had learnt a structure, and to draw it as ``learnt`` does."""
 
     class Guided(RunFolder):
-        config = preset("quick")
-
         @property
         def guide(self):
             policy = StructurePrior.__new__(StructurePrior)
@@ -167,6 +165,7 @@ def test_features_that_do_not_say_where_objects_are(fitted, monkeypatch):
 
 def test_sites_that_could_not_be_read_are_named(fitted):
     run = guided(fitted, learnt=dots(11.0))
+    run.config = run.config.set("parameters=likelihood")
     read = {"distance": {"prior": 0.25, "learnt": 0.12, "floor": 0.02}}
     site = {"kinds": ["red"], "learnt": True, "skill": 0.9, "because": "", "read": read}
     unread = {"kinds": ["red"], "learnt": False, "skill": 0.1, "because": "it cannot be read in renders"}

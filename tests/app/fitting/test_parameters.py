@@ -16,6 +16,7 @@ from probscene.app.fitting import parameter_stage as parameters
 from probscene.app.fitting import site_selection as select_sites
 from probscene.app.fitting import store as storage
 from probscene.app.fitting import structure_stage as structure
+from probscene.app.fitting.learnt_parameters import split_tensors
 from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
@@ -72,7 +73,7 @@ def learnt(path, copy):
     net = ParameterGuide(run.model, sites).net
     for weight in net.parameters():
         torch.nn.init.normal_(weight, std=0.3)
-    own = parameters.apart(run.read_tensors("guide"))[0]
+    own = split_tensors(run.read_tensors("guide"))[0]
     run.write_tensors("guide", own | parameters.prefixed(net.state_dict()))
     return RunFolder.at(copy)
 

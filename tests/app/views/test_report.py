@@ -92,7 +92,7 @@ def test_the_page_shows_figures_curves_grammar_time_and_configuration(text, fitt
         "Pretraining",
     ):
         assert what in words, what
-    for key in ("seed", "threads", "version", "target", "preset.count.steps", "preset.batches"):
+    for key in ("seed", "threads", "version", "target", "config.features.schedule.steps", "config.structure.batches"):
         assert f"<td>{key}</td>" in text
     assert f"<td>{html.escape(run.record['target'])}</td>" in text and f"version {run.record['version']}" in words
     assert len(re.findall(r"<b>\d\.\d{3} → \d\.\d{3}</b>", text)) == 4
