@@ -14,7 +14,7 @@ $(BIN)/python:
 	        exec "$$python" -m venv .venv; \
 	    fi; \
 	done; \
-	echo "Expected Python 3.11, 3.12 or 3.13 with its venv module, actual none on the PATH;" \
+	echo "expected Python 3.11, 3.12 or 3.13 with its venv module, got none on the PATH;" \
 	    "install one (Debian, Ubuntu: python3.11-venv) or run: make install PYTHON=/path/to/python3.11" >&2; \
 	exit 2
 

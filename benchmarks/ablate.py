@@ -30,16 +30,15 @@ from learn_driving import FLOOR, counted, sampled_anew
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.sources import PRIOR, START, before
+from probscene.app.evaluation.sources import PRIOR, START, baseline_policies
 from probscene.app.files import write_json
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import STRUCTURE
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.inference.judging.metrics import histogram, total_variation
+from probscene.inference.statistics.count_metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
@@ -69,22 +68,22 @@ class Variant(NamedTuple):
 
 VARIANTS = {
     AS_IT_IS: Variant(),
-    "4 latent vectors": Variant(("num_latents=4",)),
-    "no index": Variant(("index=false",)),
+    "4 latent vectors": Variant(("guide.num_latents=4",)),
+    "no index": Variant(("guide.index=false",)),
     "presence features": Variant(("features=presence",)),
     "EfficientNet features": Variant(("features=efficientnet",)),
-    "objective js": Variant(("objective=js",)),
-    "objective witness": Variant(("objective=witness",)),
-    "objective mmd": Variant(("objective=mmd",)),
-    "no marginals": Variant(("marginal_variance=none",)),
-    "the paper's bandwidth": Variant(("variance=none",)),
-    "a scene in its own density": Variant(("leave_one_out=false",)),
-    "one drawing a structure": Variant(("draws_per_structure=1",)),
-    "one update a batch": Variant(("updates=1",)),
-    "moving average as baseline": Variant(("baseline=moving_average",)),
+    "objective js": Variant(("divergence=js",)),
+    "objective witness": Variant(("divergence=witness",)),
+    "objective mmd": Variant(("divergence=mmd",)),
+    "no marginals": Variant(("divergence.marginal_variance=none",)),
+    "the paper's bandwidth": Variant(("divergence.variance=none",)),
+    "a scene in its own density": Variant(("divergence.leave_one_out=false",)),
+    "one drawing a structure": Variant(("structure.draws_per_structure=1",)),
+    "one update a batch": Variant(("structure.updates=1",)),
+    "moving average as baseline": Variant(("structure.baseline=moving_average",)),
     "guide pcfg": Variant(("guide=pcfg",)),
     "guide grammar-vae": Variant(("guide=grammar-vae",)),
-    "pretrained on the prior": Variant(("on_prior=true",)),
+    "pretrained on the prior": Variant(("pretrain.on_prior=true",)),
     "no counts by group": Variant(ungrouped=True),
     "simple prior": Variant(model="driving_simple"),
 }
@@ -119,14 +118,14 @@ def figures(model: SceneModel, policy: Policy, truth: np.ndarray, held_out: Deri
 
 def of_variant(args, seed: int, truth: np.ndarray, held_out: Derivation, name: str) -> dict:
     """The row of a variant, which is fitted in a process of its own; the others are as of ``figures``."""
-    keep_freed_memory()
+    tune_malloc()
     use_threads(1)
     start, variant = time.monotonic(), VARIANTS[name]
     other = changed(load_model(args.model), args.model, variant)
-    base = replace(preset(args.preset), learn=STRUCTURE, prior_if_worse=False)
+    base = preset(args.preset).set("parameters=none", "fallback_to_prior=false")
     images, path = args.out / f"target-{seed}" / "images", args.out / f"{name.replace(' ', '-')}-{seed}"
-    chosen = override(base, list(variant.settings))
-    run = fit(other, images, chosen, seed, threads=1, out=path, resume=True, cache=args.out / "cache")
+    execution = Execution(1, cache=args.out / "cache")
+    run = fit(other, images, base.set(*variant.settings), out=path, seed=seed, resume=True, execution=execution)
     took, found = round(time.monotonic() - start, 1), figures(run.model, run.guide, truth, held_out)
     return {"variant": name, "settings": " ".join(variant.settings), "seed": seed, **found, "seconds": took}
 
@@ -143,7 +142,7 @@ def of_seed(args, seed: int) -> list[dict]:
     floor = [total_variation(histogram(sample[:, i]), histogram(truth[:, i])) for i in range(len(target.classes))]
     own = figures(target, target.prior, truth, held_out) | {"total_variation": round(float(np.mean(floor)), 4)}
     rows = [{"variant": FLOOR, "settings": "", "seed": seed, **own, "seconds": 0.0}]
-    for name, policy in before(model).items():
+    for name, policy in baseline_policies(model).items():
         rows.append(
             {"variant": name, "settings": "", "seed": seed, **figures(model, policy, truth, held_out), "seconds": 0.0}
         )
@@ -187,7 +186,7 @@ def main():
     parser.add_argument("--workers", type=int, default=cores(), help="fits at a time (%(default)s)")
     args = parser.parse_args()
     args.out /= args.model
-    keep_freed_memory()
+    tune_malloc()
     rows = []
     for seed in args.seeds:
         rows += of_seed(args, seed)

@@ -29,18 +29,18 @@ from learn_aerial import Truth, judged, show
 from torch import Tensor
 
 from probscene.app.files import write_json
-from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.config import DIVERGENCES, FitConfig
 from probscene.app.fitting.presets import DEFAULT
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.errors import ProbsceneError
+from probscene.inference.divergence import MMD, KDELogRatio
 from probscene.inference.guides.base import Guide
-from probscene.inference.guides.lstm import make_guide
 from probscene.inference.guides.pcfg import PCFG
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import BASELINES, ScoreFunction
 from probscene.inference.pretrain import pretrain
+from probscene.inference.structure_training import StructureTraining
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
 from probscene.relations import per_parent
 from probscene.sampling import Scenes, seed_everything
@@ -55,7 +55,7 @@ SCENES, BATCH, VARIANCES = (30_000, 60_000, 120_000), (50, 150, 500), (1.0, 4.0,
 
 @dataclass(frozen=True)
 class Settings:
-    """What is searched; see ``Trainer`` and ``ScoreFunction``."""
+    """What is searched; see ``StructureTraining`` and ``ScoreFunction``."""
 
     learning_rate: float
     updates: int
@@ -65,20 +65,23 @@ class Settings:
     variance: float | None  # of the kernel
 
 
-def preset_of(fit: str) -> Preset:
-    """The default preset with a guide or an objective."""
-    return DEFAULT.with_guide(fit) if fit in GUIDES else DEFAULT.with_objective(fit) if fit in OBJECTIVES else DEFAULT
+def config_of(fit: str) -> FitConfig:
+    """The default preset with a guide or a divergence."""
+    if fit in GUIDES:
+        return DEFAULT.with_guide(fit)
+    return DEFAULT.with_divergence(fit) if fit in DIVERGENCES else DEFAULT
 
 
 def drawn(fit: str, num: int) -> list[Settings]:
     """The default's settings, then others, in one order for all fits."""
-    preset = preset_of(fit)
+    training, kernel = config_of(fit).structure, config_of(fit).divergence
+    assert isinstance(kernel, KDELogRatio | MMD)
     every = [Settings(*each) for each in product(RATES, UPDATES, BASELINES, SCENES, BATCH, VARIANCES)]
     order = np.random.default_rng(7).permutation(len(every))
     # All scenes share the cost of MMD: without each one's own, the others' mean is all of it.
     useful = [every[i] for i in order if (fit, every[i].baseline) != ("mmd", "leave_one_out")]
-    scenes = preset.batches * preset.num_scenes
-    own = Settings(preset.learning_rate, preset.updates, preset.baseline, scenes, preset.num_scenes, preset.variance)
+    scenes, N = training.batches * training.num_scenes, training.num_scenes
+    own = Settings(training.learning_rate, training.updates, training.baseline, scenes, N, kernel.variance)
     return [own, *(each for each in useful if each != own)][:num]
 
 
@@ -111,22 +114,23 @@ def structures(num_scenes: int) -> Drawing:
 
 def learnt(fit: str, settings: Settings, truth: Truth, seed: int) -> Guide:
     """A guide that has seen true counts of 5,000 structures."""
-    preset = preset_of(fit)
+    config = config_of(fit)
     seed_everything(1000 + seed)
     real = seen(derive_complete(GRAMMAR, truth.policy, REAL, MODEL.max_steps)[0])
     seed_everything(seed)
-    guide = make_guide(grammar=GRAMMAR, max_steps=MODEL.max_steps, **preset.guide_settings())
+    guide = config.guide_maker()(GRAMMAR, MODEL.max_steps)
     guide.bind(MODEL.support)
-    pretrain(guide, MODEL.pretraining_policy, learning_rate=preset.pretrain_rate)
+    pretrain(guide, MODEL.pretraining_policy, learning_rate=config.pretrain.learning_rate)
 
     def observe(scenes: Scenes) -> Tensor:
         return seen(scenes.derivation)
 
-    divergence = replace(preset, variance=settings.variance).divergence()
+    assert isinstance(config.divergence, KDELogRatio | MMD)
+    divergence = replace(config.divergence, variance=settings.variance)
     loss = ScoreFunction(observe, divergence, settings.baseline, updates=settings.updates)
     batches = max(1, settings.scenes // settings.num_scenes)
     rate, num_scenes = settings.learning_rate, settings.num_scenes
-    Trainer(structures, guide, loss, real, batches, num_scenes, learning_rate=rate, seed=seed).run()
+    StructureTraining(structures, guide, loss, real, batches, num_scenes, learning_rate=rate, seed=seed).run()
     return guide
 
 

@@ -18,6 +18,7 @@ import json
 import shutil
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -29,10 +30,17 @@ from probscene.app.chunks import CHUNK
 from probscene.app.datasets.generate import generate
 from probscene.app.files import write_json
 from probscene.app.fitting.run import RunFolder
+from probscene.app.workers.actor_pool import ActorPool
 from probscene.app.workers.cluster import Cluster
-from probscene.app.workers.crew import Crew
 
-SHORT = {"count.steps": 60, "batches": 8, "num_scenes": 300, "pretrain_derivations": 500, "learn": "structure"}
+SHORT = {
+    "features": "count",
+    "parameters": "none",
+    "features.schedule.steps": 60,
+    "structure.batches": 8,
+    "structure.num_scenes": 300,
+    "pretrain.derivations": 500,
+}
 
 
 class CPU:
@@ -84,8 +92,8 @@ def main():
     target = out / "target"
     ps.generate(model.target(0), 300, target, format="images", progress=False)
     shutil.rmtree(out / "alone", ignore_errors=True)
-    fit = {"preset": "quick", "features": "count", "settings": SHORT, "threads": 1, "cache": out / "cache"}
-    alone = ps.fit("multi_mnist", target / "images", out=out / "alone", **fit)
+    config, alone_by = ps.preset("quick").set(SHORT), ps.Execution(threads=1, cache=out / "cache")
+    alone = ps.fit("multi_mnist", target / "images", config, out=out / "alone", execution=alone_by)
     run = RunFolder.at(alone.path)
 
     def made(name, number, **how):
@@ -93,7 +101,7 @@ def main():
         with CPU() as cost:
             if how.pop("auto", False):
                 with Cluster("auto") as cluster:
-                    generate(run, number, out / name, 0, cluster=cluster)
+                    generate(run, number, out / name, 0, workers=cluster)
             else:
                 generate(run, number, out / name, 0, **how)
         found.setdefault(name, []).append({"images": number, "seconds": cost.wall, "cpu": cost.seconds})
@@ -125,16 +133,16 @@ def main():
                     what()
 
         with Cluster(simulated.address, said.append) as cluster:
-            generate(run, args.disturbed, out / name, 0, progress=progress, cluster=cluster)
+            generate(run, args.disturbed, out / name, 0, progress=progress, workers=cluster)
         longest = max(later - earlier for earlier, later in zip(times, times[1:], strict=False))
         found[name] = {"images": args.disturbed, "seconds": times[-1] - times[0], "longest wait": longest}
         found[name] |= {"same bytes": same(out / "fewer", out / name), "said": said}
         print(name, json.dumps(found[name]), flush=True)
     simulated.whole()
     shutil.rmtree(out / "nodes", ignore_errors=True)
-    run_crew, parts = Crew.run, []
+    run_pool, parts = ActorPool.run, []
 
-    def disturbed(crew, tasks, done):
+    def disturbed(pool, tasks, done):
         def each(result):
             parts.append(result)
             for number, what in ((8, simulated.kill), (20, simulated.freeze)):
@@ -142,11 +150,12 @@ def main():
                     what()
             done(result)
 
-        run_crew(crew, tasks, each)
+        run_pool(pool, tasks, each)
 
-    Crew.run = disturbed
+    ActorPool.run = disturbed
     with CPU() as cost:
-        ps.fit("multi_mnist", target / "images", out=out / "nodes", cluster=simulated.address, **fit)
+        by_nodes = replace(alone_by, cluster=simulated.address)
+        ps.fit("multi_mnist", target / "images", config, out=out / "nodes", execution=by_nodes)
     guides = [(out / name / "guide.safetensors").read_bytes() for name in ("alone", "nodes")]
     found["fit"] = {"seconds": cost.wall, "same bytes": guides[0] == guides[1]}
     print("fit", json.dumps(found["fit"]), flush=True)

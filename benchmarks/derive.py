@@ -115,9 +115,9 @@ def cars_placed() -> int:
             further = pyro.sample("further", dist.Uniform(48.0, 64.0))
         with scene.nodes("car"):
             pyro.sample("x", dist.Uniform(10.0, 246.0))
-            beside = pyro.sample("beside", dist.Uniform(-12.0, 12.0))
+            prefixed = pyro.sample("beside", dist.Uniform(-12.0, 12.0))
             pyro.sample("angle", dist.Uniform(0.0, 6.2832))
-        _ = scene.of_parent((further * scene.mask("road")).cumsum(1)) + beside
+        _ = scene.of_parent((further * scene.mask("road")).cumsum(1)) + prefixed
     return labelled(scene, aerial2d)
 
 

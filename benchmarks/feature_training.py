@@ -15,10 +15,10 @@ import time
 
 import torch
 
-from probscene.app.fitting.observer import Observer
 from probscene.app.fitting.presets import QUICK
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.training import CountTraining
 from probscene.sampling import seed_everything
@@ -56,9 +56,9 @@ def main():
     parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    keep_freed_memory()
+    tune_malloc()
     model = load_model(args.model)
-    view = Observer(model, 1)
+    view = RenderedFeatures(model, 1)
     train(model, view, 16, False)  # compiles the renderer's kernels
     taken = {"torch": [], "ours": []}
     for _ in range(args.repeats):

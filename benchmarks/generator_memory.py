@@ -21,8 +21,8 @@ from given import command, needed, out_option
 
 from probscene.app.files import write_json
 from probscene.app.loading import load_model
-from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import close_pools, pool_for
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.sampling import sample, seed_everything
 
 MODEL = Path(__file__).parents[1] / "examples" / "generators" / "blender" / "table.py"

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from probscene.generator import Command
-from probscene.renderers.generated import GeneratedRenderer
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.request import Request
 
 NODES, ROUNDS = 12, 3

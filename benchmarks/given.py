@@ -34,7 +34,7 @@ def needed(given: Path | None, what: str) -> Path:
         what: that it is, and how it is given.
     """
     if given is None:
-        print(f"Skipped: expected {what}, actual none.")
+        print(f"Skipped: expected {what}, got none.")
         sys.exit(0)
     return Path(given)
 

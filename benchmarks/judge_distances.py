@@ -17,11 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.app.evaluation.structure_counts import StructureCounts, sampled
+from probscene.app.evaluation.structure_counts import StructureCounts, sample_counts
 from probscene.app.loading import load_model
 from probscene.inference.features.counting.grouping import ABSENT
-from probscene.inference.judging.trust import trust
-from probscene.inference.judging.verdict import Verdict
+from probscene.inference.statistics.verdict import Verdict, structure_verdict
 from probscene.model import SceneModel
 from probscene.models.aerial2d import poisson
 from probscene.structure import StructurePrior, counts, ranked, weights
@@ -112,9 +111,11 @@ def main():
                 )
                 found = at(case.target, toward / toward.sum(), away * unit)
             sides = (case.policy(found), N), (case.policy(case.target), L), (case.model.prior, N)
-            features = (read(case.model, sampled(case.model, *of, 3 * fit + i), rng) for i, of in enumerate(sides))
-            verdict = trust(*features, resolution=0.5, seed=fit)
-            visible = verdict.figures.difference.detectable
+            features = (
+                read(case.model, sample_counts(case.model, *of, 3 * fit + i), rng) for i, of in enumerate(sides)
+            )
+            verdict = structure_verdict(*features, resolution=0.5, seed=fit)
+            visible = verdict.statistics.difference.detectable
             named.append(visible)
             rows[away].append(
                 (away * unit, verdict.verdict is Verdict.GOOD, visible is not None and away * unit > visible)

@@ -12,7 +12,6 @@ fits of one preset and seed share their feature network, whose training counts a
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,11 +23,12 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.preset import STRUCTURE, Preset
+from probscene.app.fitting.config import FitConfig
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import DEFAULT, PAPER_AERIAL, QUICK
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.derive import derive_complete
-from probscene.inference.judging.metrics import total_variation
+from probscene.inference.statistics.count_metrics import total_variation
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET, poisson
 from probscene.policy import Policy
 from probscene.relations import per_parent
@@ -40,12 +40,12 @@ FITS = ("lstm", "pcfg", "grammar-vae", "mmd", "witness", "js")
 COLUMNS = ("roads", "first", "others", "mean_first", "mean_others", "log_q")
 
 
-def chosen(preset: str, fit: str) -> Preset:
-    """The preset with another guide or objective, for structure alone."""
-    base = replace(PRESETS[preset], learn=STRUCTURE)
+def chosen(preset: str, fit: str) -> FitConfig:
+    """The preset with another guide or divergence, for structure alone."""
+    base = PRESETS[preset].set("parameters=none")
     if fit in ("lstm", "pcfg", "grammar-vae"):
         return base.with_guide(fit)
-    return base.with_objective(fit)
+    return base.with_divergence(fit)
 
 
 class Truth(NamedTuple):
@@ -106,7 +106,8 @@ def show(table: dict[str, list[dict]]) -> None:
 def fit_images(preset: str, name: str, seed: int, out: Path) -> tuple[Policy, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
     images, path = out / f"target-{seed}" / "images", out / f"{preset}-{name}-{seed}"
-    run = fit("aerial2d", images, chosen(preset, name), seed, out=path, resume=True, cache=out / "cache")
+    execution = Execution(cache=out / "cache")
+    run = fit("aerial2d", images, chosen(preset, name), out=path, seed=seed, resume=True, execution=execution)
     return run.guide, timing(run)
 
 

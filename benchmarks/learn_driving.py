@@ -14,7 +14,6 @@ those that can be seen, by correlation, in the start's scenes and in other ones 
 import argparse
 import json
 import time
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -23,19 +22,18 @@ from torch.nn.functional import one_hot
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.sources import FITTED, LEARNT, START, before
+from probscene.app.evaluation.sources import LEARNT, SAMPLED_SOURCES, START, baseline_policies
 from probscene.app.files import write_json
-from probscene.app.fitting.observer import RENDERED_AT_ONCE, Observer
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import STRUCTURE
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, RenderedFeatures
+from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.derive import derive_complete
 from probscene.inference.features.base import FeatureNet
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
-from probscene.inference.judging.tally import around
+from probscene.inference.features.counting.training import CountFeatures
+from probscene.inference.statistics.count_metrics import bootstrap_interval, histogram, total_variation, wasserstein
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
@@ -59,7 +57,10 @@ def apart(counts: np.ndarray, truth: np.ndarray) -> dict[str, list[float]]:
     resampled = rng.multinomial(len(counts), own, RESAMPLES) / len(counts)
     distances = {"total_variation": total_variation, "wasserstein": wasserstein}
     return {
-        name: [round(x, 4) for x in around(distance(own, true), [distance(each, true) for each in resampled], 0.0)]
+        name: [
+            round(x, 4)
+            for x in bootstrap_interval(distance(own, true), [distance(each, true) for each in resampled], 0.0)
+        ]
         for name, distance in distances.items()
     }
 
@@ -80,7 +81,7 @@ def sampled_anew(model: SceneModel, num: int) -> np.ndarray:
 def correlations(model: SceneModel, policy: Policy, net: FeatureNet, least: float) -> dict[str, float]:
     """By class, of what the features read in scenes and what is seen there of ``least`` of its silhouette or more."""
     seed_everything(99)
-    observer, parts = Observer(model, 1), []
+    observer, parts = RenderedFeatures(model, 1), []
     for _ in range(0, READ, RENDERED_AT_ONCE):
         drawn = observer.labelled(sample(model, policy, RENDERED_AT_ONCE))
         label = drawn.label.masked_fill(drawn.visible < least, -1)
@@ -103,32 +104,33 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=3000)
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     model, rows = load_model(args.model), []
     for seed in args.seeds:
         target = model.target(seed)
         folder = args.out / f"target-{seed}"
         generate_scenes(target, target.prior, args.images, folder, seed=1000 + seed, format="images")
-        chosen = override(replace(preset(args.preset), learn=STRUCTURE), args.settings)
+        config = preset(args.preset).set("parameters=none", *args.settings)
         path = args.out / f"run-{seed}"
         began = path.exists()
         start = time.monotonic()
-        run = fit(args.model, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
+        execution = Execution(cache=args.out / "cache")
+        run = fit(args.model, folder / "images", config, out=path, seed=seed, resume=True, execution=execution)
         truth = counted(model, target.prior)
         row = {"seed": seed, "seconds": round(time.monotonic() - start, 1), "stages": timing(run), "resumed": began}
-        policies = {**before(run.model), LEARNT: run.guide}
+        policies = {**baseline_policies(run.model), LEARNT: run.guide}
         counts = {name: counted(model, policy) for name, policy in policies.items()}
         counts[FLOOR] = sampled_anew(target, args.images)
         row |= distances(model, counts, truth)
         net = run.network()
         if net is not None:
-            least = chosen.count.min_visible
+            least = run.features.schedule.min_visible if isinstance(run.features, CountFeatures) else 0.0
             sides = {START: (run.model, run.model.pretraining_policy), "target": (target, target.prior)}
             row["read"] = {name: correlations(*side, net, least) for name, side in sides.items()}
         rows.append(row)
         print(json.dumps(row), flush=True)
         write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
-    for name in (name for name in (*FITTED, FLOOR) if name in rows[0]):
+    for name in (name for name in (*SAMPLED_SOURCES, FLOOR) if name in rows[0]):
         cars = [row[name]["car"]["total_variation"][0] for row in rows]
         print(f"{name:8} cars, total variation: mean {np.mean(cars):.3f}, {min(cars):.3f} to {max(cars):.3f}")
 

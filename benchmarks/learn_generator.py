@@ -21,13 +21,13 @@ from given import command, out_option
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import STRUCTURE
+from probscene.app.fitting.config import configuration
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
 from probscene.derive import derive_complete
-from probscene.inference.judging.metrics import histogram, total_variation
+from probscene.inference.statistics.count_metrics import histogram, total_variation
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import per_parent
@@ -75,15 +75,15 @@ def main():
         truth = model.target(seed)
         folder = args.out / f"target-{args.example}-{seed}"
         generate_scenes(truth, truth.prior, args.images, folder, seed=1000 + seed, format="images")
-        base = preset(args.preset) if args.features is None else preset(args.preset).with_features(args.features)
-        chosen = override(base, [f"learn={STRUCTURE}", *args.settings])
+        config = configuration(preset(args.preset), args.features, parameters="none", settings=args.settings)
         path = args.out / f"run-{args.example}-{args.preset}-{seed}"
-        run = fit(file, folder / "images", chosen, seed, out=path, resume=True, cache=args.out / "cache")
+        execution = Execution(cache=args.out / "cache")
+        run = fit(file, folder / "images", config, out=path, seed=seed, resume=True, execution=execution)
         expected = structures(model, truth.prior, STRUCTURES, 99)
         sources = {"prior": model.prior, "start": model.pretraining_policy, "learnt": run.guide}
         row = {name: apart(structures(model, policy, STRUCTURES, 98), expected) for name, policy in sources.items()}
         row["floor"] = apart(structures(model, truth.prior, args.images, 97), expected)
-        rows.append({"seed": seed, **row, "seconds": timing(run), "images": run.preset.images})
+        rows.append({"seed": seed, **row, "seconds": timing(run), "images": run.config.images})
         print(json.dumps(rows[-1]), flush=True)
         write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
 

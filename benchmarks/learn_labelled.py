@@ -26,16 +26,17 @@ import probscene as ps
 from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import Labels, read_labels
-from probscene.app.evaluation.sources import FITTED
+from probscene.app.evaluation.sources import SAMPLED_SOURCES
 from probscene.app.evaluation.structure_counts import StructureCounts
 from probscene.app.files import make_folder, write_json
-from probscene.app.fitting.preset import BOTH, STRUCTURE
-from probscene.app.fitting.presets import PRESETS
-from probscene.app.labelling.counts import write_counts
+from probscene.app.fitting.config import BOTH, STRUCTURE, configuration, parameter_choice
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import PRESETS, preset
+from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.count_metrics import histogram, total_variation, wasserstein
 
 SCENES, RESAMPLES = 2000, 200
 COUNTS = "count=efficientnet"
@@ -77,7 +78,7 @@ def main():
     parser.add_argument("--min-height", type=float, default=0.0, help="of boxes that are counted, pixels")
     args = parser.parse_args()
     needed(args.labels, "a model, a folder of images, and their labels")
-    keep_freed_memory()
+    tune_malloc()
     model = load_model(args.model)
     folder = ImageFolder(args.images, model.canvas, model.channels)
     every = read_labels(args.labels, model, folder, min_height=args.min_height)
@@ -91,11 +92,17 @@ def main():
         write_counts(out, [names[i] for i in few], counts[few], classes)
         seen = [folder.paths[i] for i in sorted({*few, *rest})]
         start = time.monotonic()
+        config = configuration(preset(args.preset), COUNTS, parameters=parameter_choice(args.learn, None))
         run = fit(
-            args.model, seen, args.preset, seed,
-            features=COUNTS, learn=args.learn, labels=out if args.number else None,
-            out=args.out / f"run-{seed}", resume=True, cache=False,
-        )  # fmt: skip
+            args.model,
+            seen,
+            config,
+            out=args.out / f"run-{seed}",
+            seed=seed,
+            labels=out if args.number else None,
+            resume=True,
+            execution=Execution(cache=False),
+        )
         judged = ImageFolder([folder.paths[i] for i in rest], model.canvas, model.channels)
         truth = Labels(StructureCounts(counts[rest], {}), None, classes, every.notes, every.min_height)
         found = evaluate(run, judged, truth, lambda *_: None, num=SCENES)
@@ -103,7 +110,9 @@ def main():
         row |= {"unread": list(run.unread), "means": {}, "distances": {}}
         for c, name in enumerate(classes):
             column = found.classes.index(name)
-            each = {s: source.counts[:, column] for s, source in found.sources.items() if s in (*FITTED, "truth")}
+            each = {
+                s: source.counts[:, column] for s, source in found.sources.items() if s in (*SAMPLED_SOURCES, "truth")
+            }
             row["means"][name] = {s: round(float(x.mean()), 2) for s, x in each.items()}
             row["distances"][name] = {s: apart(x, counts[rest, c]) for s, x in each.items() if s != "truth"}
             if len(few):

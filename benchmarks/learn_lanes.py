@@ -27,11 +27,13 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.storage import timing
-from probscene.app.memory import keep_freed_memory
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import preset
+from probscene.app.fitting.store import timing
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import kid
+from probscene.inference.statistics.image_metrics import kid
 from probscene.models.aerial2d import CANVAS, GRAMMAR, MODEL
 from probscene.sampling import Scenes, sample, seed_everything
 
@@ -77,9 +79,9 @@ def measured(seed: int, args: argparse.Namespace) -> dict:
     """One seed's rows."""
     target, truth = args.out / f"target-{seed}", MODEL.target(0)
     generate_scenes(truth, truth.prior, args.images, target, seed=1000 + seed, format="images")
-    learn = {"learn": "structure,parameters", "threads": 1, "cache": args.out / "cache", "resume": True}
-    learn |= {"out": args.out / f"both-{seed}", "settings": args.set}
-    run = fit("aerial2d", target / "images", args.preset, seed, **learn)
+    config, out = preset(args.preset).set("parameters=any", *args.set), args.out / f"both-{seed}"
+    execution = Execution(1, cache=args.out / "cache")
+    run = fit("aerial2d", target / "images", config, out=out, seed=seed, resume=True, execution=execution)
     look, real = EfficientNetLite(), ImageFolder(target / "images", run.model.canvas, run.model.channels)
     of_real = look.embed(torch.stack([real.load(i) for i in range(2 * IMAGES)]))
     seed_everything(seed)
@@ -108,9 +110,9 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="quick")
-    parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
+    parser.add_argument("--set", action="append", default=[], help="as of probscene fit")
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     rows = []
     for seed in args.seeds:
         rows.append(measured(seed, args))

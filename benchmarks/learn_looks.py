@@ -32,16 +32,17 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
-from probscene.app.fitting.preset import BOTH
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.learnt_parameters import NAME, learnt_by, prefixed
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import preset
+from probscene.app.fitting.store import timing
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import kid
-from probscene.inference.judging.metrics import histogram, total_variation
-from probscene.inference.parameters.sites import NEAR, quantiles_of, site_name, within
+from probscene.inference.parameters.sites import U_EPS, quantiles_of, site_name, with_handlers
+from probscene.inference.statistics.count_metrics import histogram, total_variation
+from probscene.inference.statistics.image_metrics import kid
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
@@ -68,7 +69,7 @@ class Narrowed(Messenger):
         low = self.lowest.get(site_name(self.grammar, msg["name"]))
         if low is not None and msg["value"] is None:
             u = msg["fn"].cdf(msg["fn"].sample())
-            msg["value"] = msg["fn"].icdf((low + WIDTH * u).clamp(NEAR, 1 - NEAR))
+            msg["value"] = msg["fn"].icdf((low + WIDTH * u).clamp(U_EPS, 1 - U_EPS))
 
 
 def hidden(model: SceneModel, seed: int) -> SceneModel:
@@ -76,7 +77,7 @@ def hidden(model: SceneModel, seed: int) -> SceneModel:
     assert model.target is not None
     truth, rng = model.target(seed), np.random.default_rng(seed)
     lowest = dict(zip(HIDDEN, rng.uniform(0, 1 - WIDTH, len(HIDDEN)).tolist(), strict=True))
-    return within(truth, Narrowed(truth, lowest))
+    return with_handlers(truth, Narrowed(truth, lowest))
 
 
 def quantiles(model: SceneModel, drawn_by: SceneModel, policy: Policy, seed: int) -> dict[str, list[np.ndarray]]:
@@ -102,12 +103,16 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
     """One seed's rows."""
     folder, truth = args.out / f"target-{seed}", hidden(model, seed)
     generate_scenes(truth, truth.prior, args.images, folder, seed=1000 + seed, format="images")
-    learn = {"learn": BOTH, "threads": args.threads, "cache": args.out / "cache", "resume": True}
-    run = fit(
-        args.model, folder / "images", args.preset, seed, out=args.out / f"run-{seed}", settings=args.set, **learn
-    )
+    config = preset(args.preset).set("parameters=any", *args.set)
+    execution = Execution(args.threads, cache=args.out / "cache")
+    out = args.out / f"run-{seed}"
+    run = fit(args.model, folder / "images", config, out=out, seed=seed, resume=True, execution=execution)
     tensors = run.read_tensors(NAME)
-    learnt = learnt_by(run, run.guide, beside(tensors)).suited(model) if tensors else model
+    learnt = (
+        learnt_by(model, run.config, run.parameters, run.guide, prefixed(tensors)).with_parameters(model)
+        if tensors
+        else model
+    )
     structure = copy(run.guide)
     structure.suits = None
     true = quantiles(model, truth, truth.prior, 1)
@@ -156,9 +161,9 @@ def main():
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--preset", default="street")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
+    parser.add_argument("--set", action="append", default=[], help="as of probscene fit")
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     model, rows = load_model(args.model), []
     for seed in args.seeds:
         rows.append(measured(model, seed, args))

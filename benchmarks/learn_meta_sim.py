@@ -21,13 +21,13 @@ from learn_parameters import SIDE, picture, row_errors
 from torch import Tensor
 
 from probscene.app.files import write_json
-from probscene.app.fitting.observer import Observer
-from probscene.app.fitting.overrides import override
 from probscene.app.fitting.presets import QUICK
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.presence_task import PresenceTask
+from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.meta_sim.task import TaskLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
 from probscene.inference.training import Training
@@ -41,11 +41,11 @@ IMAGES, TRIED, TOLD = 1000, 500, 10  # of the target; scenes that figures are of
 
 def figures(transform: ParameterTransform | None, structure: Policy) -> tuple[dict[str, float], Tensor]:
     """Of new scenes, how far they are from rows; and images of some of them."""
-    model = MODEL if transform is None else transform.suited(MODEL)
+    model = MODEL if transform is None else transform.with_parameters(MODEL)
     seed_everything(1)
     with torch.no_grad():
         scenes = sample(model, structure, TRIED)
-    return row_errors([scenes]), Observer(MODEL, 1).labelled(scenes, slice(0, SIDE**2)).image
+    return row_errors([scenes]), RenderedFeatures(MODEL, 1).labelled(scenes, slice(0, SIDE**2)).image
 
 
 def task_of(target: int, structure: Policy, labelled: int) -> PresenceTask:
@@ -53,9 +53,9 @@ def task_of(target: int, structure: Policy, labelled: int) -> PresenceTask:
     assert MODEL.target is not None
     truth = MODEL.target(target)
     seed_everything(2)
-    drawn = Observer(truth, 1).labelled(sample(truth, structure, labelled))
+    drawn = RenderedFeatures(truth, 1).labelled(sample(truth, structure, labelled))
     shown = torch.stack([(drawn.label == c).any(1) for c in range(len(CLASSES))], 1)
-    return PresenceTask(Observer(MODEL, 1).labelled, drawn.image, shown)
+    return PresenceTask(RenderedFeatures(MODEL, 1).labelled, drawn.image, shown)
 
 
 def learnt(name: str, training: Training, transform: ParameterTransform, structure: Policy) -> dict:
@@ -94,10 +94,11 @@ def main():
     images = torch.stack([real.load(i) for i in range(IMAGES)])
     number, share = distributions(args.target)
     structure = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
-    settings = ["parameter_method=meta-sim", *(f"meta_sim.{setting}" for setting in args.set)]
-    schedule = override(QUICK, settings).meta_sim
+    given = (f"parameters.{setting}" for setting in args.set)
+    schedule = QUICK.set("parameters=meta-sim", *given).parameters
+    assert isinstance(schedule, MetaSimSchedule)
     look = EfficientNetLite(schedule.feature_size)
-    seen = Observer(MODEL, 1).observe(look)
+    seen = RenderedFeatures(MODEL, 1).observe(look)
     matching = MetaSimLearning(MODEL, structure, seen, look.embed(images), schedule, args.seed)
     transform = matching.guide
     assert transform is not None

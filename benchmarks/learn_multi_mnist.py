@@ -15,7 +15,6 @@ import gzip
 import json
 import shutil
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -26,25 +25,26 @@ from given import mnist_option, needed_mnist, out_option
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.files import write_json
-from probscene.app.fitting.preset import BOTH, STRUCTURE
+from probscene.app.fitting.config import BOTH, STRUCTURE, configuration, parameter_choice
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import DEFAULT, PAPER, QUICK
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
+from probscene.inference.statistics.count_metrics import histogram, pooled_shares, total_variation
+from probscene.inference.structure_training import StructureTraining
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL
 from probscene.sampling import seed_everything
 from probscene.structure import StructurePrior, counts, weights
 
 PRESETS = {
     "quick": QUICK,
-    "quick-mmd": QUICK.with_objective("mmd"),
+    "quick-mmd": QUICK.with_divergence("mmd"),
     "default": DEFAULT,
-    "default-mmd": DEFAULT.with_objective("mmd"),
+    "default-mmd": DEFAULT.with_divergence("mmd"),
     "paper": PAPER,
     "oracle": QUICK,
 }
@@ -133,8 +133,9 @@ def floor(target: int, images: int) -> tuple[float, float]:
 def fit_images(name: str, target: int, seed: int, args) -> tuple[LSTMGuide, dict[str, float]]:
     """A fit from images, resumed if it was begun."""
     images, out = args.out / f"target-{target}", args.out / f"{name}-{target}"
-    preset = replace(PRESETS[name], learn=args.learn)
-    run = fit("multi_mnist", images, preset, seed, out=out, resume=True, cache=args.out / "cache")
+    config = configuration(PRESETS[name], parameters=parameter_choice(args.learn, None))
+    execution = Execution(cache=args.out / "cache")
+    run = fit("multi_mnist", images, config, out=out, seed=seed, resume=True, execution=execution)
     return run.guide, timing(run)
 
 
@@ -160,7 +161,7 @@ def fit_counts(target: int, seed: int, images: int) -> tuple[LSTMGuide, dict[str
     pretrain(guide, MODEL.prior)
     loss = ScoreFunction(observe, QUICK.divergence(), updates=QUICK.updates)
     features = torch.cat([seen, seen.sum(1, keepdim=True)], 1)
-    Trainer(structures, guide, loss, features, ORACLE_BATCHES, seed=seed).run()
+    StructureTraining(structures, guide, loss, features, ORACLE_BATCHES, seed=seed).run()
     return guide, {"structure": time.monotonic() - start}
 
 

@@ -29,16 +29,18 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.chunks import CHUNK, draw_chunk
 from probscene.app.files import write_json
-from probscene.app.fitting.learnt.parameters import NAME, beside, learnt_by
-from probscene.app.fitting.learnt.structure import BEFORE
-from probscene.app.fitting.preset import LIKELIHOOD
+from probscene.app.fitting.config import LIKELIHOOD
+from probscene.app.fitting.learnt_parameters import NAME, learnt_by, prefixed
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
-from probscene.app.fitting.storage import timing
+from probscene.app.fitting.store import timing
+from probscene.app.fitting.structure_stage import BEFORE
 from probscene.app.loading import renderer_for
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import Figure, kid
+from probscene.inference.statistics.image_metrics import ImageDistance, kid
 from probscene.policy import Policy
 from probscene.sampling import Scenes
 
@@ -72,7 +74,7 @@ def drawn(run: RunFolder, policy: Policy, seed: int) -> tuple[list[Scenes], Tens
     return scenes, torch.cat([render(some.drawing).image for some in scenes])[:IMAGES]
 
 
-def said(figure: Figure) -> dict[str, float]:
+def said(figure: ImageDistance) -> dict[str, float]:
     """For JSON."""
     return {"value": figure.value, "low": figure.low, "high": figure.high}
 
@@ -93,9 +95,9 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
     """The rows of one target and one way of learning parameters."""
     images, name = args.out / f"target-{target}", "both" if method == LIKELIHOOD else method
     draw_target(args.mnist, target, images, args.images)
-    learn = {"learn": "structure,parameters", "threads": 1, "cache": args.out / "cache", "resume": True}
-    learn |= {"parameters": method, "out": args.out / f"{name}-{target}", "settings": args.set}
-    run = fit("multi_mnist", images, args.preset, args.seed, **learn)
+    config, out = preset(args.preset).set(f"parameters={method}", *args.set), args.out / f"{name}-{target}"
+    execution = Execution(1, cache=args.out / "cache")
+    run = fit("multi_mnist", images, config, out=out, seed=args.seed, resume=True, execution=execution)
     look, real = EfficientNetLite(), ImageFolder(images, run.model.canvas, run.model.channels)
     of_real = look.embed(torch.stack([real.load(i) for i in range(2 * IMAGES)]))
     first, before = run.new_guide().eval(), run.read_tensors(BEFORE)
@@ -112,7 +114,9 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
     }
     row["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
     panels, tensors = [], run.read_tensors(NAME)
-    suits = learnt_by(run, run.guide, beside(tensors)).suited if tensors else None
+    suits = None
+    if tensors:
+        suits = learnt_by(run.model, run.config, run.parameters, run.guide, prefixed(tensors)).with_parameters
     for source in SOURCES:
         policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
         policy.suits = suits if source in ("parameters", "both") else None
@@ -133,9 +137,9 @@ def main():
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--parameters", nargs="+", default=[LIKELIHOOD], help="ways of learning them")
-    parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
+    parser.add_argument("--set", action="append", default=[], help="as of probscene fit")
     args = parser.parse_args()
-    keep_freed_memory()
+    tune_malloc()
     args.mnist = needed_mnist(args.mnist)
     rows = []
     for target in args.targets:

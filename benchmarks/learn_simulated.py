@@ -15,7 +15,6 @@ is apart (``read``). FOLDER holds ``results.json``.
 import argparse
 import json
 import time
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -23,19 +22,18 @@ from given import command, out_option
 from learn_driving import FLOOR, counted, distances, sampled_anew
 from torch import Tensor
 
-from probscene.app.evaluation.sources import FITTED, LEARNT, before
+from probscene.app.evaluation.sources import LEARNT, SAMPLED_SOURCES, baseline_policies
 from probscene.app.files import make_folder, write_json
-from probscene.app.fitting.learnt.structure import score_function
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import STRUCTURE, Preset
+from probscene.app.fitting.config import FitConfig
 from probscene.app.fitting.presets import preset
+from probscene.app.fitting.structure_stage import score_function
 from probscene.app.loading import load_model
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
 from probscene.inference.guides.base import Guide
 from probscene.inference.guides.scenario import guide_of
-from probscene.inference.learn import Trainer
 from probscene.inference.pretrain import pretrain
+from probscene.inference.structure_training import StructureTraining
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.policy import Policy
@@ -70,26 +68,27 @@ class Channel:
             return self.read(derive_complete(self.grammar, policy, num, model.max_steps)[0])
 
 
-def learn(model: SceneModel, channel: Channel, real: Tensor, chosen: Preset, seed: int) -> Guide:
+def learn(model: SceneModel, channel: Channel, real: Tensor, config: FitConfig, seed: int) -> Guide:
     """A guide, by what a fit of the preset does."""
     seed_everything(batch_seed(seed, 2))
-    guide, start = guide_of(model.grammar, model.max_steps, **chosen.guide_settings()), model.pretraining_policy
+    guide, start = guide_of(model.grammar, model.max_steps, make=config.guide_maker()), model.pretraining_policy
     guide.bind(model.support)
-    objective = score_function(chosen, model, channel, chosen.divergence(), guide)
-    pretrain(guide, start, chosen.pretrain_derivations, chosen.pretrain_epochs, learning_rate=chosen.pretrain_rate)
-    scenes, images, rate = chosen.num_scenes, chosen.num_real, chosen.learning_rate
+    objective = score_function(config.structure, model, channel, config.make_divergence(), guide)
+    first, then = config.pretrain, config.structure
+    pretrain(guide, start, first.derivations, first.epochs, learning_rate=first.learning_rate)
+    scenes, images, rate = then.num_scenes, then.num_real, then.learning_rate
     seeds = batch_seed(seed, 3)
-    Trainer(model, guide, objective, real, chosen.batches, scenes, images, rate, chosen.cosine, seeds).run()
+    StructureTraining(model, guide, objective, real, then.batches, scenes, images, rate, then.cosine, seeds).run()
     return guide
 
 
 def measured(model: SceneModel, seed: int, again: int, args: argparse.Namespace) -> dict:
     """The row of one fit."""
-    chosen = override(replace(preset(args.preset), learn=STRUCTURE), args.set)
+    config = preset(args.preset).set("parameters=none", *args.set)
     target, channel, began = model.target(seed), Channel(model), time.monotonic()
-    guide = learn(model, channel, channel.sample(target, target.prior, args.images, 1000 + seed), chosen, again)
+    guide = learn(model, channel, channel.sample(target, target.prior, args.images, 1000 + seed), config, again)
     truth = counted(model, target.prior)
-    counts = {name: counted(model, policy) for name, policy in {**before(model), LEARNT: guide}.items()}
+    counts = {name: counted(model, policy) for name, policy in {**baseline_policies(model), LEARNT: guide}.items()}
     counts[FLOOR] = sampled_anew(target, args.images)
     row = {"seed": seed, "again": again, "seconds": round(time.monotonic() - began, 1)}
     sides = (model, guide), (target, target.prior)
@@ -105,7 +104,7 @@ def main():
     parser.add_argument("--again", type=int, default=1, help="seeds of learning for each target (%(default)s)")
     parser.add_argument("--images", type=int, default=3000)
     parser.add_argument("--preset", default="street")
-    parser.add_argument("--set", action="append", default=[], help="key=value, another value of the preset's field")
+    parser.add_argument("--set", action="append", default=[], help="as of probscene fit")
     args = parser.parse_args()
     torch.set_num_threads(1)
     make_folder(args.out)
@@ -116,7 +115,7 @@ def main():
             print(json.dumps(rows[-1]), flush=True)
             write_json(args.out / "results.json", {"command": command(__file__), "rows": rows})
     first = model.classes[0]
-    for name in (name for name in (*FITTED, FLOOR, "read") if name in rows[0]):
+    for name in (name for name in (*SAMPLED_SOURCES, FLOOR, "read") if name in rows[0]):
         each = [row[name][first]["total_variation"][0] for row in rows]
         print(f"{name:8} {first}, total variation: mean {np.mean(each):.3f}, {min(each):.3f} to {max(each):.3f}")
 

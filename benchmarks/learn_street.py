@@ -42,19 +42,19 @@ from torch import Tensor
 from probscene.app.api.fit import fit
 from probscene.app.evaluation.evaluate import Evaluation, evaluate
 from probscene.app.evaluation.labels import Labels, read_labels
-from probscene.app.evaluation.sources import FITTED, LEARNT, before
-from probscene.app.evaluation.structure_counts import sampled
+from probscene.app.evaluation.sources import LEARNT, SAMPLED_SOURCES, baseline_policies
+from probscene.app.evaluation.structure_counts import sample_counts
 from probscene.app.files import write_json
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import BOTH, STRUCTURE
+from probscene.app.fitting.config import BOTH, STRUCTURE
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.kitti import DONT_CARE, read_objects
-from probscene.app.memory import keep_freed_memory
+from probscene.app.labels.kitti import DONT_CARE, read_objects
+from probscene.app.memory import tune_malloc
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.image_metrics import fid, kid
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.count_metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.image_metrics import fid, kid
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -63,9 +63,9 @@ from matplotlib.ticker import MaxNLocator
 DRAWN, RESAMPLES, SMOOTH = 500, 1000, 5  # images of a source; bootstraps; rows
 PARAMETERS = "parameters"
 SETTINGS = {
-    STRUCTURE: [f"learn={STRUCTURE}"],
-    BOTH: [f"learn={BOTH}"],
-    PARAMETERS: [f"learn={BOTH}", "batches=0", "batches_again=0", "on_prior=true"],
+    STRUCTURE: ["parameters=none"],
+    BOTH: ["parameters=any"],
+    PARAMETERS: ["parameters=any", "structure.batches=0", "refine.batches=0", "pretrain.on_prior=true"],
 }
 GRID, GRID_WIDTH = (4, 2), 420  # rows and columns of a source's images; pixels of one
 MARKED, SCENES = 0.01, 2000  # of a frame; of which objects are counted
@@ -81,7 +81,7 @@ def row(found: Evaluation) -> dict:
     """How far prior, start and learnt are from the labels."""
     each = cars(found)
     out = {"truth": {"mean": round(float(np.dot(np.arange(len(each["truth"])), each["truth"])), 2)}}
-    for name in (name for name in each if name in FITTED):
+    for name in (name for name in each if name in SAMPLED_SOURCES):
         out[name] = {
             "mean": round(float(np.dot(np.arange(len(each[name])), each[name])), 2),
             "total_variation": round(float(total_variation(each[name], each["truth"])), 3),
@@ -100,7 +100,7 @@ def from_all(found: Evaluation, counts: Path) -> dict:
             "wasserstein": round(float(wasserstein(each, every)), 3),
         }
         for name, each in cars(found).items()
-        if name in (*FITTED, "truth")
+        if name in (*SAMPLED_SOURCES, "truth")
     }
 
 
@@ -108,7 +108,7 @@ def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) ->
     """The correlation of what is read of cars with the labels, and in how many frames."""
     net = run.network()
     assert net is not None and truth.classes is not None
-    read = net.embed(frames.some(len(frames))).numpy()[:, net.names.index("car")]
+    read = net.embed(frames.subset(len(frames))).numpy()[:, net.names.index("car")]
     true = truth.structures.counts[:, truth.classes.index("car")]
     which = {"all": np.full(len(frames), True)}
     if labels.is_dir():
@@ -126,8 +126,8 @@ def reading(run: RunFolder, frames: ImageFolder, labels: Path, truth: Labels) ->
 def structures(run: RunFolder) -> dict[str, dict[str, float]]:
     """How many objects of each class scenes of each source have in the mean."""
     means = {
-        name: sampled(run.model, policy, SCENES, 0).counts.mean(0).round(2).tolist()
-        for name, policy in {**before(run.model), LEARNT: run.guide}.items()
+        name: sample_counts(run.model, policy, SCENES, 0).counts.mean(0).round(2).tolist()
+        for name, policy in {**baseline_policies(run.model), LEARNT: run.guide}.items()
     }
     return {name: dict(zip(run.model.classes, each, strict=True)) for name, each in means.items()}
 
@@ -162,8 +162,8 @@ def said(images: Tensor) -> dict[str, list[float]]:
 
 def looks(run: RunFolder, frames: ImageFolder, num: int, grid: Path) -> dict:
     """What is said of frames and of each source's images, and how far these are from the frames; some as a picture."""
-    real = frames.some(len(frames))
-    policies = before(run.model)
+    real = frames.subset(len(frames))
+    policies = baseline_policies(run.model)
     if run.parameters:
         policies["structure"] = copy(run.guide)
         policies["structure"].suits = None
@@ -223,13 +223,13 @@ def main():
     args = parser.parse_args()
     args.images = needed(args.images, "a folder of street frames, and the file or folder of their labels")
     args.labels = needed(args.labels, "the frames' labels, KITTI's label_2 or a CSV of counts, after their folder")
-    keep_freed_memory()
+    tune_malloc()
     rows, histograms = [], []
     for seed in args.seeds:
         path = args.out / f"run-{seed}"
-        chosen = override(preset("street").with_features(args.features), [*args.settings, *SETTINGS[args.learn]])
+        config = preset("street").with_features(args.features).set(*SETTINGS[args.learn], *args.settings)
         start = time.monotonic()
-        run = fit(args.model, args.images, chosen, seed, out=path, resume=True, cache=False)
+        run = fit(args.model, args.images, config, out=path, seed=seed, resume=True, execution=Execution(cache=False))
         seconds = round(time.monotonic() - start, 1)
         target = ImageFolder(args.images, run.model.canvas, run.model.channels)
         truth = read_labels(args.labels, run.model, target, False, args.min_height)

@@ -88,8 +88,8 @@ def main():
     true = truth(rng, 20_000)
     tabletop = load_model(str(MODEL))
     for seed in args.seeds:
-        how = {"preset": args.preset, "seed": seed, "threads": 1}
-        run = ps.fit(str(MODEL), target, out=args.out / f"run-{seed}", **how)
+        out, execution = args.out / f"run-{seed}", ps.Execution(threads=1)
+        run = ps.fit(str(MODEL), target, args.preset, out=out, seed=seed, execution=execution)
         policies = {"prior": tabletop.prior, "start": tabletop.pretraining_policy, "learnt": run.guide}
         sources = {name: drawn(tabletop, policy, seed) for name, policy in policies.items()}
         sources["floor"] = [truth(rng, len(some)) for some in sources["learnt"]]

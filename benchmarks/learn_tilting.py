@@ -4,11 +4,11 @@
 
 MODEL is a model's name or file, IMAGES a folder of photographs without labels. One in five judges, and is not learnt
 from. Printed for each seed are squared energy distances of renders from these, by EfficientNet's features and by what
-can plainly be said of an image (``plain``), in units of how far the photographs are apart, without bias, with the
-interval that holds 95 % of bootstraps over images; for the prior, the start (the structures that a fit begins with,
-under the prior's parameters), what was learnt (the same structures, learnt parameters), and the floor, the photographs
-that were learnt from. Then the sites that were moved, renders, and CPU seconds. FOLDER holds ``results.json``, and a
-picture of each seed, ``scenes-K.png``: start, learnt, photographs.
+can plainly be said of an image (``image_statistics``), in units of how far the photographs are apart, without bias,
+with the interval that holds 95 % of bootstraps over images; for the prior, the start (the structures that a fit begins
+with, under the prior's parameters), what was learnt (the same structures, learnt parameters), and the floor, the
+photographs that were learnt from. Then the sites that were moved, renders, and CPU seconds. FOLDER holds
+``results.json``, and a picture of each seed, ``scenes-K.png``: start, learnt, photographs.
 """
 
 import argparse
@@ -25,20 +25,19 @@ from torch import Tensor
 
 import probscene as ps
 from probscene.app.files import make_folder, write_json
-from probscene.app.fitting.learnt.parameters import HELD
-from probscene.app.fitting.observer import RENDERED_AT_ONCE, Observer
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import TILTING
+from probscene.app.fitting.parameter_stage import HELD
 from probscene.app.fitting.presets import preset
+from probscene.app.fitting.rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from probscene.app.loading import load_model
-from probscene.app.memory import keep_freed_memory
+from probscene.app.memory import tune_malloc
 from probscene.app.progress import Display
 from probscene.dataset import ImageFolder
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.tally import around, resamples
-from probscene.inference.judging.two_sample import Features
+from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import TiltingLearning
-from probscene.inference.parameters.tilting.plain import plain
+from probscene.inference.parameters.tilting.schedule import TiltingSchedule
+from probscene.inference.statistics.count_metrics import bootstrap_interval, resamples
+from probscene.inference.statistics.energy import Features
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import sample, seed_everything
@@ -62,7 +61,7 @@ def squared(own: Features, real: Features) -> tuple[float, float, float]:
 
     whole = found(np.ones((1, len(own))), np.ones((1, len(real))))
     drawn = found(resamples(len(own), RESAMPLES, 0), resamples(len(real), RESAMPLES, 1))
-    value, low, high = around(float(whole[0]), drawn)
+    value, low, high = bootstrap_interval(float(whole[0]), drawn)
     return round(value, 4), round(low, 4), round(high, 4)
 
 
@@ -77,7 +76,7 @@ def picture(panels: list[Tensor], path: Path) -> None:
     cv2.imwrite(str(path), np.concatenate(blocks[:-1], 1)[..., ::-1])
 
 
-def renders(observer: Observer, model: SceneModel, policy: Policy, number: int) -> Tensor:
+def renders(observer: RenderedFeatures, model: SceneModel, policy: Policy, number: int) -> Tensor:
     """Images ``(number, C, H, W)``, of one seed."""
     seed_everything(99)
     parts = [min(RENDERED_AT_ONCE, number - i) for i in range(0, number, RENDERED_AT_ONCE)]
@@ -85,12 +84,13 @@ def renders(observer: Observer, model: SceneModel, policy: Policy, number: int) 
 
 
 def learn(
-    model: SceneModel, observer: Observer, photographs: Tensor, seed: int, settings: list[str]
+    model: SceneModel, observer: RenderedFeatures, photographs: Tensor, seed: int, settings: list[str]
 ) -> TiltingLearning:
     """Parameters, learnt from photographs."""
-    given = [f"parameter_method={TILTING}", *(f"tilting.{setting}" for setting in settings)]
-    schedule = override(preset("quick"), given).tilting
-    seen_by = EfficientNetLite(schedule.feature_size).embed, plain
+    given = (f"parameters.{setting}" for setting in settings)
+    schedule = preset("quick").set("parameters=tilting", *given).parameters
+    assert isinstance(schedule, TiltingSchedule)
+    seen_by = EfficientNetLite(schedule.feature_size).embed, image_statistics
     real = tuple(embed(photographs) for embed in seen_by)
     learning = TiltingLearning(model, model.pretraining_policy, observer.labelled, seen_by, real, schedule, seed)
     with Display() as show:
@@ -108,15 +108,15 @@ def main():
     parser.add_argument("--set", action="append", default=[], help="key=value, another value of the schedule's field")
     args = parser.parse_args()
     needed(args.photographs, "a model and a folder of photographs")
-    keep_freed_memory()
+    tune_malloc()
     torch.set_num_threads(1)
     make_folder(args.out)
     model, rows = load_model(args.model), []
     folder = ImageFolder(args.photographs, model.canvas, model.channels)
     target = torch.stack([folder.load(i) for i in range(len(folder))])
     held = torch.arange(len(target)) % HELD == HELD - 1
-    observer, start = Observer(model, 1), model.pretraining_policy
-    judges = {"efficientnet": EfficientNetLite().embed, "plain": plain}
+    observer, start = RenderedFeatures(model, 1), model.pretraining_policy
+    judges = {"efficientnet": EfficientNetLite().embed, "plain": image_statistics}
 
     def seen(images: Tensor) -> dict[str, Features]:
         return {judge: embed(images).double().numpy() for judge, embed in judges.items()}
@@ -135,7 +135,7 @@ def main():
         row: dict = {"seed": seed, "photographs": len(target), "judged": int(held.sum())}
         row |= {"moved": [site.name for site in learning.learnt], "renders": learning.schedule.drawn}
         row["seconds"] = round(time.process_time() - before)
-        learnt = model if learning.guide is None else learning.guide.suited(model)
+        learnt = model if learning.guide is None else learning.guide.with_parameters(model)
         images = renders(observer, learnt, start, args.images)
         of_source = same | {"learnt": apart(images)}
         row |= {judge: {source: found[judge] for source, found in of_source.items()} for judge in judges}

@@ -12,8 +12,8 @@ import time
 
 import torch
 
-from probscene.app.fitting.observer import Observer
 from probscene.app.fitting.presets import QUICK
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.app.loading import load_model, renderer_for
 from probscene.derive import derive_complete
 from probscene.inference.guides.lstm import make_guide
@@ -69,7 +69,7 @@ def main():
     columns = {}
     for features in args.features:
         seed_everything(0)
-        view = Observer(model, 1)
+        view = RenderedFeatures(model, 1)
         net = QUICK.with_features(features).make_features().build(model).eval()
         if features == "count":
             net.fit_to(view.object_size())

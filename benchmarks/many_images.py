@@ -30,7 +30,14 @@ from pycocotools.coco import COCO
 import probscene as ps
 from probscene.app.files import write_json
 
-SHORT = {"count.steps": 60, "batches": 2, "num_scenes": 100, "pretrain_derivations": 500, "learn": "structure"}
+SHORT = {
+    "features": "count",
+    "parameters": "none",
+    "features.schedule.steps": 60,
+    "structure.batches": 2,
+    "structure.num_scenes": 100,
+    "pretrain.derivations": 500,
+}
 MEGA = 2**20
 
 
@@ -94,7 +101,8 @@ def main():
     target, path, rows = args.out / "target", args.out / "run", []
     ps.generate(ps.load_model("multi_mnist").target(0), 200, target, format="images", progress=False)
     shutil.rmtree(path, ignore_errors=True)
-    ps.fit("multi_mnist", target / "images", "quick", features="count", settings=SHORT, out=path, progress=False)
+    config, execution = ps.preset("quick").set(SHORT), ps.Execution(progress=False)
+    ps.fit("multi_mnist", target / "images", config, out=path, execution=execution)
     for format in args.formats:
         out = args.out / format
         shutil.rmtree(out, ignore_errors=True)

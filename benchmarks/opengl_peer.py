@@ -8,10 +8,10 @@ import moderngl
 import numpy as np
 import opengl_shaders as glsl
 
-from probscene.renderers.mesh import tables
-from probscene.renderers.mesh.atlas import MeshAtlas
 from probscene.renderers.mesh.instances import instances
 from probscene.renderers.mesh.scenes import view
+from probscene.renderers.mesh.tables import layout
+from probscene.renderers.mesh.tables.atlas import MeshAtlas
 from probscene.world import World
 
 
@@ -21,9 +21,9 @@ class Peer:
     def __init__(self, world: World, canvas: tuple[int, int], map_size: int):
         self.canvas, self.map_size, atlas, sight = canvas, map_size, MeshAtlas(), view(world)
         table = instances(world, atlas, canvas, map_size)
-        self.real = table.real.reshape(-1, tables.REALS).astype(np.float32)
-        self.whole = table.whole.reshape(-1, tables.INTEGERS)
-        scenes = table.scenes.reshape(-1, tables.SCENE)
+        self.real = table.real.reshape(-1, layout.REALS).astype(np.float32)
+        self.whole = table.whole.reshape(-1, layout.INTEGERS)
+        scenes = table.scenes.reshape(-1, layout.SCENE)
         self.first, (layer,) = table.first, world.layers
         self.yaw = layer.yaw.numpy()
         self.mesh = layer.mesh.numpy()
@@ -57,7 +57,7 @@ class Peer:
         self.sky["canvas"], self.sky["horizon"] = (width, height), horizon
         self.sky["zenith"] = tuple(light.zenith[0].tolist())
         self.sky["lens"] = float(camera.focal[0]), float(camera.centre_x[0]), float(camera.centre_y[0])
-        on_map = scenes[:, tables.ON_MAP : tables.ON_MAP + 12].reshape(-1, 3, 4)
+        on_map = scenes[:, layout.ON_MAP : layout.ON_MAP + 12].reshape(-1, 3, 4)
         per_metre = np.linalg.norm(np.linalg.solve(sight.ray.swapaxes(1, 2), on_map[:, :, 1:].swapaxes(1, 2)), axis=1)
         rows = sight.sun * per_metre[:, :, None]
         self.ground_map = np.concatenate([rows, on_map[:, :, :1] - rows @ sight.eye[:, :, None]], 2).astype("f4")
@@ -98,24 +98,24 @@ class Peer:
         context.front_face = "cw"  # the image is upside down
         for scene in range(number):
             part = range(self.first[scene], self.first[scene + 1])
-            mesh = {k: self.mesh[scene, self.whole[k, tables.NODE]] for k in part}
+            mesh = {k: self.mesh[scene, self.whole[k, layout.NODE]] for k in part}
             context.enable_only(moderngl.DEPTH_TEST)
             self.map_buffer.use()
             self.map_buffer.clear(depth=1.0)
             for k in part:
-                self.cast["to_map"].write(self.real[k, tables.TO_MAP : tables.TO_MAP + 12])
+                self.cast["to_map"].write(self.real[k, layout.TO_MAP : layout.TO_MAP + 12])
                 self.casting[mesh[k]].render()
             context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self.buffer.use()
             self.buffer.clear(depth=1.0)
             self.map.use(0)
             for k in part:
-                node = self.whole[k, tables.NODE]
+                node = self.whole[k, layout.NODE]
                 cos, sin = np.cos(self.yaw[scene, node]), np.sin(self.yaw[scene, node])
-                self.draw["to_image"].write(self.real[k, tables.TO_IMAGE : tables.TO_IMAGE + 12])
-                self.draw["to_map"].write(self.real[k, tables.TO_MAP : tables.TO_MAP + 12])
+                self.draw["to_image"].write(self.real[k, layout.TO_IMAGE : layout.TO_IMAGE + 12])
+                self.draw["to_map"].write(self.real[k, layout.TO_MAP : layout.TO_MAP + 12])
                 self.draw["turn"], self.draw["label"] = (cos, sin, 0, -sin, cos, 0, 0, 0, 1), int(node) + 1
-                self.draw["tint"].write(self.real[k, tables.TINT : tables.TINT + 3])
+                self.draw["tint"].write(self.real[k, layout.TINT : layout.TINT + 3])
                 self.draw["textured"] = panes is not None if (panes := self.panes[mesh[k]]) else False
                 if panes:
                     panes.use(1)

@@ -22,7 +22,7 @@ from probscene.app.evaluation.labels import read_labels
 from probscene.app.files import make_folder, write_json
 from probscene.app.fitting.run import RunFolder
 from probscene.dataset import ImageFolder
-from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.photographs.net import PretrainedCountNet
 from probscene.inference.features.photographs.readability import Read, with_labels
 from probscene.inference.features.photographs.reading import by_steps
 
@@ -67,13 +67,13 @@ def main():
         run = RunFolder.at(path)
         net = run.network()
         if not isinstance(net, PretrainedCountNet):
-            parser.error(f"expected runs with features count=efficientnet, actual others in {path}")
+            parser.error(f"expected runs with features count=efficientnet, got others in {path}")
         folder = ImageFolder(args.images, run.model.canvas, run.model.channels)
         every = read_labels(args.labels, run.model, folder, min_height=args.min_height)
         labelled = [run.model.classes[c] for c in every.columns(run.model)]
         parts = [torch.stack([folder.load(i) for i in range(k, min(k + AT_ONCE, len(folder)))])
                  for k in range(0, len(folder), AT_ONCE)]  # fmt: skip
-        whole = torch.cat([net.readings(net.look(some))[0] for some in parts])
+        whole = torch.cat([net.readings(net.compute_maps(some))[0] for some in parts])
         read = Read(whole, whole[:0], net.apart, net.held_read, net.held_true)
         for name in (name for name in labelled if name in (args.classes or labelled)):
             counts = every.structures.counts[:, labelled.index(name)]

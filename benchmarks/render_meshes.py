@@ -19,9 +19,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from probscene.camera_effects import CameraEffects
 from probscene.mesh import Mesh, Surface
-from probscene.photo import Photo
-from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.mesh.renderer import MeshRenderer
 from probscene.threads import use_threads
 from probscene.world import Camera, Ground, Light, Meshes, World, resolve_ground, resolve_meshes, resolve_scene
 
@@ -84,7 +84,7 @@ def streets(scenes: int, canvas: tuple[int, int]) -> World:
         resolve_scene(Camera.kitti(canvas), scenes),
         resolve_scene(Light(), scenes),
         resolve_ground(ground, scenes),
-        resolve_scene(Photo(), scenes),
+        resolve_scene(CameraEffects(), scenes),
     )
 
 
@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("--pictures", help="a folder for the first scene as both draw it")
     arguments = parser.parse_args()
     if importlib.util.find_spec("moderngl") is None:
-        print("Skipped: expected moderngl, actual none; make benchmark installs it.")
+        print("Skipped: expected moderngl, got none; make benchmark installs it.")
         return
     from opengl_peer import Peer
 

@@ -31,12 +31,19 @@ from typing import Any
 from given import out_option
 
 import probscene as ps
+from probscene.app.fitting.config import configuration
+from probscene.app.fitting.presets import preset
 
 IMAGES, TARGET_IMAGES, LABELLED = 128, 48, 8
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 TABLETOP = str(EXAMPLES / "tabletop.py")
-STRUCTURE = {"pretrain_derivations": 100, "pretrain_epochs": 2, "batches": 3, "num_scenes": 32}
-COUNTS = {"count.steps": 48, "count.images": 4, "count.crops": 4, "width": (4, 8, 8)}
+STRUCTURE = {"pretrain.derivations": 100, "pretrain.epochs": 2, "structure.batches": 3, "structure.num_scenes": 32}
+COUNTS = {
+    "features.schedule.steps": 48,
+    "features.schedule.images": 4,
+    "features.schedule.crops": 4,
+    "features.width": (4, 8, 8),
+}
 LIKELIHOOD = {
     "parameters.reader_steps": 20,
     "parameters.scene_renders": 32,
@@ -49,19 +56,25 @@ LIKELIHOOD = {
     "parameters.energy_steps": 2,
     "parameters.energy_scenes": 8,
     "parameters.weighted_scenes": 24,
-    "batches_again": 2,
+    "refine.batches": 2,
 }
-HEADS = {"pairs": 24, "head_epochs": 1, "photographs": 24}
-TILTING = {"tilting.rounds": 2, "tilting.first": 64, "tilting.scenes": 24, "tilting.steps": 4, "batches_again": 2}
+HEADS = {"features.pairs": 24, "features.epochs": 1, "features.photographs": 24}
+TILTING = {
+    "parameters.rounds": 2,
+    "parameters.first": 64,
+    "parameters.scenes": 24,
+    "parameters.steps": 4,
+    "refine.batches": 2,
+}
 META_SIM = {
-    "meta_sim.steps": 3,
-    "meta_sim.scenes": 6,
-    "meta_sim.values": 10,
-    "meta_sim.feature_size": 96,
-    "meta_sim.hidden": 8,
-    "batches_again": 2,
+    "parameters.steps": 3,
+    "parameters.scenes": 6,
+    "parameters.values": 10,
+    "parameters.feature_size": 96,
+    "parameters.hidden": 8,
+    "refine.batches": 2,
 }
-PRESENCE = {"presence_images": 48, "presence_epochs": 1}
+PRESENCE = {"features.images": 48, "features.epochs": 1}
 FITS: dict[str, dict[str, Any]] = {
     "digits": {"model": "multi_mnist", "features": "count", "settings": STRUCTURE | COUNTS | LIKELIHOOD},
     "groups": {
@@ -69,14 +82,14 @@ FITS: dict[str, dict[str, Any]] = {
         "features": "count",
         "divergence": "js",
         "guide": "pcfg",
-        "learn": "structure",
+        "parameters": "none",
         "settings": STRUCTURE | COUNTS,
     },
     "street": {
         "model": "driving_simple:rural",
         "preset": "street",
         "features": "count",
-        "settings": STRUCTURE | COUNTS | LIKELIHOOD | {"num_scenes": 16, "width": (4, 4, 4)},
+        "settings": STRUCTURE | COUNTS | LIKELIHOOD | {"structure.num_scenes": 16, "features.width": (4, 4, 4)},
     },
     "photographs": {
         "model": TABLETOP,
@@ -91,21 +104,21 @@ FITS: dict[str, dict[str, Any]] = {
         "divergence": "witness",
         "guide": "grammar-vae",
         "parameters": "meta-sim",
-        "settings": STRUCTURE | META_SIM | {"pairs": 24, "views": 2},
+        "settings": STRUCTURE | META_SIM | {"features.pairs": 24, "num_crops": 2},
     },
     "scenarios": {
         "model": "driving_simple:rural,suburban",
         "features": "presence",
         "divergence": "mmd",
-        "learn": "structure",
-        "settings": STRUCTURE | PRESENCE | {"num_scenes": 12},
+        "parameters": "none",
+        "settings": STRUCTURE | PRESENCE | {"structure.num_scenes": 12},
     },
     "plug-ins": {
         "model": TABLETOP,
         "features": f"{EXAMPLES}/own_features.py:TinyCounts",
         "divergence": f"{EXAMPLES}/own_divergence.py:energy",
         "guide": f"{EXAMPLES}/own_guide.py:PlaceGuide",
-        "learn": "structure",
+        "parameters": "none",
         "settings": STRUCTURE,
     },
 }
@@ -142,23 +155,16 @@ def bytes_of(file: Path) -> bytes:
 def fit(name: str, out: Path) -> Path:
     """The folder of a finished run."""
     chosen = dict(FITS[name])
-    model, labelled = ps.load_model(chosen.pop("model")), chosen.pop("labels", 0)
+    model_name, labelled = chosen.pop("model"), chosen.pop("labels", 0)
+    model = ps.load_model(model_name)
     source = model if model.target is None else model.target(0)
     target = out / f"{name}-target"
     ps.generate(source, TARGET_IMAGES, target, format="coco", seed=1, progress=False)
-    if labelled:
-        chosen["labels"] = few_labels(target / "annotations.json", labelled)
-    run = ps.fit(
-        FITS[name]["model"],
-        target / "images",
-        chosen.pop("preset", "quick"),
-        seed=3,
-        out=out / name,
-        threads=1,
-        cache=False,
-        progress=False,
-        **chosen,
-    )
+    labels = few_labels(target / "annotations.json", labelled) if labelled else None
+    config = configuration(preset(chosen.pop("preset", "quick")), **chosen)
+    execution = ps.Execution(threads=1, cache=False, progress=False)
+    images = target / "images"
+    run = ps.fit(model_name, images, config, seed=3, out=out / name, labels=labels, execution=execution)
     return run.path
 
 

@@ -2,12 +2,12 @@
 
     python benchmarks/tell_domain_shift.py [--images 40] [--scenes 160] [--seed 0] [--photographs FOLDER ...]
 
-Printed for each is the share of its images that show what is unlike anything in the prior's scenes (``strange``); from
-a half on a verdict says "another domain". Beside it is the share of images that are farther from every scene than two
-scenes are from one another, by features of whole images (``foreign``), which verdicts went by before. Nothing is
-fitted. Not learnt, but within the model's reach, are digits and roads in other numbers and other places. Other domains
-are letters, and digits and roads that are turned, larger, blurred, noisy or in other colours than the model draws;
-photographs in folders are held against the model of digits.
+Printed for each is the share of its images that show what is unlike anything in the prior's scenes
+(``patch_outliers``); from a half on the verdict is "domain shift". Beside it is the share of images that are farther
+from every scene than two scenes are from one another, by features of whole images (``distance_outliers``), which
+verdicts went by before. Nothing is fitted. Not learnt, but within the model's reach, are digits and roads in other
+numbers and other places. Other domains are letters, and digits and roads that are turned, larger, blurred, noisy or in
+other colours than the model draws; photographs in folders are held against the model of digits.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.derive import derive
 from probscene.inference.features.pretrained import EfficientNetLite
-from probscene.inference.judging.support import foreign, strange
+from probscene.inference.statistics.domain_shift import distance_outliers, patch_outliers
 from probscene.model import SceneModel
 from probscene.models import multi_mnist
 from probscene.models.digits import shipped
@@ -38,7 +38,7 @@ from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, weights
 
 LOW, HIGH = multi_mnist.MARGIN, multi_mnist.CANVAS - multi_mnist.MARGIN
-UNIFORM_NUMBER, UNIFORM_CLASS = (1,) * (multi_mnist.MOST + 1), (1,) * 10
+UNIFORM_NUMBER, UNIFORM_CLASS = (1,) * (multi_mnist.MAX_DIGITS + 1), (1,) * 10
 FONTS = cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX
 WITHIN, BEYOND = "not learnt", "another domain"
 Place = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor | float, Tensor | float]]
@@ -176,7 +176,7 @@ def main():
     for name, each in cases.items():
         scenes = look.places(render_scenes(load_model(name), args.scenes, 100 + args.seed))
         for expected, case, images in each:
-            sides = zip(look.places(images), scenes, (foreign, strange), strict=True)
+            sides = zip(look.places(images), scenes, (distance_outliers, patch_outliers), strict=True)
             shares = [float(by(real.numpy(), drawn.numpy()).mean()) for real, drawn, by in sides]
             right.append([expected == (BEYOND if share > 0.5 else WITHIN) for share in shares])
             wrong = "" if right[-1][1] else "  wrong"

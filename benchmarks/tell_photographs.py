@@ -3,9 +3,10 @@
     python benchmarks/tell_photographs.py [--models multi_mnist aerial2d driving] [--targets 5]
         [--photographs MODEL=FOLDER ...]
 
-Printed for each is the share of its images that look like no render of the model, see ``unlike``, which asks for fewer
-renders where most do. From ``UNLIKE`` on a fit takes features for photographs. Drawn targets have other structures and
-layouts and, those of ``driving``, other light, weather and camera (``SceneModel.target``, ``learn_looks.hidden``).
+Printed for each is the share of its images that look like no render of the model, see ``domain_shift``, which asks for
+fewer renders where most do. From ``DOMAIN_SHIFT_SHARE`` on a fit takes features for photographs. Drawn targets have
+other structures and layouts and, those of ``driving``, other light, weather and camera (``SceneModel.target``,
+``learn_looks.hidden``).
 """
 
 import argparse
@@ -14,7 +15,7 @@ from pathlib import Path
 import torch
 from learn_looks import hidden
 
-from probscene.app.fitting.scene_features import ASKED, UNLIKE, images_of, unlike
+from probscene.app.fitting.scene_features import ASKED, DOMAIN_SHIFT_SHARE, domain_shift, images_of
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.image_array import ImageArray
@@ -26,7 +27,7 @@ def drawn(model: SceneModel, seed: int) -> float:
     assert model.target is not None
     truth = hidden(model, seed) if model.name == "driving" else model.target(seed)
     images = torch.cat(list(images_of(truth, truth.prior, ASKED, 1000 + seed)))
-    return unlike(model, ImageArray(images.permute(0, 2, 3, 1).numpy(), model.canvas, model.channels))
+    return domain_shift(model, ImageArray(images.permute(0, 2, 3, 1).numpy(), model.canvas, model.channels))
 
 
 def main():
@@ -42,9 +43,9 @@ def main():
     for given in args.photographs:
         name, _, folder = given.partition("=")
         model = load_model(name)
-        share = unlike(model, ImageFolder(Path(folder), model.canvas, model.channels, skip_bad=True))
+        share = domain_shift(model, ImageFolder(Path(folder), model.canvas, model.channels, skip_bad=True))
         print(f"{name}, photographs in {folder}: {share:.2f}", flush=True)
-    print(f"Unlike from {UNLIKE} on.")
+    print(f"Unlike from {DOMAIN_SHIFT_SHARE} on.")
 
 
 if __name__ == "__main__":

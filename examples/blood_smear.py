@@ -187,12 +187,12 @@ def main() -> None:
     ps.seed_everything(0)
     read = ps.ImageFolder(options.photographs, (HEIGHT, WIDTH), 3, skip_bad=True)
     if len(read) < 8:
-        parser.error(f"expected at least 8 images in {options.photographs}, actual {len(read)}")
+        parser.error(f"expected at least 8 images in {options.photographs}, got {len(read)}")
     photographs = [read.load(i) for i in np.random.default_rng(0).choice(len(read), 8, replace=False)]
     drawn = ps.render(blood_smear, ps.sample(blood_smear, PRIOR, 8)).image
     rows = torch.stack([*photographs, *drawn]).reshape(4, 4, 3, HEIGHT, WIDTH).permute(0, 3, 1, 4, 2)
     if not cv2.imwrite(options.out, rows.reshape(4 * HEIGHT, 4 * WIDTH, 3).flip(-1).numpy()):
-        parser.error(f"expected --out in a folder that can be written, actual {options.out}")
+        parser.error(f"expected --out in a folder that can be written, got {options.out}")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 
 from probscene.app.files import make_folder
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.dataset import is_image
 from probscene.decoding import read_rgb
 from probscene.errors import DataError, ProbsceneError
@@ -42,14 +42,14 @@ def boxes(frame: Path, width: int, height: int) -> np.ndarray:
     """
     file = frame.with_suffix(".txt")
     if not file.is_file():
-        raise DataError(f"Expected YOLO labels of {frame.name} in {file}, actual none; name the folder that has them.")
+        raise DataError(f"expected YOLO labels of {frame.name} in {file}, got none; name the folder that has them.")
     found = []
     for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
         try:
             kind, *box = map(float, line.split())
             box = np.array(box).reshape(4)
         except ValueError:
-            raise DataError(f"Expected 'class x y width height' in line {number} of {file}, actual {line!r}.") from None
+            raise DataError(f"expected 'class x y width height' in line {number} of {file}, got {line!r}.") from None
         if kind == CARS:
             found.append(box * (width, height, width, height))
     return np.array(found).reshape(-1, 4)
@@ -63,7 +63,7 @@ def sequences(data: Path) -> list[tuple[str, list[Path]]]:
     """
     frames = sorted(filter(is_image, data.glob("*")))
     if not frames:
-        raise DataError(f"Expected frames (PNG, JPEG or TIFF) with YOLO labels in {data}, actual none.")
+        raise DataError(f"expected frames (PNG, JPEG or TIFF) with YOLO labels in {data}, got none.")
     found, last = [], None
     for key in sorted(map(_key, frames), key=lambda key: key[:3]):
         *place, number, frame = key
@@ -130,13 +130,13 @@ def main():
     args = parser.parse_args()
     try:
         if args.stride < 1:
-            raise ProbsceneError(f"Expected a positive stride, actual {args.stride}.")
+            raise ProbsceneError(f"expected a positive stride, got {args.stride}.")
         found = sequences(args.data)
         aside = [part for part in found if part[0] == args.held_out]
         if not aside or len(found) == 1:
             names = ", ".join(name for name, _ in found)
             raise DataError(
-                f"Expected --held-out among the sequences {names}, and another to fit, actual {args.held_out}."
+                f"expected --held-out among the sequences {names}, and another to fit, got {args.held_out}."
             )
         write(args.out / "fit", [part for part in found if part[0] != args.held_out], args.stride)
         write(args.out / "held_out", aside, args.stride)

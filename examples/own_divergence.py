@@ -1,8 +1,8 @@
 """A divergence of one's own: the energy distance, which needs no kernel's width.
 
-    probscene fit examples/tabletop.py --target photos/ --out runs/own --objective examples/own_divergence.py:energy
+    probscene fit examples/tabletop.py --target photos/ --out runs/own --divergence examples/own_divergence.py:energy
 
-In Python, ``probscene.fit(..., divergence=energy)``. Densities with a width that suits the features say more where
+In Python, ``FitConfig(divergence=energy)``. Densities with a width that suits the features say more where
 structures are many; distances say something wherever the features are.
 """
 

@@ -2,7 +2,7 @@
 
     probscene fit examples/tabletop.py --target photos/ --out runs/own --features examples/own_features.py:TinyCounts
 
-In Python, ``probscene.fit(..., features=TinyCounts(steps=1000))``. ``Colours`` in its place is the short form.
+In Python, ``FitConfig(features=TinyCounts(steps=1000))``. ``Colours`` in its place is the short form.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 import probscene as ps
 from probscene.inference.features.base import Examples, Photographs, Renders
-from probscene.inference.training import Report, batch_seed, check_finite, restore_training, training_state
+from probscene.inference.training import TrainingLoop
 
 
 class Colours:
@@ -27,13 +27,13 @@ class Colours:
 
 
 class TinyNet(nn.Module):
-    """Three convolutions over a small image; what its places say of each class is added up."""
+    """Three convolutions over a small image; the outputs for each class are added up over all places."""
 
     def __init__(self, classes: tuple[str, ...]):
         super().__init__()
         self.names = classes
-        seen = nn.Sequential(nn.Conv2d(3, 16, 5, 2, 2), nn.ReLU(), nn.Conv2d(16, 32, 5, 1, 2), nn.ReLU())
-        self.places = nn.Sequential(seen, nn.Conv2d(32, len(classes), 1))
+        hidden = nn.Sequential(nn.Conv2d(3, 16, 5, 2, 2), nn.ReLU(), nn.Conv2d(16, 32, 5, 1, 2), nn.ReLU())
+        self.places = nn.Sequential(hidden, nn.Conv2d(32, len(classes), 1))
 
     def forward(self, images: Tensor) -> Tensor:
         small = nn.functional.adaptive_avg_pool2d(images.expand(-1, 3, -1, -1) / 255, 64)
@@ -67,39 +67,26 @@ class TinyCounts(ps.Features):
         return TinyTraining(net, renders, self.steps, seed)
 
 
-class TinyTraining:
-    """Adam on the squared error of the counts. A step depends on its number and on ``state`` alone, so that a training
-    that was interrupted goes on to the same bits."""
+class TinyTraining(TrainingLoop):
+    """Adam on the squared error of the counts. ``TrainingLoop`` seeds each step by its number, checks that all stays
+    finite and keeps what a training that was interrupted needs to go on to the same bits."""
 
-    unit = "steps"
+    subject = "TinyNet"
 
     def __init__(self, net: TinyNet, renders: Renders, steps: int, seed: int):
-        self.net, self.renders, self.total, self.seed = net, renders, steps, seed
-        self.adam, self.done = torch.optim.Adam(net.parameters(), lr=3e-3), 0
+        self.net, self.renders = net, renders
+        self.adam = torch.optim.Adam(net.parameters(), lr=3e-3)
+        super().__init__(net, {"adam": self.adam}, steps, seed)
 
-    def run(self, each: Report | None = None) -> None:
-        while self.done < self.total:
-            ps.seed_everything(batch_seed(self.seed, self.done))
-            shown = self.renders.draw(16)
-            loss = (self.net(shown.image) - visible_counts(shown, len(self.net.names))).square().mean()
-            self.adam.zero_grad()
-            loss.backward()
-            self.adam.step()
-            self.done += 1
-            check_finite(loss.item(), self.net.parameters(), "TinyNet", f"at step {self.done}", "lower its rate")
-            if each is not None:
-                each(self, {"loss": loss.item()})
-
-    def summary(self) -> dict[str, float]:
-        return {}
-
-    def state(self) -> dict[str, Tensor]:
-        return training_state(self.net, {"adam": self.adam}, done=self.done)
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        self.done = int(restore_training(self.net, {"adam": self.adam}, tensors)["done"])
+    def step(self) -> float:
+        examples = self.renders.draw(16)
+        loss = (self.net(examples.image) - visible_counts(examples, len(self.net.names))).square().mean()
+        self.adam.zero_grad()
+        loss.backward()
+        self.adam.step()
+        return loss.item()
 
 
-def visible_counts(shown: Examples, classes: int) -> Tensor:
-    """How many nodes of each class are seen, ``(N, classes)`` float; a label of -1 is none."""
-    return (shown.label.unsqueeze(-1) == torch.arange(classes)).sum(1).float()
+def visible_counts(examples: Examples, classes: int) -> Tensor:
+    """How many nodes of each class are visible, ``(N, classes)`` float; a label of -1 is none."""
+    return (examples.label.unsqueeze(-1) == torch.arange(classes)).sum(1).float()

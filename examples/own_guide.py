@@ -2,7 +2,7 @@
 
     probscene fit examples/tabletop.py --target photos/ --out runs/own --guide examples/own_guide.py:PlaceGuide
 
-In Python, ``probscene.fit(..., guide=PlaceGuide)``. A PCFG has one weight a rule and forgets where it is; an LSTM
+In Python, ``FitConfig(guide=PlaceGuide)``. A PCFG has one weight a rule and forgets where it is; an LSTM
 remembers everything. This one knows two places, and what it has learnt can be read in its table.
 """
 
@@ -45,4 +45,4 @@ class PlaceGuide(ps.Guide):
         return self._at(derivation.frontier)
 
     def _at(self, frontier: Frontier) -> Tensor:
-        return self.table[frontier.parent_repeat.clamp(max=PLACES - 1), frontier.repeat.clamp(max=PLACES - 1)]
+        return self.table[frontier.parent_list_index.clamp(max=PLACES - 1), frontier.list_index.clamp(max=PLACES - 1)]

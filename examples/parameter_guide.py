@@ -91,7 +91,7 @@ def main():
             print(f"step {step:4d}  {loss.item():.2f} nats a scene")
 
     truth = measured(500)
-    for name, model in (("prior", tabletop), ("learnt", guide.suited(tabletop))):
+    for name, model in (("prior", tabletop), ("learnt", guide.with_parameters(tabletop))):
         found = distance(ps.sample(model, PRIOR, 500), truth)
         print(f"Wasserstein-1 of mug.dx, {name}: {found:.1f} pixels")
 

@@ -20,7 +20,7 @@ import torch
 from probscene.drawing import Atlas, Drawing, Sprites, disc
 from probscene.grammar import Grammar
 from probscene.model import SceneModel, scene_model
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, ranked
@@ -116,7 +116,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if options.num < 1:
-        parser.error(f"expected --num of at least 1, actual {options.num}")
+        parser.error(f"expected --num of at least 1, got {options.num}")
     seed_everything(options.seed)
     batch = SpriteRenderer(tabletop.canvas)(sample(tabletop, PRIOR, options.num).drawing)
     pictures = batch.image.permute(0, 2, 3, 1).numpy().copy()
@@ -129,7 +129,7 @@ def main() -> None:
     blank = np.zeros((-len(pictures) % 4, CANVAS, CANVAS, 3), np.uint8)
     rows = np.concatenate([pictures, blank]).reshape(-1, 4, CANVAS, CANVAS, 3)
     if not cv2.imwrite(options.out, rows.transpose(0, 2, 1, 3, 4).reshape(-1, 4 * CANVAS, 3)[..., ::-1]):
-        parser.error(f"expected --out in a folder that can be written, actual {options.out}")
+        parser.error(f"expected --out in a folder that can be written, got {options.out}")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from probscene.errors import ProbsceneError
 
-BLOCK = 2**18  # kernels in memory at once
+BLOCK_SIZE = 2**18  # kernels in memory at once
+SELF_SHARE = 0.1  # of the density at a scene that is its own kernel's
 
 
 class Divergence(Protocol):
@@ -30,7 +31,7 @@ class Divergence(Protocol):
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor: ...
 
 
-def anscombe(features: Tensor) -> Tensor:
+def anscombe_transform(features: Tensor) -> Tensor:
     """``2 sqrt(x + 3/8)`` less its value at 0, of the same shape: Poisson counts come out with a variance of about 1,
     whatever their mean [4]. Below 0, where networks may read, it is odd."""
     return 2 * features.sign() * ((features.abs() + 0.375).sqrt() - math.sqrt(0.375))
@@ -71,7 +72,7 @@ class KDELogRatio:
             rare: the paper keeps it in.
         equal_sizes: estimate both densities from as many scenes. The larger sample is split into parts about as large
             as the smaller one, and the log densities of the parts are averaged, which are all too low by as much.
-        stabilised: compare counts after Anscombe's transformation (not in the paper). A network is farther off the more
+        anscombe: compare counts after Anscombe's transformation (not in the paper). A network is farther off the more
             there is, so that one kernel in counts is too wide for what is rare or too narrow for what there is much of.
             Near a count x a variance v is then about one of ``v x`` in counts.
 
@@ -83,18 +84,18 @@ class KDELogRatio:
     marginal_variance: float | None = 0.1
     leave_one_out: bool = True
     equal_sizes: bool = False
-    stabilised: bool = False
+    anscombe: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        generated, real = _compared(generated, real, self.stabilised)
+        generated, real = _transformed(generated, real, self.anscombe)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
-        cost = self.of_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
+        cost = self.cost_of_log_ratio(self._log_ratios(generated.unsqueeze(0), real.unsqueeze(0), variance))[0]
         if self.marginal_variance is not None and generated.shape[1] > 1:
             one, other = (features.T.contiguous().unsqueeze(-1) for features in (generated, real))  # (D, N or L, 1)
-            cost = cost + self.of_ratio(self._log_ratios(one, other, self.marginal_variance)).sum(0)
+            cost = cost + self.cost_of_log_ratio(self._log_ratios(one, other, self.marginal_variance)).sum(0)
         return cost
 
-    def of_ratio(self, log_ratio: Tensor) -> Tensor:
+    def cost_of_log_ratio(self, log_ratio: Tensor) -> Tensor:
         """The cost where the log ratio is ``log_ratio``; of the same shape."""
         return log_ratio
 
@@ -115,7 +116,7 @@ class JensenShannon(KDELogRatio):
     it never exceeds log 2, so no scene is punished without bound for being where no real one is (not in [1]).
     """
 
-    def of_ratio(self, log_ratio: Tensor) -> Tensor:
+    def cost_of_log_ratio(self, log_ratio: Tensor) -> Tensor:
         """``log 2 - log(1 + p~/q~)``."""
         return math.log(2) - torch.nn.functional.softplus(-log_ratio)
 
@@ -128,15 +129,15 @@ class MMD:
         variance: of the kernel; None is the feature dimension.
         shared: every scene pays the one discrepancy of the batch (the baseline of [1], which cannot assign credit);
             otherwise each pays its own witness value ``2 (E k(x, G) - E k(x, R))``, the same gradient in expectation.
-        stabilised: as of ``KDELogRatio``.
+        anscombe: as of ``KDELogRatio``.
     """
 
     variance: float | None = 1.0
     shared: bool = True
-    stabilised: bool = False
+    anscombe: bool = False
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        generated, real = _compared(generated, real, self.stabilised)
+        generated, real = _transformed(generated, real, self.anscombe)
         variance = float(generated.shape[1]) if self.variance is None else self.variance
         N, L = len(generated), len(real)
         within = torch.exp(-0.5 / variance * _squared_distances(generated, generated)).fill_diagonal_(0.0)
@@ -167,7 +168,7 @@ class Blockwise:
     divergences: tuple[Divergence | None, ...]
 
     def __call__(self, generated: Tensor, real: Tensor) -> Tensor:
-        _check(generated, real)
+        _check_features(generated, real)
         blocks = zip(self.divergences, generated.split(self.sizes, 1), real.split(self.sizes, 1), strict=True)
         costs = [divergence(*block) for divergence, *block in blocks if divergence is not None]
         return sum(costs, torch.zeros(len(generated)))
@@ -194,7 +195,7 @@ def _log_sums(points: Tensor, data: Tensor, variance: float, leave_one_out: bool
     if leave_one_out:
         pivot = pivot.where(pivot != torch.arange(N), nearest[:, 1:])
     fill = partial(torch.addcmul, value=1 / variance) if d == 1 else partial(torch.baddbmm, alpha=1 / variance)
-    rows, samples = min(N, max(1, BLOCK // L)), min(B, max(1, BLOCK // (N * L)))
+    rows, samples = min(N, max(1, BLOCK_SIZE // L)), min(B, max(1, BLOCK_SIZE // (N * L)))
     memory = points.new_empty(samples * rows * L)
     found = torch.empty_like(points[..., 0])
     for b in range(0, B, samples):
@@ -229,21 +230,37 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
     return (a.square().sum(1, keepdim=True) + b.square().sum(1) - 2 * a @ b.T).clamp_(min=0.0)
 
 
-def _compared(generated: Tensor, real: Tensor, stabilised: bool) -> tuple[Tensor, Tensor]:
-    """Features, checked, and transformed where they are to be stabilised."""
-    _check(generated, real)
-    return (anscombe(generated), anscombe(real)) if stabilised else (generated, real)
+def _transformed(generated: Tensor, real: Tensor, anscombe: bool) -> tuple[Tensor, Tensor]:
+    """Features, checked, and transformed where they are to be transformed."""
+    _check_features(generated, real)
+    return (anscombe_transform(generated), anscombe_transform(real)) if anscombe else (generated, real)
 
 
-def _check(generated: Tensor, real: Tensor) -> None:
+def _check_features(generated: Tensor, real: Tensor) -> None:
     if generated.ndim != 2 or real.ndim != 2 or generated.shape[1] != real.shape[1]:
         raise ProbsceneError(
-            f"Expected generated (N, D) and real (L, D) features, actual {tuple(generated.shape)} and "
-            f"{tuple(real.shape)}."
+            f"expected generated (N, D) and real (L, D) features, got {tuple(generated.shape)} and {tuple(real.shape)}."
         )
     if len(generated) < 2 or len(real) < 1:
-        raise ProbsceneError(
-            f"Expected at least 2 generated and 1 real scene, actual {len(generated)} and {len(real)}."
-        )
+        raise ProbsceneError(f"expected at least 2 generated and 1 real scene, got {len(generated)} and {len(real)}.")
     if not torch.isfinite(generated.sum() + real.sum()):  # NaN and infinity stay in a sum
-        raise ProbsceneError("Expected finite features, actual NaN or infinity; lower the learning rate.")
+        raise ProbsceneError("expected finite features, got NaN or infinity; lower the learning rate.")
+
+
+def self_share(points: Tensor) -> float:
+    """The mean share that a point's own kernel, Gaussian of variance 1, has in the density estimated at it from all.
+
+    Args:
+        points: ``(N, d)``.
+    """
+    return float((1 / torch.exp(-0.5 * torch.cdist(points, points).square()).sum(1)).mean())
+
+
+def bandwidth(points: Tensor) -> float:
+    """The least standard deviation of a Gaussian kernel at which ``points (N, d)`` have a self share of ``SELF_SHARE``,
+    or of two points' worth where there are too few for that."""
+    share, low, high = max(SELF_SHARE, 2 / len(points)), -20.0, 20.0  # powers of two
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if self_share(points / 2**middle) > share else (low, middle)
+    return 2**high

@@ -53,8 +53,8 @@ from probscene.sampling import Scenes, run_program
 from .divergence import Divergence
 from .guides.base import Guide
 
-FAR = 20.0  # nats
-NEEDED = ("grammar", "log_prob", "max_steps")  # of a guide
+MAX_LOG_RATIO = 20.0  # nats, of the KL from the prior
+GUIDE_ATTRIBUTES = ("grammar", "log_prob", "max_steps")
 BASELINES = ("moving_average", "leave_one_out", "none")
 
 
@@ -80,12 +80,13 @@ class SceneBatch(NamedTuple):
     failed_advantage: Tensor
 
 
-def _check(guide: object) -> None:
-    missing = [name for name in NEEDED if not hasattr(guide, name)]
+def _check_guide(guide: object) -> None:
+    missing = [name for name in GUIDE_ATTRIBUTES if not hasattr(guide, name)]
     if missing:
         raise ModelError(
-            f"Expected a guide with {', '.join(NEEDED[:-1])} and {NEEDED[-1]}, actual {type(guide).__name__} without "
-            f"{', '.join(missing)}; derive it from probscene.inference.guides.base.Guide."
+            f"expected a guide with {', '.join(GUIDE_ATTRIBUTES[:-1])} and {GUIDE_ATTRIBUTES[-1]}, got "
+            f"{type(guide).__name__} without {', '.join(missing)}; derive it from "
+            "probscene.inference.guides.base.Guide."
         )
 
 
@@ -107,8 +108,8 @@ class ScoreFunction:
         reject_weight, reject_threshold: lambda and epsilon of section 3.3.
         incompletion_weight: of half the squared number of failed attempts.
         prior, prior_kl_weight: a policy, and the weight of the reverse KL from it: ``log q(T) - log p(T)`` nats, at
-            most ``FAR``, are added to the cost of a scene (not in the paper). Without it, whatever images do not show
-            drifts freely, such as the number of cars that are hidden behind others.
+            most ``MAX_LOG_RATIO``, are added to the cost of a scene (not in the paper). Without it, whatever images do
+            not show drifts freely, such as the number of cars that are hidden behind others.
         strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
             several guides learn together, so that the gradient is that of their own mean cost; all have one where None.
 
@@ -136,15 +137,13 @@ class ScoreFunction:
         strata: Callable[[Derivation], Tensor] | None = None,
     ):
         if baseline not in BASELINES:
-            raise ProbsceneError(f"Expected a baseline among {', '.join(BASELINES)}, actual {baseline!r}.")
+            raise ProbsceneError(f"expected a baseline among {', '.join(BASELINES)}, got {baseline!r}.")
         if updates < 1 or not 0 < decay <= 1 or clip <= 0:
             raise ProbsceneError(
-                f"Expected updates >= 1, decay in (0, 1] and clip > 0, actual {updates}, {decay} and {clip}."
+                f"expected updates >= 1, decay in (0, 1] and clip > 0, got {updates}, {decay} and {clip}."
             )
         if reject_threshold < 0:
-            raise ProbsceneError(
-                f"Expected a reject_threshold of at least 0 failed attempts, actual {reject_threshold}."
-            )
+            raise ProbsceneError(f"expected a reject_threshold of at least 0 failed attempts, got {reject_threshold}.")
         self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
         self.updates, self.clip, self.scale = updates, clip, scale
         self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
@@ -153,9 +152,9 @@ class ScoreFunction:
         self.strata = strata
         self.averages: dict[int, float] = {}  # moving, by stratum
         self.batch: SceneBatch | None = None
-        self._used = 0
-        self._real: Tensor | None = None  # what the batch was compared with
-        self._drawn_with: Tensor | None = None  # log q(T) under the guide that drew the batch
+        self._updates_done = 0
+        self._real: Tensor | None = None  # that the batch was compared with
+        self._old_log_prob: Tensor | None = None  # log q(T) under the guide that drew the batch
 
     def __call__(self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor) -> Tensor:
         """A scalar whose value is the mean cost and whose gradient is the score-function estimate.
@@ -163,28 +162,28 @@ class ScoreFunction:
         Raises:
             ModelError: the guide lacks something.
         """
-        _check(guide)
+        _check_guide(guide)
         if not torch.is_grad_enabled():
             return self._costs(model, guide, num_scenes, real)[2].mean()
         if am_i_wrapped():  # in SVI, which learns the parameters that it sees registered
             pyro.module("guide", guide)
-        if self.batch is None or self._used == self.updates or not self._drawn_for(self.batch, num_scenes, real):
-            self.batch, self._used, self._real = self._draw(model, guide, num_scenes, real), 0, real
+        if self.batch is None or self._updates_done == self.updates or not self._reusable(self.batch, num_scenes, real):
+            self.batch, self._updates_done, self._real = self._draw(model, guide, num_scenes, real), 0, real
         batch = self.batch
         log_prob, advantage = guide.log_prob(batch.derivation), batch.advantage
         if batch.failed is not None:
             log_prob = torch.cat([log_prob, guide.log_prob(batch.failed)])
             advantage = torch.cat([advantage, batch.failed_advantage])
-        if self._used == 0:
-            self._drawn_with = log_prob.detach()
-        self._used += 1
-        assert self._drawn_with is not None
-        ratio = torch.exp(log_prob - self._drawn_with)
+        if self._updates_done == 0:
+            self._old_log_prob = log_prob.detach()
+        self._updates_done += 1
+        assert self._old_log_prob is not None
+        ratio = torch.exp(log_prob - self._old_log_prob)
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         surrogate = torch.maximum(advantage * ratio, advantage * clipped).sum() / num_scenes
         return batch.cost.mean() + surrogate - surrogate.detach()
 
-    def _drawn_for(self, batch: SceneBatch, num_scenes: int, real: Tensor) -> bool:
+    def _reusable(self, batch: SceneBatch, num_scenes: int, real: Tensor) -> bool:
         before = self._real
         if len(batch.cost) != num_scenes or (before is None) != (real is None):
             return False
@@ -204,8 +203,8 @@ class ScoreFunction:
         features = self.observe(run_program(model, derivation, failures=failures, density=False))
         cost = self.divergence(features, real)
         if self.prior is not None and self.prior_kl_weight:
-            away = guide.log_prob(derivation) - self.prior.log_prob(derivation)
-            cost = cost + self.prior_kl_weight * away.clamp(max=FAR)
+            log_ratio = guide.log_prob(derivation) - self.prior.log_prob(derivation)
+            cost = cost + self.prior_kl_weight * log_ratio.clamp(max=MAX_LOG_RATIO)
         return derivation, features, cost, failures.float().mean().item()
 
     def _draw(self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor) -> SceneBatch:
@@ -213,22 +212,22 @@ class ScoreFunction:
             attempts: list[Derivation] | None = None if self.baseline == "leave_one_out" else []
             derivation, features, cost, rejections = self._costs(model, guide, num_scenes, real, attempts)
             strata = self._strata(derivation)
-            above = self.scale * (cost - self._baseline(cost, strata))
-            failed, of_failed = None, above[:0]
+            advantage = self.scale * (cost - self._baseline(cost, strata))
+            failed, failed_advantage = None, advantage[:0]
             if attempts:
-                places = torch.arange(sum(map(len, attempts))).split([len(some) for some in attempts])
+                places = torch.arange(sum(map(len, attempts))).split([len(attempt) for attempt in attempts])
                 failed = Derivation.merged(guide.grammar, list(zip(places, attempts, strict=True)))
-                of_failed = _means(above, strata, self._strata(failed))
-            advantage = above - self._failing(rejections)
-            return SceneBatch(derivation, features, cost, advantage, rejections, failed, of_failed)
+                failed_advantage = _stratum_means(advantage, strata, self._strata(failed))
+            advantage = advantage - self._failure_cost(rejections)
+            return SceneBatch(derivation, features, cost, advantage, rejections, failed, failed_advantage)
 
     def _strata(self, derivation: Derivation) -> Tensor:
         return torch.zeros(len(derivation), dtype=torch.int64) if self.strata is None else self.strata(derivation)
 
-    def _failing(self, failed: float) -> float:
-        """What is taken off all advantages where scenes failed so often in the mean."""
-        ends, least = 1 / (1 + failed), math.floor(self.reject_threshold) + 1
-        rejected = least * (1 - ends) ** (least - 1) * ends
+    def _failure_cost(self, failed: float) -> float:
+        """The cost of a mean number of failed attempts a scene, which is subtracted from all advantages."""
+        completion, k = 1 / (1 + failed), math.floor(self.reject_threshold) + 1
+        rejected = k * (1 - completion) ** (k - 1) * completion
         return self.reject_weight * rejected + self.incompletion_weight * failed * (1 + failed)
 
     def _baseline(self, cost: Tensor, strata: Tensor) -> Tensor:
@@ -238,21 +237,21 @@ class ScoreFunction:
         for stratum in strata.unique().tolist():
             own = strata == stratum
             if self.baseline == "moving_average":
-                baseline[own] = self._average(stratum, cost[own].mean().item())
+                baseline[own] = self._moving_average(stratum, cost[own].mean().item())
             else:
                 others = cost[own] if own.sum() > 1 else cost  # a scene alone in its stratum has none
                 baseline[own] = (others.sum() - cost[own]) / (len(others) - 1)
         return baseline
 
-    def _average(self, stratum: int, new: float) -> float:
+    def _moving_average(self, stratum: int, new: float) -> float:
         # The paper leaves the first value open. From 0, every scene of the first batches would seem bad, or good.
         before = self.averages.get(stratum)
         self.averages[stratum] = new if before is None else self.decay * new + (1 - self.decay) * before
         return self.averages[stratum]
 
 
-def _means(values: Tensor, strata: Tensor, wanted: Tensor) -> Tensor:
-    """The mean of ``values (N,)`` in each of the ``wanted (F,)`` strata; 0 where there is none."""
-    size = 1 + int(torch.maximum(strata.max(), wanted.max()))
+def _stratum_means(values: Tensor, strata: Tensor, others: Tensor) -> Tensor:
+    """The mean of ``values (N,)`` in each of the strata ``others (F,)``; 0 where there is none."""
+    size = 1 + int(torch.maximum(strata.max(), others.max()))
     total = values.new_zeros(size).index_add(0, strata, values)
-    return (total / strata.bincount(minlength=size).clamp(min=1))[wanted]
+    return (total / strata.bincount(minlength=size).clamp(min=1))[others]

@@ -27,7 +27,7 @@ def pretrain(
         guide: a module with ``grammar``, ``max_steps`` and ``log_prob``.
         prior: the structure prior.
         num_derivations, epochs, batch_size, learning_rate: the paper's are the defaults.
-        progress: called after each epoch with its number and the mean negative log-likelihood.
+        progress: called after each epoch with its number, from 0, and the mean negative log-likelihood.
 
     Returns:
         The last epoch's mean negative log-likelihood, nats a scene.

@@ -38,7 +38,7 @@ GRAMMAR = Grammar("""
 CANVAS, MAX_STEPS, CLASSES = 256, 64, ("road", "car")
 LANE = ROAD / 4  # pixels from the middle of a road to the middle of a lane
 APART = 20.5  # pixels between cars of a lane: more than the diagonal of a car
-FULL = 11  # cars that a lane has room for
+LANE_CAPACITY = 11  # cars that a lane has room for
 EDGE = CAR / 2 + 1  # pixels from the border of the canvas to the middle of the first car
 TREES, HOUSES, GAP = 28, 12, 5  # at most so many, and pixels between them and a road
 COLOURS = torch.tensor(
@@ -139,7 +139,7 @@ def _car_places(scene: SceneGraph, car: Tensor, place, side, turn, spaced: bool)
 
     shared, chosen = rank(side) % 2, (side > 0.5).long()
     in_lane = (siblings & (chosen[:, None, :] == chosen[:, :, None])).sum(-1)
-    crowded = (siblings & (in_lane > FULL)[:, None, :]).any(-1)
+    crowded = (siblings & (in_lane > LANE_CAPACITY)[:, None, :]).any(-1)
     lane = torch.where(crowded, shared, shared if spaced else chosen)
     along = torch.where(lane == 1, 0.0, math.pi)
     siblings = siblings & (lane[:, None, :] == lane[:, :, None])

@@ -64,7 +64,7 @@ def folder(path: str) -> Scenery:
 def _pictures(path: Path, size: float) -> tuple[np.ndarray, ...]:
     files = sorted(p for p in path.glob("*") if p.suffix.lower() == ".png" and not p.name.startswith("."))
     if not files:
-        raise DataError(f"Expected PNG files in {path}, actual none; make the folders car, tree and house there.")
+        raise DataError(f"expected PNG files in {path}, got none; make the folders car, tree and house there.")
     found = []
     for file in files:
         picture = _rgba(file)
@@ -87,7 +87,7 @@ def _rgba(file: Path) -> np.ndarray:
             raise Fault("has no alpha channel")
     except Fault as fault:
         raise DataError(
-            f"Expected an RGBA picture, actual {file}, which {fault}; mend it, or save it as PNG with an alpha channel."
+            f"expected an RGBA picture, got {file}, which {fault}; fix it, or save it as PNG with an alpha channel."
         ) from None
     return picture if picture.dtype == np.uint8 else (picture >> 8).astype(np.uint8)
 

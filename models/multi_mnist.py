@@ -31,8 +31,8 @@ GRAMMAR = Grammar("""
     Digit  -> 0 | 1 | 2 | 3 | 4 | 5 | 6 | 7 | 8 | 9
 """)
 CLASSES = tuple("0123456789")
-MOST = 10
-PRIOR = StructurePrior(GRAMMAR, Digits=counts(*[1] * (MOST + 1)))
+MAX_DIGITS = 10
+PRIOR = StructurePrior(GRAMMAR, Digits=counts(*[1] * (MAX_DIGITS + 1)))
 CANVAS = 256
 MAX_STEPS = 32  # up to 15 digits, more than the longest of the prior
 TURN = math.radians(30)
@@ -73,7 +73,7 @@ def draw(scene: SceneGraph, digits: Digits, exemplar, x, y, angle: Tensor | floa
 def target(seed: int, digits: Source = shipped, assets: str = "") -> SceneModel:
     """The experiment's truth: counts in 0..10 and digits from distributions that are Dirichlet(1) draws of ``seed``."""
     rng = np.random.default_rng(seed)
-    number, share = rng.dirichlet(np.ones(MOST + 1)), rng.dirichlet(np.ones(len(CLASSES)))
+    number, share = rng.dirichlet(np.ones(MAX_DIGITS + 1)), rng.dirichlet(np.ones(len(CLASSES)))
     prior = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
     program = partial(row, digits=digits)
     more = {"channels": 1, "assets": assets}

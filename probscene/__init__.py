@@ -2,11 +2,11 @@
 
     import probscene as ps
 
-    fit = ps.fit(model, "photos/", preset="quick")
+    fit = ps.fit(model, "photos/", "quick")
     fit.generate(10_000, "dataset/", format="coco")
 
-This face holds what a person writes; a name is imported when it is first used. Each is defined in one module, which is
-what the library itself imports.
+These are the public names. A name is imported when it is first used. Each is defined in one module, which is what the
+library itself imports.
 """
 
 import sys as _sys
@@ -21,17 +21,20 @@ if (_checkout / "pyproject.toml").is_file():  # a plain checkout: probscene.mode
 
 __version__ = "0.2.0"
 
-_HOME = {
+_APP_MODULES = {
     "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
     "api.fit": ("fit",),
+    "fitting.begin": ("ModelFile", "TargetImages"),
+    "fitting.config": ("FitConfig",),
+    "fitting.pipeline": ("Execution",),
+    "fitting.presets": ("preset",),
     "api.label": ("label",),
     "api.run": ("Run",),
     "datasets.scene_dataset": ("SceneDataset",),
-    "fitting.preset": ("Preset",),
     "loading": ("load_model",),
 }
 _MODULES = {
-    **{f"probscene.app.{module}": names for module, names in _HOME.items()},
+    **{f"probscene.app.{module}": names for module, names in _APP_MODULES.items()},
     "probscene.batch": ("RenderBatch", "Renderer"),
     "probscene.dataset": ("ImageFolder",),
     "probscene.derivation": ("Derivation",),
@@ -57,7 +60,7 @@ _MODULES = {
     "probscene.inference.pretrain": ("pretrain",),
     "probscene.mesh": ("Mesh",),
     "probscene.model": ("Groups", "SceneModel", "scene_model"),
-    "probscene.photo": ("Photo",),
+    "probscene.camera_effects": ("CameraEffects",),
     "probscene.policy": ("Policy",),
     "probscene.request": ("Objects", "Request"),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
@@ -73,7 +76,10 @@ if TYPE_CHECKING:
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
     from probscene.app.datasets.scene_dataset import SceneDataset
-    from probscene.app.fitting.preset import Preset
+    from probscene.app.fitting.begin import ModelFile, TargetImages
+    from probscene.app.fitting.config import FitConfig
+    from probscene.app.fitting.pipeline import Execution
+    from probscene.app.fitting.presets import preset
     from probscene.app.loading import load_model
     from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
     from probscene.inference.features.base import FeatureNet, Features
@@ -87,6 +93,7 @@ if TYPE_CHECKING:
     from probscene.inference.pretrain import pretrain
 
     from .batch import RenderBatch, Renderer
+    from .camera_effects import CameraEffects
     from .dataset import ImageFolder
     from .derivation import Derivation
     from .derive import derive
@@ -107,7 +114,6 @@ if TYPE_CHECKING:
     from .image_array import ImageArray
     from .mesh import Mesh
     from .model import Groups, SceneModel, scene_model
-    from .photo import Photo
     from .policy import Policy
     from .request import Objects, Request
     from .sampling import Scenes, sample, seed_everything
@@ -116,27 +122,28 @@ if TYPE_CHECKING:
     from .world import Camera, Ground, Light, Meshes, World
 
 __all__ = [
-    "Camera", "Command", "DataError", "Derivation", "Divergence", "Drawing", "FeatureNet", "Features",
-    "GeneratorError", "Grammar", "GrammarError", "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray",
-    "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes",
-    "ModelError", "Objects", "PCFG", "ParameterGuide", "Photo", "Policy", "Preset", "ProbsceneError", "RenderBatch",
-    "Renderer", "Request", "Run", "RunError", "SamplingError", "SceneDataset", "SceneGraph", "SceneModel", "Scenes",
-    "ScoreFunction", "Sprites", "StructurePrior", "World", "compare", "counts", "derive", "enumerate_derivations",
-    "evaluate", "find_sites", "fit", "generate", "label", "load_model", "pretrain", "ranked", "render", "report",
-    "sample", "scene_model", "seed_everything", "trial", "weights",
+    "Camera", "CameraEffects", "Command", "DataError", "Derivation", "Divergence", "Drawing", "Execution",
+    "FeatureNet", "Features", "FitConfig", "GeneratorError", "Grammar", "GrammarError", "GrammarVAE", "Ground",
+    "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide", "Light", "MMD",
+    "MachineError", "Mesh", "Meshes", "ModelError", "ModelFile", "Objects", "PCFG", "ParameterGuide", "Policy",
+    "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError", "SamplingError", "SceneDataset",
+    "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "TargetImages", "World",
+    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
+    "load_model", "preset", "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything",
+    "trial", "weights",
 ]  # fmt: skip
 
 
-class _Face(_ModuleType):
-    """A package of which ``derive`` is the function, though a module has that name, too: importing a submodule would
-    bind its name here."""
+class _PublicApi(_ModuleType):
+    """A package whose ``derive`` is the function, though a module has the same name: importing a submodule would bind
+    the module to that name."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _MODULE_OF and isinstance(value, _ModuleType)):
             super().__setattr__(name, value)
 
 
-_sys.modules[__name__].__class__ = _Face
+_sys.modules[__name__].__class__ = _PublicApi
 
 
 def __getattr__(name: str) -> object:

@@ -7,7 +7,7 @@ from torch import Tensor
 from .request import Renderable
 
 
-class Space(NamedTuple):
+class SceneGeometry(NamedTuple):
     """What the render of a 3D scene has in addition; the camera's axes are KITTI's, see ``world``.
 
     Attributes:
@@ -58,7 +58,7 @@ class RenderBatch(NamedTuple):
     amodal_box: Tensor
     pixels: Tensor
     visible: Tensor
-    space: Space | None = None
+    space: SceneGeometry | None = None
     unknown: tuple[str, ...] = ()
     depth: Tensor | None = None
 
@@ -70,7 +70,7 @@ class Renderer(Protocol):
     ``(H, W)``, and a number of threads, or None for one for every core; ``renderer(drawing)`` is all that is called
     on what it gives, again and again, with batches of any N. A drawing's ``kind (N, M)`` says what its nodes are,
     ``len(drawing)`` is N, ``drawing[a:b]`` are some of its scenes, and ``drawing.photo`` is what a camera makes of the
-    images, None for nothing (``probscene.renderers.photo.photographed`` does it).
+    images, None for nothing (``probscene.renderers.camera.effects.apply_camera_effects`` does it).
 
     It returns a ``RenderBatch`` on the CPU, with every field but ``space``, in the shapes and types named there:
 

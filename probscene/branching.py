@@ -1,10 +1,10 @@
 """A structure prior as a multi-type branching process: does it end, how long is it, what does it hold; all exact.
 
-Under a ``StructurePrior`` what a nonterminal turns into depends on its type alone: its symbol, how often its list has
-repeated and the rank of the list around it. With ``A[i, j]`` the mean number of j that one i leaves behind, a
-derivation surely ends if the spectral radius of A is below 1, and ``(I - A)^-1`` counts the expected visits. The
-lengths follow from the generating function ``L_i(s) = s sum_k p_ik prod_j L_j(s)``, coefficient by coefficient.
-Reference: Harris, The Theory of Branching Processes, 1963, chapter II.
+Under a ``StructurePrior`` what a nonterminal turns into depends on its type alone: its symbol, its list index and its
+parent list index. With ``A[i, j]`` the mean number of j that one i leaves behind, a derivation surely ends if the
+spectral radius of A is below 1, and ``(I - A)^-1`` counts the expected visits. The lengths follow from the generating
+function ``L_i(s) = s sum_k p_ik prod_j L_j(s)``, coefficient by coefficient. Reference: Harris, The Theory of Branching
+Processes, 1963, chapter II.
 
 Axis letters: I types, E productions of types, R children, T steps, K rules.
 """
@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
@@ -26,8 +27,8 @@ class Type(NamedTuple):
     """What decides over an expansion; the indices are clamped where the table no longer tells them apart."""
 
     symbol: int
-    repeat: int
-    parent_repeat: int
+    list_index: int
+    parent_list_index: int
 
 
 class Branching:
@@ -49,24 +50,24 @@ class Branching:
         self.grammar = grammar
         _, P, C, _ = log_probs.shape
         table = log_probs.double().exp().numpy()
-        # A list's repeats become the rank that its elements read, so they are told apart as far as either axis goes.
+        # The index of a list is the parent list index of its elements, so both axes are kept as far as either goes.
         last = max(C, P) - 1
         below = [[v for v in row if v >= 0] for row in grammar.children.tolist()]
         recursive = grammar.recursive.tolist()
         index = {Type(0, 0, 0): 0}
         todo, productions = list(index), []
-        for v, repeat, around in todo:  # grows while it is read
-            row = table[v, around, min(repeat, C - 1)]
-            own = min(repeat, P - 1) if recursive[v] else around
+        for v, list_index, parent in todo:  # grows while it is read
+            row = table[v, parent, min(list_index, C - 1)]
+            own = min(list_index, P - 1) if recursive[v] else parent
             for k in np.flatnonzero(row):
                 left = []
                 for child in below[k]:
-                    kind = Type(v, min(repeat + 1, last), around) if child == v else Type(child, 0, own)
+                    kind = Type(v, min(list_index + 1, last), parent) if child == v else Type(child, 0, own)
                     if kind not in index:
                         index[kind] = len(index)
                         todo.append(kind)
                     left.append(index[kind])
-                productions.append((index[Type(v, repeat, around)], k, row[k] / row.sum(), left))
+                productions.append((index[Type(v, list_index, parent)], k, row[k] / row.sum(), left))
         self.types = todo
         self.owner = np.array([p[0] for p in productions])
         self.rule = np.array([p[1] for p in productions])
@@ -139,3 +140,42 @@ class Branching:
             if (grown == length).all():
                 return float(length[0])
             length = grown
+
+    def max_totals(self, gain: np.ndarray, max_steps: int) -> np.ndarray:
+        """``(T + 1,)`` the largest total gain of a derivation of at most 0, 1, ..., T rules; -inf where there is none.
+
+        Args:
+            gain: ``(E,)`` of each production, such as the objects that it adds.
+            max_steps: T.
+        """
+        (E, R), size = self.children.shape, len(self.types)
+        total = np.full((size + 1, max_steps + 1), -np.inf)  # of derivations of exactly n rules
+        total[size, 0] = 0.0
+        partial = np.full((R + 1, E, max_steps + 1), -np.inf)  # over the first r children
+        partial[0, :, 0] = gain
+        for n in range(1, max_steps + 1):
+            for r, child in enumerate(self.children.T):
+                partial[r + 1, :, n - 1] = (partial[r, :, :n] + total[child, n - 1 :: -1]).max(1)
+            np.maximum.at(total[:, n], self.owner, partial[R, :, n - 1])
+        return np.maximum.accumulate(total[0])
+
+    def max_total(self, gain: np.ndarray) -> float:
+        """The largest total gain of a derivation of any length, of gains that are all of one sign; infinite if there is
+        no largest."""
+        size = len(self.types)
+        total = np.append(np.full(size, -np.inf), 0.0)
+        before = total
+        with np.errstate(invalid="ignore"):  # of a child without an end beside one without a largest
+            for n in range(3 * size):
+                if n == size:  # deeper derivations repeat a type, and have a larger total only if there is no largest
+                    before = total.copy()
+                if n == 2 * size:
+                    total[total > before] = np.inf
+                np.fmax.at(total, self.owner, gain + total[self.children].sum(1))
+        return float(total[0])
+
+
+def expand_table(table: Tensor, P: int, C: int) -> Tensor:
+    """A table ``(..., p, c, K)`` with P and C entries on its two index axes; all later ones are as the last."""
+    parent_index, index = (torch.arange(n).clamp(max=table.shape[axis] - 1) for n, axis in ((P, -3), (C, -2)))
+    return table[..., parent_index, :, :][..., index, :]

@@ -1,6 +1,6 @@
 """What a person should know before fitting: does every derivation end, how long is it, does T_max cover it.
 
-``check(model)`` gives a ``Report``; ``str(report)`` says it in words, ``faults`` are to be mended first.
+``check(model)`` gives a ``Report``; ``str(report)`` says it in words, ``faults`` are to be fixed first.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ class Report:
     Attributes:
         grammar: the grammar.
         max_steps: T_max.
-        faults: what must be mended, each with what to do.
+        faults: what must be fixed, each with what to do.
         warnings: what should be known.
         spectral_radius: of the mean-offspring matrix; every derivation ends iff it is below 1. NaN if only sampled.
         expected_length: mean number of rules; infinite if a derivation need not end.
@@ -84,7 +84,7 @@ class Report:
         lines.append(f"max_steps = {self.max_steps}: {longer}.")
         lines += [f"Fault: {text}" for text in self.faults] + [f"Warning: {text}" for text in self.warnings]
         if not self.faults and not self.warnings:
-            lines.append("Nothing to mend.")
+            lines.append("Nothing to fix.")
         return "\n".join(lines)
 
 
@@ -106,7 +106,7 @@ def check_grammar(grammar: Grammar, prior: Policy, max_steps: int, samples: int 
         GrammarError: the prior is one over another grammar.
     """
     if prior.grammar.rules != grammar.rules:
-        raise GrammarError("Expected a prior over this grammar, actual one over another; build both from one Grammar.")
+        raise GrammarError("expected a prior over this grammar, got one over another; build both from one Grammar.")
     exact = isinstance(prior, StructurePrior)
     report = _exact(grammar, prior, max_steps) if exact else _sampled(grammar, prior, max_steps, samples)
     faults, warnings = list(report.faults), list(report.warnings)

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .ahead import ahead
 from .decoding import (
     Part,
     Window,
@@ -29,6 +28,7 @@ from .decoding import (
 )
 from .errors import DataError
 from .image_bytes import Fault
+from .prefetch import ahead
 from .threads import cores
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
@@ -81,11 +81,11 @@ class Images:
             view: 0 for the image as it is. Any other number is a part of it, at least ``LEAST_PART`` of either side and
                 anywhere in it, resized to the canvas: which one depends on ``i`` and the number alone.
         """
-        raise TypeError(f"Expected images with a 'load' method, actual {type(self).__name__}.")
+        raise TypeError(f"expected images with a 'load' method, got {type(self).__name__}.")
 
-    def some(self, most: int) -> Tensor:
+    def subset(self, max_images: int) -> Tensor:
         """At most so many of the images, ``(l, C, H, W)`` uint8, evenly spread over all."""
-        number = min(most, len(self))
+        number = min(max_images, len(self))
         return torch.stack([self.load(i * len(self) // number) for i in range(number)])
 
     def batches(self, size: int, view: int = 0) -> Iterator[Tensor]:
@@ -99,7 +99,7 @@ class Images:
             DataError: see ``load``; a size that is not positive.
         """
         if size < 1:
-            raise DataError(f"Expected a positive batch size, actual {size}.")
+            raise DataError(f"expected a positive batch size, got {size}.")
         for start in range(0, len(self), size):
             yield torch.stack([self.load(i, view) for i in range(start, min(start + size, len(self)))])
 
@@ -207,7 +207,7 @@ class ImageFolder(Images):
                 part = part_of(i, view) if view else None
                 image, _ = decoded(read(self.paths[i]), self.canvas, self.channels, part, self.value_range)
         except Fault as fault:
-            raise DataError(f"Expected the image {self.paths[i]} as it was, actual a file that {fault}.") from fault
+            raise DataError(f"expected the image {self.paths[i]} as it was, got a file that {fault}.") from fault
         return torch.from_numpy(image)
 
     def _checked(self, file: Path) -> "_Checked | Fault":
@@ -220,10 +220,10 @@ class ImageFolder(Images):
 
     def _judge(self, skip_bad: bool) -> None:
         if self.bad and not (skip_bad and self.paths):
-            remedy = "there is no other image in the folder" if not self.paths else "mend or delete them, or skip them"
+            remedy = "there is no other image in the folder" if not self.paths else "fix or delete them, or skip them"
             total = len(self.paths) + len(self.bad)
             raise DataError(
-                f"Expected images that decode in {self.path}, actual {len(self.bad)} of {total} bad: "
+                f"expected images that decode in {self.path}, got {len(self.bad)} of {total} bad: "
                 f"{_first(f'{file.name} {fault}' for file, fault in self.bad.items())}; {remedy}"
                 f"{' with --skip-bad' if self.paths else ''}."
             )
@@ -314,15 +314,15 @@ def _listed(folder: Path) -> tuple[list[Path], list[str], dict[str, int]]:
     """The image files of a folder, sorted by name; the names of its other files; and by name of its subfolders how many
     images are in them."""
     if not folder.exists():
-        raise DataError(f"Expected a folder of PNG, JPEG or TIFF images, actual {folder}, which is not there.")
+        raise DataError(f"expected a folder of PNG, JPEG or TIFF images, got {folder}, which is not there.")
     if not folder.is_dir():
         raise DataError(
-            f"Expected a folder of PNG, JPEG or TIFF images, actual {folder}, which is a file; name its folder."
+            f"expected a folder of PNG, JPEG or TIFF images, got {folder}, which is a file; name its folder."
         )
     try:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
-        raise DataError(f"Expected a folder that can be read, actual {folder}: {error.strerror}.") from error
+        raise DataError(f"expected a folder that can be read, got {folder}: {error.strerror}.") from error
     entries.sort(key=lambda entry: entry.name)  # paths of Windows would be sorted without regard to case
     folders = [entry.name + "/" for entry in entries if entry.is_dir()]
     files = [entry for entry in entries if not entry.is_dir()]
@@ -331,7 +331,7 @@ def _listed(folder: Path) -> tuple[list[Path], list[str], dict[str, int]]:
     if not images:
         there = f"only {_first(folders + others)}" if folders or others else "an empty folder"
         remedy = "; images in subfolders are not read, name the subfolder" if folders else ""
-        raise DataError(f"Expected PNG, JPEG or TIFF images in {folder}, actual {there}{remedy}.")
+        raise DataError(f"expected PNG, JPEG or TIFF images in {folder}, got {there}{remedy}.")
     below = {entry.name: _images_below(entry) for entry in entries if entry.is_dir()}
     return images, others, {name: number for name, number in below.items() if number}
 
@@ -347,7 +347,7 @@ def _images_below(folder: Path) -> int:
 def _place(files: list[Path]) -> Path:
     """The folder of a list of files, or the one that has all of theirs."""
     if not files:
-        raise DataError("Expected PNG, JPEG or TIFF images, actual an empty list of files.")
+        raise DataError("expected PNG, JPEG or TIFF images, got an empty list of files.")
     return Path(os.path.commonpath([file.resolve().parent for file in files]))
 
 

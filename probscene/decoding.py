@@ -85,12 +85,12 @@ def read_rgb(path: Path, value_range: tuple[float, float] | None = None) -> np.n
         DataError: it is missing, is another file, or does not decode.
     """
     if not Path(path).is_file():
-        raise DataError(f"Expected a PNG, JPEG or TIFF image at {path}, actual none.")
+        raise DataError(f"expected a PNG, JPEG or TIFF image at {path}, got none.")
     try:
         with quiet():
             found = eight_bit(stored(read(Path(path)))[0], value_range)
     except Fault as fault:
-        raise DataError(f"Expected a PNG, JPEG or TIFF image at {path}, actual a file that {fault}.") from fault
+        raise DataError(f"expected a PNG, JPEG or TIFF image at {path}, got a file that {fault}.") from fault
     return _of_channels(found, 3)
 
 
@@ -225,7 +225,7 @@ def checked_range(value_range: Sequence[float]) -> tuple[float, float]:
     except (TypeError, ValueError):
         pass
     raise DataError(
-        f"Expected as range of 16-bit images two values from 0 to 65535, the lower first, actual {value_range}; leave "
+        f"expected as range of 16-bit images two values from 0 to 65535, the lower first, got {value_range}; leave "
         "it out to take the one that is found in the images."
     )
 

@@ -25,14 +25,14 @@ class Frontier(NamedTuple):
 
     Attributes:
         symbol: ``(N,)`` int64 nonterminal; V where the scene is finished.
-        repeat: ``(N,)`` how often this list has repeated: a child with its parent's nonterminal counts one more, any
-            other child starts at 0.
-        parent_repeat: ``(N,)`` the ``repeat`` of the nearest list around it.
+        list_index: ``(N,)`` how many elements of this list come before: a child with its parent's nonterminal has one
+            more, any other child 0.
+        parent_list_index: ``(N,)`` the ``list_index`` of the nearest enclosing list.
     """
 
     symbol: Tensor
-    repeat: Tensor
-    parent_repeat: Tensor
+    list_index: Tensor
+    parent_list_index: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Derivation:
     frontier: Frontier
 
     @staticmethod
-    def of(grammar: Grammar, rules: Tensor) -> "Derivation":
+    def from_rules(grammar: Grammar, rules: Tensor) -> "Derivation":
         """The derivations that given rules ``(N, T)`` spell; -1 pads.
 
         Raises:
@@ -64,10 +64,10 @@ class Derivation:
         given, K = rules.long(), len(grammar.rules)
         if ((given < -1) | (given >= K)).any():
             raise GrammarError(
-                f"Expected rules among 0..{K - 1}, or -1 for padding, actual {int(given.min())}..{int(given.max())}."
+                f"expected rules among 0..{K - 1}, or -1 for padding, got {int(given.min())}..{int(given.max())}."
             )
         if ((given[:, 1:] >= 0) & (given[:, :-1] < 0)).any():
-            raise GrammarError("Expected padding (-1) only after a scene's last rule, actual rules after padding.")
+            raise GrammarError("expected padding (-1) only after a scene's last rule, got rules after padding.")
 
         def choose(t, frontier, previous):
             rule = given[:, t]
@@ -77,12 +77,12 @@ class Derivation:
                 i = int(wrong.nonzero()[0])
                 names = (*grammar.nonterminals, "the end of the derivation")
                 raise GrammarError(
-                    f"Expected a rule of {names[int(frontier.symbol[i])]} at step {t} of scene {i}, "
-                    f"actual {int(rule[i])} ({grammar.rules[int(rule[i])]})."
+                    f"expected a rule of {names[int(frontier.symbol[i])]} at step {t} of scene {i}, "
+                    f"got {int(rule[i])} ({grammar.rules[int(rule[i])]})."
                 )
             return rule
 
-        return expand(grammar, of_tensors(choose), len(given), given.shape[1])
+        return expand(grammar, tensor_chooser(choose), len(given), given.shape[1])
 
     @staticmethod
     def merged(grammar: Grammar, parts: "list[tuple[Tensor, Derivation]]") -> "Derivation":
@@ -115,7 +115,7 @@ class Derivation:
         )
 
     def trimmed(self) -> "Derivation":
-        """The same derivations without the columns that pad every scene, as ``of`` gives them."""
+        """The same derivations without the columns that pad every scene, as ``from_rules`` gives them."""
         steps = max(1, int(self.lengths.max())) if len(self) else 1
         nodes = max(1, int((self.kind >= 0).sum(1).max())) if len(self) else 1
         if (steps, nodes) == (self.rules.shape[1], self.kind.shape[1]):
@@ -156,7 +156,7 @@ Arrays = tuple[np.ndarray, ...]  # of a frontier, in its order
 Chooser = Callable[[int, Arrays, np.ndarray], np.ndarray]  # rules ``(N,)`` of the step, frontier and rules before it
 
 
-def of_tensors(choose: Callable[[int, Frontier, Tensor], Tensor]) -> Chooser:
+def tensor_chooser(choose: Callable[[int, Frontier, Tensor], Tensor]) -> Chooser:
     """A chooser that is given tensors and gives one."""
 
     def choose_arrays(t: int, frontier: Arrays, previous: np.ndarray) -> np.ndarray:
@@ -173,7 +173,7 @@ def expand(grammar: Grammar, choose: Chooser, N: int, max_steps: int) -> Derivat
     Raises:
         GrammarError: so many steps that a stack's entry does not fit into 63 bits.
     """
-    fields, R = Fields.of(grammar, max_steps), grammar.children.shape[1]
+    fields, R = Fields.from_grammar(grammar, max_steps), grammar.children.shape[1]
     deepest = 2 + (max_steps + 1) * max(1, R - 1)
     # Entry 0 is the finished scene and is never popped. Scenes lie side by side: the next entry is N further.
     stack = np.zeros((deepest + R) * N, np.int64)
@@ -213,35 +213,35 @@ class Fields(NamedTuple):
     scene is its symbol alone.
 
     Attributes:
-        repeat, parent_repeat, node: the first bit of each; that of ``symbol`` is 0.
+        list_index, parent_list_index, node: the first bit of each; that of ``symbol`` is 0.
     """
 
-    repeat: int
-    parent_repeat: int
+    list_index: int
+    parent_list_index: int
     node: int
 
     @staticmethod
-    def of(grammar: Grammar, max_steps: int) -> "Fields":
+    def from_grammar(grammar: Grammar, max_steps: int) -> "Fields":
         """As few bits as numbers need that so many steps can come to."""
-        repeat = len(grammar.nonterminals).bit_length()
-        parent_repeat = repeat + max_steps.bit_length()
-        node = parent_repeat + max_steps.bit_length()
+        list_index = len(grammar.nonterminals).bit_length()
+        parent_list_index = list_index + max_steps.bit_length()
+        node = parent_list_index + max_steps.bit_length()
         if node + (1 + max_steps * grammar.objects.shape[1]).bit_length() > 63:
-            raise GrammarError(f"Expected a max_steps of some thousands at most, actual {max_steps}; lower it.")
-        return Fields(repeat, parent_repeat, node)
+            raise GrammarError(f"expected a max_steps of some thousands at most, got {max_steps}; lower it.")
+        return Fields(list_index, parent_list_index, node)
 
     def frontier(self, entry: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Symbol, repeat and parent_repeat, as entries are."""
+        """Symbol, list_index and parent_list_index of entries."""
         return tuple(entry >> low & (1 << high - low) - 1 for low, high in pairwise((0, *self)))
 
     def owner(self, entry: np.ndarray) -> np.ndarray:
         """The node that hangs above, -1 for none."""
         return (entry >> self.node) - 1
 
-    def below(self, repeat: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """What is inside a list that has repeated so often, and hangs below the first of a rule's objects where there
+    def below(self, list_index: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """The bits of what is inside an element of a list, and hangs below the first of a rule's objects where there
         were so many nodes."""
-        return (repeat << self.parent_repeat) + (1 + nodes << self.node)
+        return (list_index << self.parent_list_index) + (1 + nodes << self.node)
 
 
 @lru_cache(64)
@@ -252,10 +252,10 @@ def _productions(grammar: Grammar, N: int, fields: Fields) -> np.ndarray:
     children, owner = grammar.children.T, grammar.child_owner.T
     same = children == grammar.lhs
     inside, hangs = ~same & grammar.recursive[grammar.lhs], owner >= 0
-    of_repeat, of_parent, of_node = ((1 << high) - (1 << low) for low, high in pairwise((*fields, 63)))
-    pushed = children + (same.long() << fields.repeat) + (owner.clamp(min=0) << fields.node)
-    kept = same * of_repeat + ~inside * of_parent + ~hangs * of_node
-    taken = inside * of_parent + hangs * of_node
+    of_list_index, of_parent_list_index, of_node = ((1 << high) - (1 << low) for low, high in pairwise((*fields, 63)))
+    pushed = children + (same.long() << fields.list_index) + (owner.clamp(min=0) << fields.node)
+    kept = same * of_list_index + ~inside * of_parent_list_index + ~hangs * of_node
+    taken = inside * of_parent_list_index + hangs * of_node
     numbers = torch.stack([N * (grammar.num_children - 1), grammar.num_objects])
     table = pad(torch.cat([pushed, kept, taken, numbers]), (0, 1))
     table[: len(children), -1] = len(grammar.nonterminals)
@@ -275,3 +275,18 @@ def _scene_graph(grammar: Grammar, rules: Tensor, base: Tensor, owner: Tensor, n
     kind = torch.full((N, M + 1), -1).scatter(1, at, objects.flatten(1))
     parent = torch.full((N, M + 1), -1).scatter(1, at, parents.flatten(1))
     return kind[:, :M].contiguous(), parent[:, :M].contiguous()
+
+
+def group_of(kind: Tensor, parent: Tensor, group: int) -> Tensor:
+    """The node of kind ``group`` that each node is or belongs to, ``(N, M)`` int64, -1 for none.
+
+    Args:
+        kind, parent: ``(N, M)`` int64 of a derivation.
+    """
+    own = torch.arange(kind.shape[1]).expand_as(kind)
+    found, above = torch.where(kind == group, own, -1), parent
+    while ((found < 0) & (above >= 0)).any():
+        at = above.clamp(min=0)
+        found = torch.where((found < 0) & (above >= 0) & (kind.gather(1, at) == group), above, found)
+        above = torch.where(above >= 0, parent.gather(1, at), above)
+    return found

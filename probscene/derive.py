@@ -1,7 +1,8 @@
 """``derive``, the one Pyro program behind prior, PCFG and guide (Meta-Sim2, section 3.2).
 
 Each step samples the rule of the next nonterminal at the site ``rule_t`` from a Categorical whose illegal rules are
-masked. ``Given`` is an effect handler that hands ``derive`` what is derived already. Axis letters: N scenes, T steps.
+masked. ``ConditionDerivation`` is an effect handler that hands ``derive`` what is derived already. Axis letters: N
+scenes, T steps.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from pyro.poutine.messenger import Messenger
 from pyro.poutine.runtime import _PYRO_STACK, effectful
 from torch import Tensor
 
-from .derivation import Chooser, Derivation, Frontier, expand, of_tensors
+from .derivation import Chooser, Derivation, Frontier, expand, tensor_chooser
 from .errors import ModelError, SamplingError
 from .grammar import Grammar
 from .policy import Policy, masked
@@ -35,7 +36,7 @@ def _derived(grammar: Grammar, choose: Chooser, num_scenes: int, max_steps: int)
 _effect = cast(Callable[..., Derivation], _derived)  # which takes a name as well
 
 
-class Given(Messenger):
+class ConditionDerivation(Messenger):
     """Inside it ``derive`` gives derivations that are known: the stack machine does not run, and no ``rule_t`` is a
     site. A program that derives scenes of another grammar, under another name, or another number of them, still
     samples.
@@ -58,8 +59,8 @@ class Given(Messenger):
         longest = self.derivation.rules.shape[1]
         if longest > max_steps and not self.any_length:
             raise ModelError(
-                f"Expected the program to derive with a max_steps of at least {longest}, the rules of the longest of "
-                f"these scenes, actual max_steps = {max_steps}: it would draw fewer objects than they have. Give "
+                f"expected the program to derive with a max_steps of at least {longest}, the rules of the longest of "
+                f"these scenes, got max_steps = {max_steps}: it would draw fewer objects than they have. Give "
                 "derive(...) the max_steps of the SceneModel, or say it once with scene_model."
             )
         msg["value"], msg["done"] = self.derivation, True
@@ -104,7 +105,7 @@ def derive(
         _check(grammar, f"{name}_{t}", value, frontier)
         return value.squeeze(-1)
 
-    derivation = _effect(grammar, of_tensors(choose), num_scenes, max_steps, name=_message(name))
+    derivation = _effect(grammar, tensor_chooser(choose), num_scenes, max_steps, name=_message(name))
     given = done == 0  # by a handler
     if _without_density():
         static = not given
@@ -137,7 +138,7 @@ class _Sampled(Messenger):
     def _pyro_post_sample(self, msg):
         if msg["infer"].get("enumerate") == "sequential":
             raise ModelError(
-                f"Expected site {msg['name']!r} to be sampled, actual sequential enumeration; for a sum over "
+                f"expected site {msg['name']!r} to be sampled, got sequential enumeration; for a sum over "
                 "structures take enumerate_derivations(grammar, max_steps), and to enumerate other sites name them "
                 "alone: pyro.sample(..., infer={'enumerate': 'parallel'})."
             )
@@ -148,7 +149,7 @@ def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> No
     shape = len(frontier.symbol), 1
     if value.shape != shape:
         raise ModelError(
-            f"Expected site {site!r} of shape {shape}, one rule a scene, actual {tuple(value.shape)}. Call derive "
+            f"expected site {site!r} of shape {shape}, one rule a scene, got {tuple(value.shape)}. Call derive "
             f"inside pyro.plate('scenes', {shape[0]}, dim=-2), and outside vectorised particles and enumeration: take "
             "num_particles without vectorize_particles, Predictive without parallel, and for a sum over structures "
             "enumerate_derivations(grammar, max_steps)."
@@ -158,7 +159,7 @@ def _check(grammar: Grammar, site: str, value: Tensor, frontier: Frontier) -> No
     if wrong.any():
         i = int(wrong.nonzero()[0])
         raise ModelError(
-            f"Expected at site {site!r} a rule of {grammar.nonterminals[int(frontier.symbol[i])]} in scene {i}, actual "
+            f"expected at site {site!r} a rule of {grammar.nonterminals[int(frontier.symbol[i])]} in scene {i}, got "
             f"{int(rule[i])} ({grammar.rules[int(rule[i])]}); condition on Derivation.sites(), and for a sum over "
             "structures take enumerate_derivations(grammar, max_steps)."
         )
@@ -197,9 +198,9 @@ def derive_complete(
             failures[todo] += 1
     if len(todo):
         raise SamplingError(
-            f"Expected every scene to end within max_steps = {max_steps}, actual {len(todo)} of {num_scenes} scenes "
+            f"expected every scene to end within max_steps = {max_steps}, got {len(todo)} of {num_scenes} scenes "
             f"still open after {attempts} attempts; raise max_steps or make the lists shorter."
         )
     if not parts:
-        return Derivation.of(grammar, torch.full((0, 1), -1)), failures
+        return Derivation.from_rules(grammar, torch.full((0, 1), -1)), failures
     return Derivation.merged(grammar, parts).trimmed(), failures

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .camera_effects import CameraEffects
 from .errors import ModelError
-from .photo import Photo
 
 _COLOUR_LIMITS = -1.0, 2.0  # within which a channel is clipped to 0..1; beyond them it has another scale
 
@@ -34,21 +34,21 @@ class Atlas:
     def __post_init__(self):
         if not isinstance(self.sprites, list | tuple):
             raise ModelError(
-                f"Expected an Atlas of a tuple of arrays, actual {_described(self.sprites)}; write Atlas((sprite,)) "
+                f"expected an Atlas of a tuple of arrays, got {_described(self.sprites)}; write Atlas((sprite,)) "
                 "for one sprite, Atlas(tuple(sprites)) for several."
             )
         if not self.sprites:
-            raise ModelError("Expected at least one sprite in an Atlas, actual none.")
+            raise ModelError("expected at least one sprite in an Atlas, got none.")
         frozen = []
         for i, sprite in enumerate(self.sprites):
             if not isinstance(sprite, np.ndarray):
                 raise ModelError(
-                    f"Expected sprite {i} as a numpy array, uint8 (h, w, 4) RGBA, actual {_described(sprite)}; "
+                    f"expected sprite {i} as a numpy array, uint8 (h, w, 4) RGBA, got {_described(sprite)}; "
                     "np.asarray(image.convert('RGBA')) makes one of a picture."
                 )
             if sprite.ndim != 3 or sprite.shape[2] != 4 or sprite.dtype != np.uint8 or sprite.size == 0:
                 raise ModelError(
-                    f"Expected sprite {i} as uint8 (h, w, 4) RGBA, actual {sprite.dtype} {sprite.shape}; "
+                    f"expected sprite {i} as uint8 (h, w, 4) RGBA, got {sprite.dtype} {sprite.shape}; "
                     "add an alpha channel and convert it to uint8."
                 )
             copy = np.ascontiguousarray(sprite).copy()
@@ -123,12 +123,12 @@ class Sprites:
     def __post_init__(self):
         if not isinstance(self.atlas, Atlas):
             raise ModelError(
-                f"Expected an Atlas in Sprites({self.kinds!r}), actual {_described(self.atlas)}; write "
+                f"expected an Atlas in Sprites({self.kinds!r}), got {_described(self.atlas)}; write "
                 "Atlas((sprite,)) around a sprite, or Atlas(tuple(sprites)) around several."
             )
         if self.keypoints and (not self.labelled or self.kinds == ()):
             raise ModelError(
-                f"Expected keypoints of sprites with a label, actual some of Sprites({self.kinds!r}) without one; give "
+                f"expected keypoints of sprites with a label, got some of Sprites({self.kinds!r}) without one; give "
                 "them to the layer that draws the object."
             )
         points = {} if self.keypoints is None else self.keypoints
@@ -137,7 +137,7 @@ class Sprites:
             for name, point in points.items()
         ):
             raise ModelError(
-                f"Expected the keypoints of Sprites({self.kinds!r}) as pairs by name, actual {self.keypoints!r}; write "
+                f"expected the keypoints of Sprites({self.kinds!r}) as pairs by name, got {self.keypoints!r}; write "
                 "keypoints={'nose': (0.5, 0.2)}, shares of the sprite's width and height."
             )
 
@@ -198,7 +198,7 @@ class Drawing:
     kinds: tuple[str, ...]
     layers: tuple[Layer, ...]
     background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
-    photo: Photo | None = None
+    photo: CameraEffects | None = None
 
     def __post_init__(self):
         try:
@@ -207,7 +207,7 @@ class Drawing:
             rgb = []
         if len(rgb) != 3 or not np.isfinite(rgb).all():
             raise ModelError(
-                f"Expected the background of a drawing as three numbers in 0..1, red, green and blue, actual "
+                f"expected the background of a drawing as three numbers in 0..1, red, green and blue, got "
                 f"{self.background!r}; write background=(0.2, 0.2, 0.2)."
             )
         check_colour("background", torch.tensor(rgb))
@@ -217,8 +217,8 @@ class Drawing:
 
     def __getitem__(self, scenes: slice | Tensor) -> "Drawing":
         """The same drawing of some of the scenes."""
-        layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
-        return replace(self, kind=self.kind[scenes], layers=layers, photo=of_scenes(self.photo, scenes))
+        layers = tuple(select_scenes(layer, scenes) for layer in self.layers)
+        return replace(self, kind=self.kind[scenes], layers=layers, photo=select_scenes(self.photo, scenes))
 
 
 def check_colour(name: str, colour: Tensor) -> None:
@@ -233,13 +233,13 @@ def check_colour(name: str, colour: Tensor) -> None:
     if low < _COLOUR_LIMITS[0] or high > _COLOUR_LIMITS[1]:
         worst = low if low < _COLOUR_LIMITS[0] else high
         remedy = "divide by 255" if 0 < worst <= 255 else "draw it from a distribution that stays there, or clamp it"
-        raise ModelError(f"Expected {name} in 0..1, actual {worst:g}; {remedy}.")
+        raise ModelError(f"expected {name} in 0..1, got {worst:g}; {remedy}.")
 
 
 AnyPart = TypeVar("AnyPart")
 
 
-def of_scenes(part: AnyPart, scenes: slice | Tensor) -> AnyPart:
+def select_scenes(part: AnyPart, scenes: slice | Tensor) -> AnyPart:
     """A dataclass with some of the scenes' rows of all its tensors; what has none is as it is."""
     if part is None:
         return part
@@ -261,19 +261,19 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
             value = torch.as_tensor(value, dtype=dtype).detach()
         except (TypeError, ValueError):
             raise ModelError(
-                f"Expected Sprites({sprites.kinds!r}).{name} as a number or a tensor, actual {value!r}; draw with "
+                f"expected Sprites({sprites.kinds!r}).{name} as a number or a tensor, got {value!r}; draw with "
                 "values of sites, such as x = pyro.sample(...)."
             ) from None
         try:
             value = value.expand(*shape, *tail)
         except RuntimeError:
             raise ModelError(
-                f"Expected Sprites({sprites.kinds!r}).{name} to broadcast to (scenes, nodes) = {tuple(shape)}, "
-                f"actual shape {tuple(value.shape)}."
+                f"expected Sprites({sprites.kinds!r}).{name} to broadcast to (scenes, nodes) = {tuple(shape)}, "
+                f"got shape {tuple(value.shape)}."
             ) from None
         shown = value[present]
         if value.is_floating_point() and not torch.isfinite(shown).all():
-            raise ModelError(f"Expected finite values in Sprites({sprites.kinds!r}).{name}, actual NaN or infinity.")
+            raise ModelError(f"expected finite values in Sprites({sprites.kinds!r}).{name}, got NaN or infinity.")
         if name == "tint":
             check_colour(f"Sprites({sprites.kinds!r}).tint", shown)
         return value.contiguous()
@@ -282,8 +282,8 @@ def resolve(sprites: Sprites, present: Tensor) -> Layer:
     chosen = index[present]
     if chosen.numel() and not (0 <= int(chosen.min()) and int(chosen.max()) < len(sprites.atlas)):
         raise ModelError(
-            f"Expected sprite indices of {sprites.kinds!r} in 0..{len(sprites.atlas) - 1}, "
-            f"actual {int(chosen.min())}..{int(chosen.max())}."
+            f"expected sprite indices of {sprites.kinds!r} in 0..{len(sprites.atlas) - 1}, "
+            f"got {int(chosen.min())}..{int(chosen.max())}."
         )
     scale_y = sprites.scale if sprites.scale_y is None else sprites.scale_y
     layer = Layer(

@@ -25,7 +25,7 @@ def enumerate_derivations(grammar: Grammar, max_steps: int, limit: int = 100_000
     shortest = shortest_lengths(grammar)
     if shortest[0] > max_steps:
         raise GrammarError(
-            f"Expected max_steps of at least {shortest[0]}, the length of the shortest derivation, actual {max_steps}."
+            f"expected max_steps of at least {shortest[0]}, the length of the shortest derivation, got {max_steps}."
         )
     children = [[int(v) for v in row if v >= 0] for row in grammar.children]
     of = [grammar.rules_of(name) for name in grammar.nonterminals]
@@ -38,7 +38,7 @@ def enumerate_derivations(grammar: Grammar, max_steps: int, limit: int = 100_000
             found.append(rules)
             if len(found) > limit:
                 raise GrammarError(
-                    f"Expected at most {limit} derivations of at most {max_steps} rules, actual more; "
+                    f"expected at most {limit} derivations of at most {max_steps} rules, got more; "
                     "lower max_steps or raise the limit."
                 )
             continue
@@ -47,7 +47,7 @@ def enumerate_derivations(grammar: Grammar, max_steps: int, limit: int = 100_000
             if len(rules) + 1 + fewest <= max_steps:
                 todo.append(((*rules, k), (*stack[:-1], *children[k]), fewest))
     longest = max(map(len, found))
-    return Derivation.of(grammar, torch.tensor([rules + (-1,) * (longest - len(rules)) for rules in found]))
+    return Derivation.from_rules(grammar, torch.tensor([rules + (-1,) * (longest - len(rules)) for rules in found]))
 
 
 def shortest_lengths(grammar: Grammar) -> list[int]:

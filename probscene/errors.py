@@ -1,4 +1,4 @@
-"""One family of errors: every fault that a person can mend is a ``ProbsceneError`` with one clear message.
+"""One family of errors: every fault that a person can fix is a ``ProbsceneError`` with one clear message.
 
 A message says what was expected, what came, and what to do. The command line prints it without a traceback and exits
 with ``exit_code``: 2 where the input is at fault, 1 where the machine is.
@@ -6,7 +6,7 @@ with ``exit_code``: 2 where the input is at fault, 1 where the machine is.
 
 
 class ProbsceneError(Exception):
-    """The input is at fault; the message says how to mend it."""
+    """The input is at fault; the message says how to fix it."""
 
     exit_code = 2
 

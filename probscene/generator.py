@@ -52,7 +52,7 @@ class Command:
     def __post_init__(self):
         if isinstance(self.argv, str) or not self.argv:
             raise ModelError(
-                f"Expected the argv of a Command as a list of words, actual {self.argv!r}; write "
+                f"expected the argv of a Command as a list of words, got {self.argv!r}; write "
                 "Command([sys.executable, str(Path(__file__).with_name('draw.py'))])."
             )
         object.__setattr__(self, "argv", tuple(str(word) for word in self.argv))
@@ -61,7 +61,7 @@ class Command:
         numbers |= {"start_timeout": self.start_timeout, "timeout": self.timeout}
         for key, number in numbers.items():
             if number is not None and number <= 0:
-                raise ModelError(f"Expected {key} of a Command above 0, actual {number}.")
+                raise ModelError(f"expected {key} of a Command above 0, got {number}.")
 
     @property
     def name(self) -> str:
@@ -83,7 +83,7 @@ class Command:
                 digest.update(hashlib.sha256(Path(file).read_bytes()).digest())
             except OSError as error:
                 raise DataError(
-                    f"Expected to read {file}, of which the generator {self.name} is made, actual {error.strerror}; "
+                    f"expected to read {file}, of which the generator {self.name} is made, got {error.strerror}; "
                     "put it back, or take it out of files=."
                 ) from error
         return f"generator {self.name}, {digest.hexdigest()[:16]}"

@@ -77,16 +77,16 @@ def _normal(symbol: str | Node) -> str | Node:
         return _checked_name(symbol if isinstance(symbol, str) else symbol.name)
     name, children = symbol
     if not isinstance(children, tuple):
-        raise GrammarError(f"Expected a tuple of children, actual Node({name!r}, {children!r}).")
+        raise GrammarError(f"expected a tuple of children, got Node({name!r}, {children!r}).")
     if is_nonterminal(_checked_name(name)):
-        raise GrammarError(f"Expected children below an object (first letter lower-case), actual '{symbol}'.")
+        raise GrammarError(f"expected children below an object (first letter lower-case), got '{symbol}'.")
     return Node(name, tuple(map(_normal, children)))
 
 
 def _checked_name(name: str) -> str:
     if not _NAME.fullmatch(name) or name in _EMPTY:
         raise GrammarError(
-            f"Expected names of letters, digits, '_' and '-', actual {name!r}; give each symbol as an argument of its "
+            f"expected names of letters, digits, '_' and '-', got {name!r}; give each symbol as an argument of its "
             "own, what hangs below an object as Node(name, children), and no symbols for the empty production."
         )
     return name
@@ -125,7 +125,7 @@ class Grammar:
     def __init__(self, productions: str | Iterable[Rule]):
         rules = parse(productions) if isinstance(productions, str) else list(productions)
         if not rules:
-            raise GrammarError("Expected at least one production, actual none; write one as 'Scene -> Things'.")
+            raise GrammarError("expected at least one production, got none; write one as 'Scene -> Things'.")
         self.nonterminals = tuple(dict.fromkeys(rule.lhs for rule in rules))
         self.rules = tuple(rule for name in self.nonterminals for rule in rules if rule.lhs == name)
         self._flat = [rule.flatten() for rule in self.rules]
@@ -147,7 +147,7 @@ class Grammar:
             GrammarError: there is no such nonterminal.
         """
         if nonterminal not in self.nonterminals:
-            raise GrammarError(f"Expected a nonterminal among {list(self.nonterminals)}, actual {nonterminal!r}.")
+            raise GrammarError(f"expected a nonterminal among {list(self.nonterminals)}, got {nonterminal!r}.")
         return [k for k, rule in enumerate(self.rules) if rule.lhs == nonterminal]
 
     def kind(self, name: str) -> int:
@@ -157,14 +157,14 @@ class Grammar:
             GrammarError: the grammar has no such object.
         """
         if name not in self.kinds:
-            raise GrammarError(f"Expected an object among {list(self.kinds)}, actual {name!r}.")
+            raise GrammarError(f"expected an object among {list(self.kinds)}, got {name!r}.")
         return self.kinds.index(name)
 
     def _check(self) -> None:
         for rule in self.rules:
             if not is_nonterminal(rule.lhs):
                 raise GrammarError(
-                    f"Expected a nonterminal (first letter upper-case) left of '->', actual {rule.lhs!r} in '{rule}'; "
+                    f"expected a nonterminal (first letter upper-case) left of '->', got {rule.lhs!r} in '{rule}'; "
                     "objects have no productions."
                 )
         for rule, count in Counter(self.rules).items():
@@ -247,7 +247,7 @@ def parse(text: str) -> list[Rule]:
             left, arrow, right = (line if "->" in line else line.replace("→", "->")).partition("->")
             lhs = left.strip()
             if not arrow or not _NAME.fullmatch(lhs):
-                raise GrammarError(f"Line {number}: expected 'Name -> symbols | symbols', actual '{line}'.")
+                raise GrammarError(f"Line {number}: expected 'Name -> symbols | symbols', got '{line}'.")
         rules += _alternatives(lhs, right, number)
     return rules
 
@@ -258,7 +258,7 @@ def _alternatives(lhs: str, right: str, number: int) -> list[Rule]:
     while at < len(right):
         match = _TOKEN.match(right, at)
         if match is None:
-            raise GrammarError(f"Line {number}: expected names, brackets and '|', actual '{right[at:].strip()}'.")
+            raise GrammarError(f"Line {number}: expected names, brackets and '|', got '{right[at:].strip()}'.")
         tokens.append(match[1])
         at = match.end()
     rules: list[Rule] = []

@@ -45,7 +45,7 @@ class ImageArray(Images):
         with quiet():
             each = [_array(image, i) for i, image in enumerate(_items(images))]
         if not each:
-            raise DataError("Expected images to learn from, actual none; give at least one.")
+            raise DataError("expected images to learn from, got none; give at least one.")
         peaks = [largest(image) if image.dtype == np.uint16 else None for image in each]
         self.value_range, of_range = common_range(peaks, value_range)
         each = [eight_bit(image, self.value_range) for image in each]
@@ -78,10 +78,10 @@ def _items(images: Any) -> Iterable[Any]:
         DataError: an array of another shape, or what has no length or no items by number.
     """
     if isinstance(images, np.ndarray | Tensor) and images.ndim not in (3, 4):
-        raise DataError(f"Expected an array of images (L, H, W, C) or (L, H, W), actual shape {tuple(images.shape)}.")
+        raise DataError(f"expected an array of images (L, H, W, C) or (L, H, W), got shape {tuple(images.shape)}.")
     if isinstance(images, np.ndarray | Tensor) and images.ndim == 3 and _looks_like_one(images):
         raise DataError(
-            f"Expected an array of images (L, H, W, C) or (L, H, W), actual shape {tuple(images.shape)}, which looks "
+            f"expected an array of images (L, H, W, C) or (L, H, W), got shape {tuple(images.shape)}, which looks "
             "like one image. Give array[None] for one image, or a list of its images for several that are grey."
         )
     try:
@@ -90,8 +90,8 @@ def _items(images: Any) -> Iterable[Any]:
         number = -1
     if number < 0 or not hasattr(images, "__getitem__") or isinstance(images, Mapping):
         raise DataError(
-            "Expected as target a folder, a list of files, an array of images or a dataset with a length and images by "
-            f"number, actual {type(images).__name__}; make a list of it."
+            "expected as target a folder, a list of files, an array of images or a dataset with a length and images by "
+            f"number, got {type(images).__name__}; make a list of it."
         )
     return (_item(images, i) for i in range(number))
 
@@ -107,7 +107,7 @@ def _item(images: Any, i: int) -> Any:
         return images[i]
     except NotImplementedError as error:
         raise DataError(
-            f"Expected a dataset that gives images by number, actual {type(images).__name__}, which does not; make a "
+            f"expected a dataset that gives images by number, got {type(images).__name__}, which does not; make a "
             "list of its images."
         ) from error
 
@@ -128,8 +128,8 @@ def _array(image: Any, i: int) -> np.ndarray:
     found = found[..., 0] if found.ndim == 3 and found.shape[2] == 1 else found
     if found.dtype not in (np.uint8, np.uint16) or (found.ndim != 2 and found.shape[2:] != (3,)) or not found.size:
         raise DataError(
-            f"Expected image {i} as (H, W), (H, W, 1) or (H, W, 3) of uint8 or uint16, or a torch tensor (1 or 3, H, "
-            f"W) of uint8 or of floats from 0 to 1, actual {found.dtype} {found.shape}; convert it before."
+            f"expected image {i} as (H, W), (H, W, 1) or (H, W, 3) of uint8 or uint16, or a torch tensor (1 or 3, H, "
+            f"W) of uint8 or of floats from 0 to 1, got {found.dtype} {found.shape}; convert it before."
         )
     return found
 
@@ -164,4 +164,4 @@ def _of_pillow(image: Image.Image, i: int) -> np.ndarray:
         return turned(values.astype(np.uint16), orientation)
     except (Fault, OSError, SyntaxError, ValueError) as error:
         fault = error if isinstance(error, Fault) else f"does not decode ({error})"
-        raise DataError(f"Expected image {i} to have pixels of 8 or 16 bits, actual one that {fault}.") from error
+        raise DataError(f"expected image {i} to have pixels of 8 or 16 bits, got one that {fault}.") from error

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from .camera_effects import CameraEffects
 from .drawing import Drawing, Layer
 from .errors import ModelError
-from .photo import Photo
 from .request import Renderable, Request, Values
 from .world import Ground, MeshLayer, Part, World, resolve_scene
 
@@ -34,9 +34,7 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
     if len(drawings) == len(drawn):
         backgrounds = {(red, green, blue) for _, drawing in drawings for red, green, blue in [drawing.background]}
         if len(backgrounds) > 1:
-            raise ModelError(
-                f"Expected scenarios with one background, actual {sorted(backgrounds)}; draw it as a layer."
-            )
+            raise ModelError(f"expected scenarios with one background, got {sorted(backgrounds)}; draw it as a layer.")
         layers = _layers(kind, [(own, drawing.kind.shape[1], drawing.layers) for own, drawing in drawings])
         return Drawing(kind, kinds, layers, backgrounds.pop(), _photo([(own, d.photo) for own, d in drawings]))
     requests = [(own, request) for own, request in drawn if isinstance(request, Request)]
@@ -44,8 +42,8 @@ def join_drawings(kind: Tensor, kinds: tuple[str, ...], drawn: list[tuple[Tensor
         return _request(kind, kinds, requests)
     if len(worlds) != len(drawn):
         raise ModelError(
-            "Expected scenarios that all draw sprites, or all build worlds, or all request images of a generator, "
-            "actual several of these; join those alike."
+            "expected scenarios that all draw sprites, or all build worlds, or all request images of a generator, "
+            "got several of these; join those alike."
         )
     return World(
         kind,
@@ -99,11 +97,13 @@ def _chosen(parts: list[tuple[Tensor, Part]]) -> Part:
     return type(parts[0][1])(**{name: _rows([(own, getattr(part, name)) for own, part in parts]) for name in names})
 
 
-def _photo(parts: list[tuple[Tensor, Photo | None]]) -> Photo | None:
+def _photo(parts: list[tuple[Tensor, CameraEffects | None]]) -> CameraEffects | None:
     """Scenarios without a photo keep their images as they are among others with one."""
     if all(photo is None for _, photo in parts):
         return None
-    return _chosen([(own, resolve_scene(Photo(), len(own)) if photo is None else photo) for own, photo in parts])
+    return _chosen(
+        [(own, resolve_scene(CameraEffects(), len(own)) if photo is None else photo) for own, photo in parts]
+    )
 
 
 def _ground(parts: list[tuple[Tensor, Ground | None]]) -> Ground | None:
@@ -112,7 +112,7 @@ def _ground(parts: list[tuple[Tensor, Ground | None]]) -> Ground | None:
     if not grounds:
         return None
     if len(grounds) < len(parts):
-        raise ModelError("Expected scenarios that all have a ground, or none, actual both; give every scenario one.")
+        raise ModelError("expected scenarios that all have a ground, or none, got both; give every scenario one.")
     strips = max(ground.surface.shape[1] for _, ground in grounds)
     surfaces, wide = (), []
     for own, ground in grounds:

@@ -1,6 +1,6 @@
 """Lists that have a longest: what the prior says of their lengths, and how long those of derivations are.
 
-A list is a nonterminal that repeats itself, ``Plates -> Plate Plates | ε``; its length is how often it has. Where
+A list is a nonterminal that leads to itself, ``Plates -> Plate Plates | ε``; its length is its last list index. Where
 ``counts(...)`` end, or a weight is 0, there is a longest (``Support``). Lists in which nothing declares one are not
 among them. Axis letters: N scenes, T steps, L lists.
 """
@@ -24,14 +24,14 @@ class ListBounds(NamedTuple):
 
     Attributes:
         symbol: the nonterminal.
-        rank: of the list around, which alone it is about; None where all ranks have the same bounds.
+        parent_list_index: the one that the bounds are of; None where all have the same bounds.
         shortest: under the prior.
         prior: the longest under the prior.
         longest: the longest that is possible, as of pretraining; not less.
     """
 
     symbol: int
-    rank: int | None
+    parent_list_index: int | None
     shortest: int
     prior: int
     longest: int
@@ -41,16 +41,18 @@ class Lengths(NamedTuple):
     """Lists of derivations.
 
     Attributes:
-        rank: ``(L,)`` int64 of the list around, ``Frontier.parent_repeat``.
+        parent_list_index: ``(L,)`` int64, as of ``Frontier``.
         length: ``(L,)`` int64.
     """
 
-    rank: NDArray[np.int64]
+    parent_list_index: NDArray[np.int64]
     length: NDArray[np.int64]
 
-    def of(self, bounds: ListBounds, ranks: int) -> NDArray[np.int64]:
-        """The lengths that bounds are about; the last of ``ranks`` is also for all later ones."""
-        return self.length if bounds.rank is None else self.length[self.rank.clip(max=ranks - 1) == bounds.rank]
+    def select(self, bounds: ListBounds, parent_list_indices: int) -> NDArray[np.int64]:
+        """The lengths of the lists that bounds are of; the last parent list index also stands for all later ones."""
+        if bounds.parent_list_index is None:
+            return self.length
+        return self.length[self.parent_list_index.clip(max=parent_list_indices - 1) == bounds.parent_list_index]
 
 
 def is_list(grammar: Grammar, symbol: int) -> bool:
@@ -60,18 +62,18 @@ def is_list(grammar: Grammar, symbol: int) -> bool:
 
 
 def bounded_lists(grammar: Grammar, prior: StructurePrior, support: Support) -> list[ListBounds]:
-    """The lists that have a longest, in the grammar's order, then by rank."""
+    """The lists that have a longest, in the grammar's order, then by parent list index."""
     found = []
-    every = [Branching(grammar, policy.table) for policy in (prior, support.uniform())]
+    every = [Branching(grammar, table) for table in (prior.table, support.uniform_table())]
     for symbol in (v for v in range(len(grammar.nonterminals)) if is_list(grammar, v)):
         own, possible = (_ends(process, symbol) for process in every)
         bounds = []
-        for rank, (_, longest) in sorted(possible.items()):
-            shortest, most = own.get(min(rank, prior.table.shape[1] - 1), (0, 0))
+        for index, (_, longest) in sorted(possible.items()):
+            shortest, most = own.get(min(index, prior.table.shape[1] - 1), (0, 0))
             if math.isfinite(longest) and math.isfinite(most):
-                bounds.append(ListBounds(symbol, rank, int(shortest), int(most), int(longest)))
+                bounds.append(ListBounds(symbol, index, int(shortest), int(most), int(longest)))
         if len({each[2:] for each in bounds}) == 1 and len(bounds) == len(possible):
-            bounds = [bounds[0]._replace(rank=None)]
+            bounds = [bounds[0]._replace(parent_list_index=None)]
         found += bounds
     return found
 
@@ -81,7 +83,7 @@ def lengths(grammar: Grammar, derivation: Derivation, symbol: int) -> Lengths:
     rules, frontier = derivation.rules, derivation.frontier
     again = (grammar.children[rules.clamp(min=0)] == symbol).any(-1)
     ended = (frontier.symbol == symbol) & (rules >= 0) & ~again
-    return Lengths(frontier.parent_repeat[ended].numpy(), frontier.repeat[ended].numpy())
+    return Lengths(frontier.parent_list_index[ended].numpy(), frontier.list_index[ended].numpy())
 
 
 def element_kinds(grammar: Grammar, symbol: int, among: Collection[int]) -> tuple[tuple[int, ...], int]:
@@ -109,7 +111,7 @@ def element_kinds(grammar: Grammar, symbol: int, among: Collection[int]) -> tupl
         total = {sum(kind in kinds for kind in _objects(grammar, k))}
         for v in _left(grammar, k):
             if v in around and v != symbol:
-                return {0, 2}  # what repeats itself has no one number
+                return {0, 2}  # what leads to itself has no one number
             if v in inside:
                 below = set().union(*(number(j, kinds, (*around, v)) for j in _rules(grammar, v)))
                 total = {a + b for a in total for b in below}
@@ -145,28 +147,32 @@ def hangs_below(grammar: Grammar, symbol: int, kind: int) -> bool:
 
 
 def share_from(process: Branching, bounds: ListBounds, length: int) -> float:
-    """The share of a prior's lists that have at least so many repeats, T_max apart; 0 where it has none."""
-    symbol, repeat, rank = np.array(process.types)[process.owner].T
+    """The share of a prior's lists that have at least so many elements, T_max apart; 0 where it has none."""
+    symbol, index, parent_index = np.array(process.types)[process.owner].T
     ends = ~(process.grammar.children.numpy()[process.rule] == bounds.symbol).any(1)
-    own = ends & (symbol == bounds.symbol) & ((rank == bounds.rank) | (bounds.rank is None))
-    total, reached = process.visits[own].sum(), process.visits[own & (repeat >= length)].sum()
+    own = (
+        ends
+        & (symbol == bounds.symbol)
+        & ((parent_index == bounds.parent_list_index) | (bounds.parent_list_index is None))
+    )
+    total, reached = process.visits[own].sum(), process.visits[own & (index >= length)].sum()
     return float(reached / total) if total and math.isfinite(total) else 0.0
 
 
 def _ends(process: Branching, symbol: int) -> dict[int, tuple[float, float]]:
-    """Shortest and longest by rank; an infinite longest where there is none."""
+    """Shortest and longest by parent list index; an infinite longest where there is none."""
     found: dict[int, tuple[float, float]] = {}
     for i, kind in enumerate(process.types):
         if kind.symbol != symbol:
             continue
         own = process.owner == i
         again = (process.grammar.children[process.rule[own]] == symbol).any(1).numpy()
-        shortest, longest = found.get(kind.parent_repeat, (math.inf, 0.0))
+        shortest, longest = found.get(kind.parent_list_index, (math.inf, 0.0))
         if not again.all():
-            shortest = min(shortest, kind.repeat)
+            shortest = min(shortest, kind.list_index)
         if (process.children[own] == i).any():  # the last state of the table, which leads back to itself
             longest = math.inf
-        found[kind.parent_repeat] = shortest, max(longest, kind.repeat)
+        found[kind.parent_list_index] = shortest, max(longest, kind.list_index)
     return found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from .errors import ModelError
 
-LARGEST = 200.0  # metres; what is larger was not made in metres
+MAX_MESH_SIZE = 200.0  # metres; what is larger was not made in metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Mesh:
     def __post_init__(self):
         F = len(self.triangles)
         if F == 0 or len(self.positions) == 0:
-            raise ModelError("Expected a mesh with triangles, actual an empty one; export it again.")
+            raise ModelError("expected a mesh with triangles, got an empty one; export it again.")
         colour = np.asarray(self.colour)
         tinted = np.ones(F, bool) if self.tinted is None else self.tinted
         self._keep("positions", self.positions, np.float32, (len(self.positions), 3))
@@ -55,35 +55,35 @@ class Mesh:
             self._keep("normals", self.normals, np.float32, (F, 3, 3))
         if self.texture is not None:
             if self.uv is None:
-                raise ModelError("Expected texture coordinates (uv) with the texture of a mesh, actual none.")
+                raise ModelError("expected texture coordinates (uv) with the texture of a mesh, got none.")
             self._keep("texture", self.texture, np.uint8, (*np.shape(self.texture)[:2], 3))
         if self.uv is not None:
             self._keep("uv", self.uv, np.float32, (F, 3, 2))
         low, high = int(self.triangles.min()), int(self.triangles.max())
         if low < 0 or high >= len(self.positions):
             raise ModelError(
-                f"Expected vertices 0..{len(self.positions) - 1} in a mesh's triangles, actual {low}..{high}."
+                f"expected vertices 0..{len(self.positions) - 1} in a mesh's triangles, got {low}..{high}."
             )
         size = float(np.ptp(self.positions, axis=0).max())
-        if not 0 < size <= LARGEST:
+        if not 0 < size <= MAX_MESH_SIZE:
             raise ModelError(
-                f"Expected a mesh of at most {LARGEST:g} m, actual {size:g} m; meshes are in metres, scale it."
+                f"expected a mesh of at most {MAX_MESH_SIZE:g} m, got {size:g} m; meshes are in metres, scale it."
             )
 
     def _keep(self, name: str, value: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
         value = np.asarray(value)
         if value.shape != shape or value.size == 0:
-            raise ModelError(f"Expected {name} of a mesh of shape {shape}, actual {value.shape}.")
+            raise ModelError(f"expected {name} of a mesh of shape {shape}, got {value.shape}.")
         if value.dtype.kind == "f" and not np.isfinite(value).all():
-            raise ModelError(f"Expected finite {name} of a mesh, actual NaN or infinity; export it again.")
+            raise ModelError(f"expected finite {name} of a mesh, got NaN or infinity; export it again.")
         if dtype is np.uint8:
             low, high = float(value.min()), float(value.max())
             if low < 0 or high > 255:
                 raise ModelError(
-                    f"Expected {name} of a mesh in 0..255, actual {low if low < 0 else high:g}; clip it there."
+                    f"expected {name} of a mesh in 0..255, got {low if low < 0 else high:g}; clip it there."
                 )
             if value.dtype.kind == "f" and 0 < high <= 1:
-                raise ModelError(f"Expected {name} of a mesh in 0..255, actual {high:g}; multiply by 255.")
+                raise ModelError(f"expected {name} of a mesh in 0..255, got {high:g}; multiply by 255.")
         value = np.ascontiguousarray(value, dtype).copy()
         value.flags.writeable = False
         object.__setattr__(self, name, value)
@@ -114,8 +114,8 @@ class Surface:
     def __post_init__(self):
         texture = np.ascontiguousarray(self.texture).copy()
         if texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8 or texture.size == 0:
-            raise ModelError(f"Expected the texture of {self.name!r} as uint8 (h, w, 3), actual {texture.shape}.")
+            raise ModelError(f"expected the texture of {self.name!r} as uint8 (h, w, 3), got {texture.shape}.")
         if min(self.tile) <= 0:
-            raise ModelError(f"Expected a tile of {self.name!r} with extent in metres, actual {self.tile}.")
+            raise ModelError(f"expected a tile of {self.name!r} with extent in metres, got {self.tile}.")
         texture.flags.writeable = False
         object.__setattr__(self, "texture", texture)

@@ -22,6 +22,7 @@ from .grammar import Grammar
 from .policy import Policy
 from .request import Renderable
 from .scene import SceneGraph
+from .structure import StructurePrior, support_of_policies
 from .support import Support
 
 
@@ -49,7 +50,7 @@ class Groups:
     def __post_init__(self):
         if self.along not in ("x", "y") or self.max_groups < 1:
             raise ModelError(
-                f"Expected Groups along 'x' or 'y' with max_groups of at least 1, actual {self.along!r} and "
+                f"expected Groups along 'x' or 'y' with max_groups of at least 1, got {self.along!r} and "
                 f"{self.max_groups}."
             )
 
@@ -146,53 +147,53 @@ class SceneModel:
     def __post_init__(self):
         if not isinstance(self.grammar, Grammar):
             raise ModelError(
-                f"Expected a Grammar in model {self.name!r}, actual {type(self.grammar).__name__}; make one of the "
+                f"expected a Grammar in model {self.name!r}, got {type(self.grammar).__name__}; make one of the "
                 "text: Grammar(text)."
             )
         for what in ("classes", "stuff"):
             value = getattr(self, what)
             if isinstance(value, str) or not isinstance(value, Sequence):
                 raise ModelError(
-                    f"Expected the {what} of model {self.name!r} as a tuple of names, actual {value!r}; write "
+                    f"expected the {what} of model {self.name!r} as a tuple of names, got {value!r}; write "
                     f"{what}=({value if isinstance(value, str) else 'plate'!r},), with the comma."
                 )
         unknown = [c for c in self.classes if c not in self.grammar.kinds]
         if unknown or not self.classes:
             raise ModelError(
-                f"Expected the classes of model {self.name!r} among the grammar's objects {list(self.grammar.kinds)}, "
-                f"actual {unknown or 'none'}."
+                f"expected the classes of model {self.name!r} among the grammar's objects {list(self.grammar.kinds)}, "
+                f"got {unknown or 'none'}."
             )
         if self.groups is not None and (self.groups.kind not in self.classes or len(self.classes) < 2):
             raise ModelError(
-                f"Expected the groups of model {self.name!r} by one of several classes {list(self.classes)}, actual "
+                f"expected the groups of model {self.name!r} by one of several classes {list(self.classes)}, got "
                 f"{self.groups.kind!r}."
             )
         if not set(self.stuff) < set(self.classes):
             raise ModelError(
-                f"Expected the stuff of model {self.name!r} among its classes {list(self.classes)} and not all of "
-                f"them, actual {list(self.stuff)}."
+                f"expected the stuff of model {self.name!r} among its classes {list(self.classes)} and not all of "
+                f"them, got {list(self.stuff)}."
             )
         if not _is_canvas(self.canvas) or not _is_positive(self.max_steps):
             raise ModelError(
-                f"Expected a positive canvas and max_steps in model {self.name!r}, "
-                f"actual canvas {self.canvas} and max_steps {self.max_steps}; write canvas=(height, width), two whole "
+                f"expected a positive canvas and max_steps in model {self.name!r}, "
+                f"got canvas {self.canvas} and max_steps {self.max_steps}; write canvas=(height, width), two whole "
                 "numbers of pixels without the channels, and max_steps as a whole number of rules."
             )
         if self.channels not in (1, 3):
-            raise ModelError(f"Expected channels 1 or 3 in model {self.name!r}, actual {self.channels}.")
+            raise ModelError(f"expected channels 1 or 3 in model {self.name!r}, got {self.channels}.")
         if self.renderer is not None and not callable(self.renderer):
             raise ModelError(
-                f"Expected the renderer of model {self.name!r} as a class or function that is called with the canvas "
-                f"and a number of threads, actual {type(self.renderer).__name__}; give the class, not an instance."
+                f"expected the renderer of model {self.name!r} as a class or function that is called with the canvas "
+                f"and a number of threads, got {type(self.renderer).__name__}; give the class, not an instance."
             )
         if self.generator is not None and not isinstance(self.generator, Command) and not callable(self.generator):
             raise ModelError(
-                f"Expected the generator of model {self.name!r} as a function of a scene or a Command, actual "
+                f"expected the generator of model {self.name!r} as a function of a scene or a Command, got "
                 f"{type(self.generator).__name__}; write Command([...]) around the words of a command line."
             )
         if self.assets_variable and self.with_assets is None:
             raise ModelError(
-                f"Expected with_assets in model {self.name!r}, whose assets {self.assets_variable} names, actual none."
+                f"expected with_assets in model {self.name!r}, whose assets {self.assets_variable} names, got none."
             )
         if isinstance(self.program, SceneProgram):  # grammar and T_max are the model's, also after dataclasses.replace
             program = SceneProgram(self.program.draw, self.grammar, self.max_steps)
@@ -206,7 +207,14 @@ class SceneModel:
     @functools.cached_property
     def support(self) -> Support | None:
         """What its prior or its policy of pretraining may derive; None where one of them is no ``StructurePrior``."""
-        return Support.of(self.grammar, (self.prior, self.pretraining_policy))
+        return support_of_policies(self.grammar, (self.prior, self.pretraining_policy))
+
+    def guide_support(self, prior_kinds: Sequence[str] = ()) -> Support | None:
+        """What a guide is bound to: ``support``, where nonterminals that derive objects of ``prior_kinds`` alone keep
+        the prior's probabilities."""
+        if self.support is None or not isinstance(self.prior, StructurePrior):
+            return self.support
+        return self.support.with_prior(self.prior.table, prior_kinds)
 
     def __call__(self, num_scenes: int, structure: Policy | None = None) -> Renderable:
         """Run the program; under the prior where no structure policy is given."""
@@ -247,24 +255,24 @@ def scene_model(
     """
     if not isinstance(grammar, Grammar):
         raise ModelError(
-            f"Expected scene_model(grammar, prior, canvas=..., max_steps=..., classes=...) above the function, actual "
+            f"expected scene_model(grammar, prior, canvas=..., max_steps=..., classes=...) above the function, got "
             f"{type(grammar).__name__} for a grammar; give it a Grammar."
         )
     if not callable(getattr(prior, "step", None)) or getattr(prior, "grammar", grammar).rules != grammar.rules:
         raise ModelError(
-            "Expected the prior of scene_model to be a policy of the same grammar, such as StructurePrior(grammar), "
-            f"actual {type(prior).__name__}{' of another grammar' if hasattr(prior, 'grammar') else ''}."
+            "expected the prior of scene_model to be a policy of the same grammar, such as StructurePrior(grammar), "
+            f"got {type(prior).__name__}{' of another grammar' if hasattr(prior, 'grammar') else ''}."
         )
     unknown = sorted(fields.keys() - (SceneModel.__dataclass_fields__.keys() - {"program"}))
     if unknown:
-        raise ModelError(f"Expected fields of a SceneModel in scene_model(...), actual {', '.join(unknown)}.")
+        raise ModelError(f"expected fields of a SceneModel in scene_model(...), got {', '.join(unknown)}.")
     kinds = (classes,) if isinstance(classes, str) else tuple(classes) if isinstance(classes, Iterable) else classes
 
     def decorated(draw: Callable[[SceneGraph], Renderable]) -> SceneModel:
         called = getattr(draw, "__name__", "") if name is None else name
         if not _takes_one(draw) or not called:
             raise ModelError(
-                f"Expected scene_model above a function of one argument, the SceneGraph, actual {_described(draw)}; "
+                f"expected scene_model above a function of one argument, the SceneGraph, got {_described(draw)}; "
                 "for a program(num_scenes, structure) that derives by itself write SceneModel(...)."
             )
         program = SceneProgram(draw, grammar, max_steps)

@@ -4,19 +4,14 @@ Axis letters: N scenes, T steps, K rules, V nonterminals.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .derivation import Derivation, Frontier
 from .grammar import Grammar
-
-if TYPE_CHECKING:
-    from .model import SceneModel
-    from .support import Support
-
-MASKED = -1e9  # finite, so that a masked logit has no gradient that is NaN
+from .support import MASKED_LOGIT, Support
 
 
 class Policy:
@@ -30,8 +25,8 @@ class Policy:
     """
 
     grammar: Grammar
-    support: "Support | None" = None
-    suits: "Callable[[SceneModel], SceneModel] | None" = None
+    support: Support | None = None
+    suits: Callable[[Any], Any] | None = None
 
     def start(self, num_scenes: int) -> Any:
         """The memory before the first step."""
@@ -39,7 +34,7 @@ class Policy:
 
     def step(self, memory: Any, frontier: Frontier, previous_rule: Tensor) -> tuple[Tensor, Any]:
         """Logits ``(N, K)`` and the next memory; ``previous_rule (N,)`` is -1 before the first step."""
-        raise TypeError(f"Expected a policy with a 'step' method, actual {type(self).__name__}.")
+        raise TypeError(f"expected a policy with a 'step' method, got {type(self).__name__}.")
 
     def logits(self, derivation: Derivation) -> Tensor:
         """Logits ``(N, T, K)`` at every step of given derivations, unmasked."""
@@ -57,11 +52,11 @@ class Policy:
         return rule_log_probs(self.grammar, self.logits(derivation), derivation, self.support).sum(1)
 
 
-def masked(grammar: Grammar, logits: Tensor, frontier: Frontier, support: "Support | None" = None) -> Tensor:
+def masked(grammar: Grammar, logits: Tensor, frontier: Frontier, support: Support | None = None) -> Tensor:
     """Logits ``(..., K)`` with the rules masked that do not expand the symbol of ``frontier (...)`` (section 3.2), or
-    that are outside a support, and those of a prior where a support holds it."""
-    logits = logits if support is None else support.settled(frontier, logits)
-    return torch.where(_allowed(grammar, frontier, support), logits, MASKED)
+    that are outside a support, and the prior's logits where a support keeps them."""
+    logits = logits if support is None else support.with_prior_logits(frontier, logits)
+    return torch.where(_allowed(grammar, frontier, support), logits, MASKED_LOGIT)
 
 
 def cumulative(logits: Tensor) -> Tensor:
@@ -69,9 +64,7 @@ def cumulative(logits: Tensor) -> Tensor:
     return (logits - logits.logsumexp(-1, keepdim=True)).softmax(-1).cumsum(-1)
 
 
-def rule_log_probs(
-    grammar: Grammar, logits: Tensor, derivation: Derivation, support: "Support | None" = None
-) -> Tensor:
+def rule_log_probs(grammar: Grammar, logits: Tensor, derivation: Derivation, support: Support | None = None) -> Tensor:
     """Log-probability ``(N, T)`` of each chosen rule; 0 on padding, -inf outside the support."""
     rules, chosen = derivation.rules, derivation.rules.clamp(min=0).unsqueeze(-1)
     logp = torch.log_softmax(masked(grammar, logits, derivation.frontier, support), -1).gather(-1, chosen).squeeze(-1)
@@ -80,5 +73,5 @@ def rule_log_probs(
     return logp.masked_fill(rules < 0, 0.0)
 
 
-def _allowed(grammar: Grammar, frontier: Frontier, support: "Support | None") -> Tensor:
+def _allowed(grammar: Grammar, frontier: Frontier, support: Support | None) -> Tensor:
     return grammar.legal[frontier.symbol] if support is None else support.allowed(frontier)

@@ -1,4 +1,4 @@
-"""Errors inside a user's own program, told with the user's file, line and source text, and with what to do.
+"""Errors inside a user's own program, raised with the user's file, line and source text, and with what to do.
 
 A traceback is the user's where one of its frames lies in code that belongs neither to probscene nor to an installed
 package; any other error is a bug of probscene and passes through as it is.
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from .errors import ModelError, ProbsceneError
 
-LONGEST = 320  # characters of another library's message that are told
+MAX_MESSAGE_LENGTH = 320  # characters of another library's message that are shown
 _INSTALLED = tuple({sysconfig.get_path(key) + os.sep for key in ("purelib", "platlib")})
 _REMEDIES = {
     "Multiple sample sites named": "give each site a name of its own",
@@ -46,8 +46,8 @@ class Place(NamedTuple):
 
 
 @contextmanager
-def told(what: str, program: Any = None) -> Iterator[None]:
-    """Errors of the user's code come out as one clear ``ModelError``.
+def user_errors(what: str, program: Any = None) -> Iterator[None]:
+    """Raise errors of the user's code as one ``ModelError``.
 
     Args:
         what: is run, in words, such as "the program of model 'tabletop'".
@@ -65,7 +65,7 @@ def told(what: str, program: Any = None) -> Iterator[None]:
         if place is None:
             raise
         raise ModelError(
-            f"Expected {what} to run, actual {type(error).__name__} in {place}: {useful_text(error)}; {remedy(error)}."
+            f"expected {what} to run, got {type(error).__name__} in {place}: {useful_text(error)}; {remedy(error)}."
         ) from error
 
 
@@ -91,13 +91,14 @@ def useful_text(error: BaseException) -> str:
     head, found, values = text.partition("but found invalid values:")
     if found:
         text = f"{head}but found {_short(values, 60)}"
-    return _short("; ".join(filter(None, map(str.strip, text.splitlines()))), LONGEST).rstrip(".") or "no message"
+    line = "; ".join(filter(None, map(str.strip, text.splitlines())))
+    return _short(line, MAX_MESSAGE_LENGTH).rstrip(".") or "no message"
 
 
 def remedy(error: BaseException) -> str:
     """What to do about an error of the user's code."""
     text = str(error)
-    return next((what for part, what in _REMEDIES.items() if part in text), "mend that line")
+    return next((what for part, what in _REMEDIES.items() if part in text), "fix that line")
 
 
 def source_file(program: Any) -> str | None:

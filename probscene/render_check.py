@@ -6,7 +6,7 @@ Axis letters: N scenes, M nodes, H W.
 import torch
 from torch import Tensor
 
-from .batch import RenderBatch, Renderer, Space
+from .batch import RenderBatch, Renderer, SceneGeometry
 from .errors import ModelError
 from .request import Renderable
 
@@ -36,7 +36,7 @@ def check_renderer(renderer: Renderer, drawing: Renderable, canvas: tuple[int, i
     for key, one, other in _pairs(batch, again):
         if not torch.equal(one[:1], other):
             raise ModelError(
-                f"Expected {name} to give the same bytes whenever it renders a scene, alone or among others, actual "
+                f"expected {name} to give the same bytes whenever it renders a scene, alone or among others, got "
                 f"another {key} in a second call; draw no random numbers in it, and keep nothing from call to call."
             )
 
@@ -45,7 +45,7 @@ def _pairs(batch: RenderBatch, again: RenderBatch) -> list[tuple[str, Tensor, Te
     each = [(key, getattr(batch, key), getattr(again, key)) for key in batch._fields]
     pairs = [(key, one, other) for key, one, other in each if isinstance(one, Tensor) and isinstance(other, Tensor)]
     if batch.space is not None and again.space is not None:
-        parts = [key for key in Space._fields if key != "names"]
+        parts = [key for key in SceneGeometry._fields if key != "names"]
         pairs += [(f"space.{key}", getattr(batch.space, key), getattr(again.space, key)) for key in parts]
     return pairs
 
@@ -53,7 +53,7 @@ def _pairs(batch: RenderBatch, again: RenderBatch) -> list[tuple[str, Tensor, Te
 def _check_batch(name: str, batch: RenderBatch, drawing: Renderable, canvas: tuple[int, int]) -> None:
     if not isinstance(batch, RenderBatch):
         raise ModelError(
-            f"Expected {name} to return a RenderBatch (probscene.batch), actual {type(batch).__name__}; it has the "
+            f"expected {name} to return a RenderBatch (probscene.batch), got {type(batch).__name__}; it has the "
             "labels beside the images."
         )
     N, M, (H, W) = *drawing.kind.shape, canvas
@@ -63,10 +63,8 @@ def _check_batch(name: str, batch: RenderBatch, drawing: Renderable, canvas: tup
         "pixels": (torch.int64, (N, M)), "visible": (torch.float32, (N, M)),
     })  # fmt: skip
     if batch.space is not None:
-        if not isinstance(batch.space, Space):
-            raise ModelError(
-                f"Expected {name} to return a Space as space, or None, actual {type(batch.space).__name__}."
-            )
+        if not isinstance(batch.space, SceneGeometry):
+            raise ModelError(f"expected {name} to return a Space as space, or None, got {type(batch.space).__name__}.")
         _check_tensors(name, "space.", batch.space, {
             "depth": (torch.float32, (N, H, W)), "semantic": (torch.uint8, (N, H, W)),
             "truncated": (torch.float32, (N, M)), "box": (torch.float32, (N, M, 7)),
@@ -82,18 +80,16 @@ def _check_tensors(name: str, prefix: str, values, expected: dict[str, tuple[tor
         value = getattr(values, key)
         if not isinstance(value, Tensor):
             raise ModelError(
-                f"Expected {name} to return {prefix}{key} as a tensor of {dtype} {shape}, actual "
+                f"expected {name} to return {prefix}{key} as a tensor of {dtype} {shape}, got "
                 f"{type(value).__name__}; torch.from_numpy makes one of an array."
             )
         if value.dtype != dtype or tuple(value.shape) != shape:
             raise ModelError(
-                f"Expected {name} to return {prefix}{key} as {dtype} {shape} (N scenes first, M nodes, the canvas's "
-                f"height and width), actual {value.dtype} {tuple(value.shape)}; convert it there."
+                f"expected {name} to return {prefix}{key} as {dtype} {shape} (N scenes first, M nodes, the canvas's "
+                f"height and width), got {value.dtype} {tuple(value.shape)}; convert it there."
             )
         if value.is_floating_point() and value.isnan().any():
-            raise ModelError(
-                f"Expected {name} to return {prefix}{key} without NaN, actual NaN; zeros where nothing is."
-            )
+            raise ModelError(f"expected {name} to return {prefix}{key} without NaN, got NaN; zeros where nothing is.")
 
 
 def _check_values(name: str, batch: RenderBatch, drawn: Tensor, canvas: tuple[int, int]) -> None:
@@ -122,4 +118,4 @@ def _check_values(name: str, batch: RenderBatch, drawn: Tensor, canvas: tuple[in
 
 def _demand(holds: bool, name: str, expected: str, actual: str) -> None:
     if not holds:
-        raise ModelError(f"Expected {name} to return {expected}, actual {actual}; see RenderBatch in probscene.batch.")
+        raise ModelError(f"expected {name} to return {expected}, got {actual}; see RenderBatch in probscene.batch.")

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .drawing import Drawing, of_scenes
+from .camera_effects import CameraEffects
+from .drawing import Drawing, select_scenes
 from .errors import ModelError
-from .photo import Photo
 from .world import World
 
 
@@ -41,8 +41,8 @@ class Values:
     present: Tensor
     values: dict[str, Tensor]
 
-    def of(self, scenes: slice | Tensor) -> "Values":
-        """Those of some of the scenes."""
+    def select(self, scenes: slice | Tensor) -> "Values":
+        """The values of some scenes."""
         return Values(self.present[scenes], {key: value[scenes] for key, value in self.values.items()})
 
 
@@ -66,7 +66,7 @@ class Request:
     seed: Tensor
     objects: tuple[Values, ...]
     scene: tuple[Values, ...]
-    photo: Photo | None = None
+    photo: CameraEffects | None = None
 
     def __len__(self) -> int:
         return self.kind.shape[0]
@@ -78,9 +78,9 @@ class Request:
             kind=self.kind[scenes],
             parent=self.parent[scenes],
             seed=self.seed[scenes],
-            objects=tuple(some.of(scenes) for some in self.objects),
-            scene=tuple(some.of(scenes) for some in self.scene),
-            photo=of_scenes(self.photo, scenes),
+            objects=tuple(some.select(scenes) for some in self.objects),
+            scene=tuple(some.select(scenes) for some in self.scene),
+            photo=select_scenes(self.photo, scenes),
         )
 
     def records(self, canvas: tuple[int, int]) -> list[dict[str, Any]]:
@@ -122,19 +122,19 @@ def resolve_values(what: str, values: Mapping[str, Any], present: Tensor) -> Val
             value = torch.as_tensor(given).detach()
         except (TypeError, ValueError, RuntimeError):
             raise ModelError(
-                f"Expected {name} of {what} as a number or a tensor, actual {given!r}; a generator is sent the values "
+                f"expected {name} of {what} as a number or a tensor, got {given!r}; a generator is sent the values "
                 "of sites, such as x = pyro.sample(...)."
             ) from None
         try:
             value = value.expand(*present.shape, *value.shape[2:])
         except RuntimeError:
             raise ModelError(
-                f"Expected {name} of {what} to broadcast to (scenes, nodes) = {tuple(present.shape)}, with one more "
-                f"axis for a list of numbers, actual shape {tuple(value.shape)}."
+                f"expected {name} of {what} to broadcast to (scenes, nodes) = {tuple(present.shape)}, with one more "
+                f"axis for a list of numbers, got shape {tuple(value.shape)}."
             ) from None
         if value.ndim > 3 or (value.is_floating_point() and not torch.isfinite(value[present]).all()):
             fault = f"shape {tuple(value.shape)}" if value.ndim > 3 else "NaN or infinity"
-            raise ModelError(f"Expected {name} of {what} as finite numbers or lists of them, actual {fault}.")
+            raise ModelError(f"expected {name} of {what} as finite numbers or lists of them, got {fault}.")
         found[name] = value
     return Values(present, found)
 

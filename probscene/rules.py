@@ -11,7 +11,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from .derivation import Arrays, Frontier, of_tensors
+from .derivation import Arrays, Frontier, tensor_chooser
 from .errors import ModelError
 from .grammar import Grammar
 from .policy import Policy, cumulative, masked
@@ -39,14 +39,14 @@ def drawn(cumulative: Tensor) -> Tensor:
     """
     if cumulative[..., -1].isnan().any():
         raise ModelError(
-            "Expected finite logits of the rules from a policy, actual NaN or infinite ones; look at what its step "
+            "expected finite logits of the rules from a policy, got NaN or infinite ones; look at what its step "
             "returns, and begin again with a lower learning rate where it was learnt."
         )
     least = cumulative[..., -1:] * (1 - torch.rand(*cumulative.shape[:-1], 1))
     return torch.searchsorted(cumulative, least).squeeze(-1)
 
 
-class Inverse(NamedTuple):
+class InverseCDF(NamedTuple):
     """The inverse of the cumulative distributions of a table's rules, E that have a probability in all its rows.
 
     Attributes:
@@ -63,13 +63,13 @@ class Inverse(NamedTuple):
 
     @staticmethod
     @lru_cache(64)
-    def of(prior: StructurePrior) -> "Inverse":
+    def from_prior(prior: StructurePrior) -> "InverseCDF":
         """Of a prior, whose table does not change any more."""
         shares = cumulative(prior.table.flatten(0, 2)).nan_to_num(1.0)  # a row of no rule: no scene comes to it
         rows, rules = (shares.diff(dim=1, prepend=torch.zeros(len(shares), 1)) > 0).nonzero(as_tuple=True)
         ascending = (shares[rows, rules].double() + 2 * rows).numpy()
         first = ascending.searchsorted(np.arange(2 * BINS * len(shares)) / BINS)
-        return Inverse(shares[:, -1].numpy(), ascending, rules.numpy(), first)
+        return InverseCDF(shares[:, -1].numpy(), ascending, rules.numpy(), first)
 
     def drawn(self, row: np.ndarray) -> np.ndarray:
         """A rule for each of some rows; of one seed those that ``drawn`` gives."""
@@ -81,7 +81,7 @@ class Inverse(NamedTuple):
 
 
 class Choice:
-    """What ``expand`` asks for rules, where nothing hears of them.
+    """Chooses rules for ``expand``, where no handler sees them.
 
     Args:
         grammar: the grammar.
@@ -92,12 +92,12 @@ class Choice:
     def __init__(self, grammar: Grammar, policy: Policy, num_scenes: int):
         self.grammar, self.policy, self.memory = grammar, policy, policy.start(num_scenes)
         self.prior = policy if type(policy) is StructurePrior and policy.support is None else None
-        self.ask = of_tensors(self._decided)
+        self.ask = tensor_chooser(self._decided)
 
     def __call__(self, t: int, frontier: Arrays, previous: np.ndarray) -> np.ndarray:
         """Rules ``(N,)``, whatever where a scene is finished."""
         if self.prior is not None:
-            return Inverse.of(self.prior).drawn(self.prior.state(*frontier))
+            return InverseCDF.from_prior(self.prior).drawn(self.prior.state(*frontier))
         return self.ask(t, frontier, previous)
 
     def _decided(self, t: int, frontier: Frontier, previous: Tensor) -> Tensor:

@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from .derivation import Derivation
-from .derive import Given, derive_complete
+from .derive import ConditionDerivation, derive_complete
 from .errors import ModelError
 from .model import SceneModel
 from .policy import Policy
-from .program_errors import remedy, told, useful_text
+from .program_errors import remedy, useful_text, user_errors
 from .request import Renderable
 
 
@@ -46,7 +46,7 @@ class Scenes:
     drawing: Renderable
     failures: Tensor
 
-    def some(self, which: Tensor) -> "Scenes":
+    def select(self, which: Tensor) -> "Scenes":
         """Those of a mask ``(N,)`` bool."""
         return Scenes(
             self.derivation[which],
@@ -90,27 +90,27 @@ def run_program(
         density: see ``sample``.
 
     Raises:
-        ModelError: a derivation that is not complete; the program raises an error, which is told with the line that it
-            comes from; its sites are not what a scene model's must be; it returns no ``Drawing``, or one of other nodes
-            than were derived.
+        ModelError: a derivation that is not complete; the program raises an error, which is given with its line; its
+            sites are not what a scene model's must be; it returns no ``Drawing``, or one of other nodes than were
+            derived.
     """
     N = len(derivation)
     sites = derivation.sites()
     name = getattr(model, "name", getattr(model, "__name__", "?"))
     if not derivation.complete.all():
         raise ModelError(
-            f"Expected complete derivations for model {name!r}, actual {int((~derivation.complete).sum())} of {N} with "
+            f"expected complete derivations for model {name!r}, got {int((~derivation.complete).sum())} of {N} with "
             "nonterminals left; draw them with derive_complete."
         )
-    known = Given(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
-    with told(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
+    known = ConditionDerivation(model.grammar, derivation) if isinstance(model, SceneModel) else nullcontext()
+    with user_errors(f"the program of model {name!r}", model), torch.no_grad(), poutine.block(), known:
         program = poutine.condition(model, data={**sites, **(parameters or {})})
         trace = poutine.trace(program).get_trace(N)
     drawing = trace.nodes["_RETURN"].get("value")
     if not isinstance(drawing, Renderable) or len(drawing) != N:
         raise ModelError(
-            f"Expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
-            f"or scene.build(...)), actual {type(drawing).__name__}."
+            f"expected the program of model {name!r} to return a Drawing or a World of {N} scenes (scene.draw(...) "
+            f"or scene.build(...)), got {type(drawing).__name__}."
         )
     check_nodes(name, drawing, derivation.trimmed())
     values, site_mask = {}, {}
@@ -121,8 +121,8 @@ def run_program(
         value, mask = site["value"], site["mask"]
         if value.ndim < 2 or value.shape[0] != N:
             raise ModelError(
-                f"Expected site {key!r} of model {name!r} inside the scenes plate, shape ({N}, nodes), "
-                f"actual {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
+                f"expected site {key!r} of model {name!r} inside the scenes plate, shape ({N}, nodes), "
+                f"got {tuple(value.shape)}; sample it inside scene.nodes(...) or the plate 'scenes' (dim=-2)."
             )
         shape = site["fn"].batch_shape
         mask = torch.ones(shape, dtype=torch.bool) if mask is None else torch.as_tensor(mask).expand(shape)
@@ -144,7 +144,7 @@ def _site_log_prob(name: str, key: str, site: dict[str, Any]) -> Tensor:
         return site["fn"].log_prob(site["value"])
     except (ValueError, RuntimeError, NotImplementedError) as error:
         raise ModelError(
-            f"Expected a log-probability of the values of site {key!r} of model {name!r}, actual "
+            f"expected a log-probability of the values of site {key!r} of model {name!r}, got "
             f"{type(error).__name__}: {useful_text(error)}; {remedy(error)}."
         ) from error
 
@@ -166,7 +166,7 @@ def check_nodes(name: str, drawing: Renderable, derivation: Derivation) -> None:
         return ", ".join(names.get(k, f"kind {k}") for k in kind[kind >= 0].tolist()) or "none"
 
     raise ModelError(
-        f"Expected the program of model {name!r} to draw the nodes that were derived, actual other ones in scene {i}: "
+        f"expected the program of model {name!r} to draw the nodes that were derived, got other ones in scene {i}: "
         f"derived {words(derived[i])}; drawn {words(drawn[i])}. Derive with the model's own grammar and max_steps, a "
         "smaller one cuts scenes short, and draw with the SceneGraph of that derivation; scene_model does both."
     )

@@ -18,7 +18,7 @@ from pyro.poutine.messenger import Messenger
 from torch import BoolTensor, Tensor
 
 from .derivation import Derivation, Frontier, expand
-from .derive import Given, derive
+from .derive import ConditionDerivation, derive
 from .enumeration import shortest_lengths
 from .errors import ModelError
 from .grammar import Grammar, Node, Rule, is_nonterminal
@@ -105,7 +105,7 @@ class JointGrammar(Grammar):
         return frontier._replace(symbol=symbol.where(own, len(grammar.nonterminals))), own
 
 
-class Within(Messenger):
+class ScopeMessenger(Messenger):
     """Names sites ``name/site``, so that several programs can run in one."""
 
     def __init__(self, name: str):
@@ -136,7 +136,7 @@ class Mixture(Policy):
         """The memories of all policies."""
         memory = []
         for name, policy in zip(self.grammar.parts, self.policies, strict=True):
-            with Within(name):
+            with ScopeMessenger(name):
                 memory.append(policy.start(num_scenes))
         return memory
 
@@ -180,12 +180,12 @@ def join(name: str, models: Mapping[str, SceneModel], weights: list[float] | Non
         ModelError: no models, or models that differ in canvas, channels, renderer or generator.
     """
     if not models:
-        raise ModelError("Expected at least one scenario, actual none.")
+        raise ModelError("expected at least one scenario, got none.")
     each = list(models.values())
     for what in ("canvas", "channels", "renderer", "generator"):
         found = {key: getattr(model, what) for key, model in models.items()}
         if len(set(found.values())) > 1:
-            raise ModelError(f"Expected scenarios of one {what}, actual {found}.")
+            raise ModelError(f"expected scenarios of one {what}, got {found}.")
     grammar = JointGrammar({key: model.grammar for key, model in models.items()})
     groups = {model.groups for model in each}
     variables = {model.assets_variable for model in each}
@@ -247,9 +247,11 @@ def _program(grammar: JointGrammar, models: dict[str, SceneModel], num_scenes: i
         own = scenario == number
         sites = grammar.sites(derivation, number)
         part = grammar.part(derivation, number)
-        known = Given(model.grammar, part, any_length=True)  # the joint model's T_max may be larger than the part's own
+        known = ConditionDerivation(
+            model.grammar, part, any_length=True
+        )  # the joint model's T_max may be larger than the part's own
         counted = cast(BoolTensor, own.unsqueeze(1))
-        with Within(name), poutine.mask(mask=counted), poutine.block(hide=list(sites)), known:
+        with ScopeMessenger(name), poutine.mask(mask=counted), poutine.block(hide=list(sites)), known:
             drawing = poutine.condition(model, data=sites)(num_scenes)
         if isinstance(drawing, Renderable):
             check_nodes(model.name, drawing, part)

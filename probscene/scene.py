@@ -13,17 +13,17 @@ import torch
 from pyro.poutine.runtime import effectful
 from torch import BoolTensor, Tensor
 
+from .camera_effects import CameraEffects, EffectValue, sample_camera_effects
 from .derivation import Derivation
 from .drawing import Drawing, Layer, Sprites, resolve
 from .errors import ModelError
 from .grammar import Grammar
-from .photo import Look, Photo, sample_photo
 from .request import Objects, Request, resolve_values
 from .scene_sites import seed_site
 from .world import Camera, Ground, Light, Meshes, MeshLayer, World, resolve_ground, resolve_meshes, resolve_scene
 
-Given = TypeVar("Given", Sprites, Meshes)
-Found = TypeVar("Found", Layer, MeshLayer)
+AnyPrimitive = TypeVar("AnyPrimitive", Sprites, Meshes)
+AnyLayer = TypeVar("AnyLayer", Layer, MeshLayer)
 
 
 class SceneGraph:
@@ -91,7 +91,7 @@ class SceneGraph:
         camera: Camera,
         light: Light | None = None,
         ground: Ground | None = None,
-        photo: Photo | None = None,
+        photo: CameraEffects | None = None,
     ) -> World:
         """A 3D world of meshes to render; their order does not matter.
 
@@ -100,7 +100,10 @@ class SceneGraph:
         """
         N = len(self.kind)
         camera, light = resolve_scene(camera, N), resolve_scene(light or Light(), N)
-        photo, ground = resolve_scene(photo or Photo(), N), None if ground is None else resolve_ground(ground, N)
+        photo, ground = (
+            resolve_scene(photo or CameraEffects(), N),
+            None if ground is None else resolve_ground(ground, N),
+        )
         found = self._resolved(layers, resolve_meshes)
         return World(self.kind, self.grammar.kinds, found, camera, light, ground, photo)
 
@@ -108,7 +111,7 @@ class SceneGraph:
         self,
         *layers: Sprites,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        photo: Photo | None = None,
+        photo: CameraEffects | None = None,
     ) -> Drawing:
         """What to render: layers from the back to the front, and what a camera makes of them.
 
@@ -118,7 +121,9 @@ class SceneGraph:
         photo = None if photo is None else resolve_scene(photo, len(self.kind))
         return Drawing(self.kind, self.grammar.kinds, self._resolved(layers, resolve), background, photo)
 
-    def request(self, *objects: Objects, scene: Mapping[str, Any] | None = None, photo: Photo | None = None) -> Request:
+    def request(
+        self, *objects: Objects, scene: Mapping[str, Any] | None = None, photo: CameraEffects | None = None
+    ) -> Request:
         """What the model's generator is to draw (``SceneModel.generator``), with a seed for each scene, the site
         ``request.seed``.
 
@@ -135,41 +140,43 @@ class SceneGraph:
             kinds = (each.kinds,) if isinstance(each.kinds, str) else each.kinds
             found.append(resolve_values(f"Objects({each.kinds!r})", each.values, self.mask(*kinds)))
         of_scene = resolve_values("the scene", scene or {}, torch.ones(N, 1, dtype=torch.bool))
-        look = None if photo is None else resolve_scene(photo, N)
+        effects = None if photo is None else resolve_scene(photo, N)
         seed = seed_site("request.seed", N, "scene.request(...)").squeeze(1)
-        return Request(self.kind, self.grammar.kinds, self.parent, seed, tuple(found), (of_scene,), look)
+        return Request(self.kind, self.grammar.kinds, self.parent, seed, tuple(found), (of_scene,), effects)
 
     def photo(
         self,
         *,
-        exposure: Look | None = None,
-        contrast: Look | None = None,
-        saturation: Look | None = None,
-        red_gain: Look | None = None,
-        blue_gain: Look | None = None,
-        vignette: Look | None = None,
-        blur: Look | None = None,
-        noise: Look | None = None,
-        jpeg_quality: Look | None = None,
-    ) -> Photo:
-        """What a camera makes of each image, for ``draw(..., photo=...)`` or ``build(..., photo=...)``.
+        exposure: EffectValue | None = None,
+        contrast: EffectValue | None = None,
+        saturation: EffectValue | None = None,
+        red_gain: EffectValue | None = None,
+        blue_gain: EffectValue | None = None,
+        vignette: EffectValue | None = None,
+        blur: EffectValue | None = None,
+        noise: EffectValue | None = None,
+        jpeg_quality: EffectValue | None = None,
+    ) -> CameraEffects:
+        """Camera effects on each image, for ``draw(..., photo=...)`` or ``build(..., photo=...)``.
 
         A range, such as ``blur=(0.0, 2.0)``, or a distribution makes a site with one value a scene, ``photo.blur``
-        and so on, which is learnt like the others; a number is the same in all images, and what is left out keeps the
-        image as it is. Noise adds a site ``photo.seed``, which keeps its prior. What the values mean: ``Photo``.
+        and so on, which is learnt like the others. A number is the same in all images; what is left out keeps the image
+        as it is. Noise adds a site ``photo.seed``, which keeps its prior. The values are those of ``CameraEffects``.
 
         Call it outside ``nodes(...)``.
 
         Raises:
             ModelError: a range that is none or outside a value's limits; it is called inside ``nodes(...)``.
         """
-        looks = {
+        given = {
             "exposure": exposure, "contrast": contrast, "saturation": saturation, "red_gain": red_gain,
             "blue_gain": blue_gain, "vignette": vignette, "blur": blur, "noise": noise, "jpeg_quality": jpeg_quality,
         }  # fmt: skip
-        return sample_photo(len(self.kind), looks)
+        return sample_camera_effects(len(self.kind), given)
 
-    def _resolved(self, layers: Iterable[Given], resolve: Callable[[Given, Tensor], Found]) -> tuple[Found, ...]:
+    def _resolved(
+        self, layers: Iterable[AnyPrimitive], resolve: Callable[[AnyPrimitive, Tensor], AnyLayer]
+    ) -> tuple[AnyLayer, ...]:
         found = []
         for layer in layers:
             kinds = (layer.kinds,) if isinstance(layer.kinds, str) else layer.kinds
@@ -186,7 +193,7 @@ def _as_wide(grammar: Grammar, derivation: Derivation, max_nodes: int) -> Deriva
     most = derivation.kind.shape[1]
     if most > max_nodes:
         raise ModelError(
-            f"Expected scenes of at most max_nodes = {max_nodes} nodes, actual {most}; give SceneGraph a larger "
+            f"expected scenes of at most max_nodes = {max_nodes} nodes, got {most}; give SceneGraph a larger "
             "one, or none."
         )
     return derivation.padded(grammar, 0, max_nodes)
@@ -204,7 +211,7 @@ def _decorated(layer: Sprites | Meshes, num_scenes: int) -> Tensor:
     if present is None or present.ndim != 2 or present.shape[0] != num_scenes or present.dtype != torch.bool:
         actual = "none" if present is None else f"{present.dtype} {tuple(present.shape)}"
         raise ModelError(
-            f"Expected {type(layer).__name__} of no kind with present, bool ({num_scenes} scenes, how many), "
-            f"actual {actual}; say which of the decoration is drawn."
+            f"expected {type(layer).__name__} of no kind with present, bool ({num_scenes} scenes, how many), "
+            f"got {actual}; say which of the decoration is drawn."
         )
     return present

@@ -24,7 +24,7 @@ def scene_site(name: str, num_scenes: int, prior: Any, call: str, **more: Any) -
     value = pyro.sample(name, prior, **more)
     if tuple(value.shape) != (num_scenes, 1):
         raise ModelError(
-            f"Expected site {name!r} with one value a scene, shape ({num_scenes}, 1), actual {tuple(value.shape)}; "
+            f"expected site {name!r} with one value a scene, shape ({num_scenes}, 1), got {tuple(value.shape)}; "
             f"call {call} inside the plate 'scenes' and outside scene.nodes(...)."
         )
     return value

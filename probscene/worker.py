@@ -87,7 +87,7 @@ def serve(render, version=""):
     """
     if SOCKET not in os.environ or TOKEN not in os.environ:
         raise SystemExit(
-            f"Expected to be started by probscene, actual no {SOCKET} in the environment; name this program in the "
+            f"expected to be started by probscene, got no {SOCKET} in the environment; name this program in the "
             "Command of a scene model's generator."
         )
     wire = connected(os.environ[SOCKET])
@@ -100,8 +100,8 @@ def serve(render, version=""):
         try:
             reply, arrays = packed(render(scene_of(message[0])))
         except Exception as error:
-            told = "".join(traceback.format_exception(type(error), error, error.__traceback__))
-            reply, arrays = {"error": told}, []
+            text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+            reply, arrays = {"error": text}, []
         send(wire, dict(reply, memory=memory()), arrays)
 
 
@@ -136,7 +136,7 @@ def packed(drawn):
     """What ``render`` gave, as JSON and arrays' bytes."""
     if not isinstance(drawn, dict) or "image" not in drawn or "instance" not in drawn:
         actual = sorted(drawn) if isinstance(drawn, dict) else type(drawn).__name__
-        raise ValueError(f"Expected render(scene) to return a dict with 'image' and 'instance', actual {actual}.")
+        raise ValueError(f"expected render(scene) to return a dict with 'image' and 'instance', got {actual}.")
     reply, arrays = {"arrays": []}, []
     for name in ("image", "instance", "depth"):
         if drawn.get(name) is None:
@@ -145,7 +145,7 @@ def packed(drawn):
             view = memoryview(drawn[name])
         except TypeError:
             actual = type(drawn[name]).__name__
-            raise ValueError(f"Expected {name!r} as an array of numpy's or as bytes, actual {actual}.") from None
+            raise ValueError(f"expected {name!r} as an array of numpy's or as bytes, got {actual}.") from None
         reply["arrays"].append({"name": name, "format": view.format, "shape": list(view.shape or ())})
         arrays.append(view.tobytes())
     boxes = drawn.get("amodal_box")
@@ -188,13 +188,13 @@ def receive(wire, most=1 << 32):
         return None
     length, size = _LENGTHS.unpack(lengths)
     if length + size > most:
-        raise ValueError(f"Expected a message of at most {most} bytes, actual {length + size}.")
+        raise ValueError(f"expected a message of at most {most} bytes, got {length + size}.")
     text, arrays = _bytes(wire, length), _bytes(wire, size)
     if text is None or arrays is None:
         return None
     message = json.loads(text.decode())
     if not isinstance(message, dict):
-        raise ValueError(f"Expected a JSON object, actual {type(message).__name__}.")
+        raise ValueError(f"expected a JSON object, got {type(message).__name__}.")
     return message, arrays
 
 

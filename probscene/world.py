@@ -12,10 +12,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from .drawing import check_colour, of_scenes
+from .camera_effects import CameraEffects, check_camera_effects
+from .drawing import check_colour, select_scenes
 from .errors import ModelError
 from .mesh import Mesh, Surface
-from .photo import Photo, check_photo
 
 KITTI_FOCAL, KITTI_CENTRE, KITTI_CANVAS, KITTI_HEIGHT = 721.5377, (609.5593, 172.854), (375, 1242), 1.65
 
@@ -162,7 +162,7 @@ class World:
     camera: Camera
     light: Light
     ground: Ground | None
-    photo: Photo
+    photo: CameraEffects
 
     def __len__(self) -> int:
         return self.kind.shape[0]
@@ -170,8 +170,8 @@ class World:
     def __getitem__(self, scenes: slice | Tensor) -> "World":
         """The same world of some of the scenes."""
 
-        parts = {name: of_scenes(getattr(self, name), scenes) for name in ("camera", "light", "photo", "ground")}
-        layers = tuple(of_scenes(layer, scenes) for layer in self.layers)
+        parts = {name: select_scenes(getattr(self, name), scenes) for name in ("camera", "light", "photo", "ground")}
+        layers = tuple(select_scenes(layer, scenes) for layer in self.layers)
         return replace(self, kind=self.kind[scenes], layers=layers, **parts)
 
 
@@ -190,7 +190,7 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
     chosen = index[present]
     if chosen.numel() and not (0 <= int(chosen.min()) and int(chosen.max()) < len(layer.meshes)):
         raise ModelError(
-            f"Expected {name}.mesh in 0..{len(layer.meshes) - 1}, actual {int(chosen.min())}..{int(chosen.max())}."
+            f"expected {name}.mesh in 0..{len(layer.meshes) - 1}, got {int(chosen.min())}..{int(chosen.max())}."
         )
     numbers = {}
     for key in ("x", "y", "z", "yaw"):
@@ -201,12 +201,12 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
             value = value.unsqueeze(-1)
         numbers[key] = _full(f"{name}.{key}", value, (*present.shape, 3), among=present)
     if not (numbers["scale"][present] > 0).all():
-        raise ModelError(f"Expected positive {name}.scale, actual {float(numbers['scale'][present].min()):g}.")
+        raise ModelError(f"expected positive {name}.scale, got {float(numbers['scale'][present].min()):g}.")
     check_colour(f"{name}.tint", numbers["tint"][present])
     return MeshLayer(layer.meshes, present, index, labelled=layer.labelled, **numbers)
 
 
-Part = TypeVar("Part", Camera, Light, Photo)
+Part = TypeVar("Part", Camera, Light, CameraEffects)
 
 
 def resolve_scene(part: Part, num_scenes: int) -> Part:
@@ -228,11 +228,9 @@ def resolve_scene(part: Part, num_scenes: int) -> Part:
             values[field.name] = _full(name, value, (num_scenes, 1), dtype, endless=endless).squeeze(1)
     if isinstance(part, Camera) and not (values["focal"] > 0).all():
         worst = float(values["focal"].min())
-        raise ModelError(
-            f"Expected a positive focal length in pixels, actual {worst:g}; mend Camera.focal of the model."
-        )
-    if isinstance(part, Photo):
-        check_photo(values)
+        raise ModelError(f"expected a positive focal length in pixels, got {worst:g}; fix Camera.focal of the model.")
+    if isinstance(part, CameraEffects):
+        check_camera_effects(values)
     return replace(part, **values)
 
 
@@ -246,11 +244,10 @@ def resolve_ground(ground: Ground, num_scenes: int) -> Ground:
     surface = _full("Ground.surface", ground.surface, (num_scenes, strips), torch.int64)
     edges = _full("Ground.edges", ground.edges, (num_scenes, strips - 1))
     if strips > 1 and not (edges.diff(dim=1) >= 0).all():
-        raise ModelError("Expected Ground.edges in ascending order, actual some that are not; sort them.")
+        raise ModelError("expected Ground.edges in ascending order, got some that are not; sort them.")
     if surface.numel() and not (0 <= int(surface.min()) and int(surface.max()) < len(ground.surfaces)):
         raise ModelError(
-            f"Expected Ground.surface in 0..{len(ground.surfaces) - 1}, "
-            f"actual {int(surface.min())}..{int(surface.max())}."
+            f"expected Ground.surface in 0..{len(ground.surfaces) - 1}, got {int(surface.min())}..{int(surface.max())}."
         )
     offset = _full("Ground.offset", ground.offset, (num_scenes, 1)).squeeze(1)
     return replace(ground, edges=edges, surface=surface, offset=offset)
@@ -263,8 +260,8 @@ def _full(
     try:
         value = value.expand(shape)
     except RuntimeError:
-        raise ModelError(f"Expected {name} to broadcast to {shape}, actual shape {tuple(value.shape)}.") from None
+        raise ModelError(f"expected {name} to broadcast to {shape}, got shape {tuple(value.shape)}.") from None
     checked = value if among is None else value[among]
     if value.is_floating_point() and not endless and not torch.isfinite(checked).all():
-        raise ModelError(f"Expected finite values in {name}, actual NaN or infinity.")
+        raise ModelError(f"expected finite values in {name}, got NaN or infinity.")
     return value.contiguous()

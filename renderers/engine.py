@@ -37,9 +37,9 @@ def check_canvas(canvas: tuple[int, int], threads: int | None, most: int) -> tup
     """
     height, width = canvas
     if min(height, width) < 1 or height * width > most:
-        raise ModelError(f"Expected a canvas of 1 to {most} pixels, actual {height} by {width}; choose another size.")
+        raise ModelError(f"expected a canvas of 1 to {most} pixels, got {height} by {width}; choose another size.")
     if threads is not None and threads < 1:
-        raise ModelError(f"Expected at least one thread, actual {threads}; leave it out to use every core.")
+        raise ModelError(f"expected at least one thread, got {threads}; leave it out to use every core.")
     return (int(height), int(width)), threads or cores()
 
 
@@ -58,7 +58,7 @@ def start() -> None:
     """
     if _forked_after_start:
         raise ProbsceneError(
-            "Expected to render in a process that started Taichi itself, actual a fork of one that had rendered; "
+            "expected to render in a process that started Taichi itself, got a fork of one that had rendered; "
             "start worker processes with multiprocessing's 'spawn' method."
         )
     if started():

@@ -13,8 +13,9 @@ from probscene.models.multi_mnist import MODEL
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-TINY = {"learn": "structure", "count.steps": 8, "batches": 1, "num_scenes": 20, "pretrain_derivations": 100}
-TINY |= {"pretrain_epochs": 1}
+TINY = {"parameters": "none", "features": "count", "features.schedule.steps": 8, "structure.batches": 1}
+TINY |= {"structure.num_scenes": 20, "pretrain.derivations": 100}
+TINY |= {"pretrain.epochs": 1}
 
 
 def test_python_runs(tmp_path, monkeypatch, capsys):
@@ -23,8 +24,13 @@ def test_python_runs(tmp_path, monkeypatch, capsys):
     (tmp_path / "drawn" / "images").rename(tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PROBSCENE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("probscene.app.judging.looked.IMAGES", 40)
-    monkeypatch.setattr(ps, "fit", functools.partial(ps.fit, settings=TINY))
+    monkeypatch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 40)
+    fit = ps.fit
+
+    def tiny(model, target, config, **options):
+        return fit(model, target, ps.preset(config).set(TINY), **options)
+
+    monkeypatch.setattr(ps, "fit", tiny)
     monkeypatch.setattr(ps.Run, "report", functools.partialmethod(ps.Run.report, num=200, scenes=60))
     (block,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names = {}

@@ -57,16 +57,16 @@ class FeatureNet(Protocol):
         """Features ``(N, D)`` float32, finite, of images ``(N, C, H, W)`` uint8, N >= 0. Renders come with C = 3;
         target images with C = 1 where the model's colour carries nothing, else 3.
 
-        A network may have three more beside it: ``embed_photographs``, which is then called for target images,
-        ``embed_drawn(examples)``, which is called for renders where their labels are at hand (their images may be black
-        if the network's ``by_labels`` is true), and ``cells(images)``, ``(N, classes, h, w)``, how many objects of each
-        of its ``classes`` each cell of the image holds, by which a verdict on layout goes."""
+        A network may have three more beside it: ``embed_real``, which is then called for target images,
+        ``embed_from_labels(examples)``, which is called for renders where their labels are at hand (their images may be
+        black if the network's ``uses_labels`` is true), and ``cells(images)``, ``(N, classes, h, w)``, how many objects
+        of each of its ``classes`` each cell of the image holds, by which a verdict on layout goes."""
         ...
 
 
 Draw = Callable[[int], Examples]
-Seen = Callable[[int, int], None]
-"""Told how many images have been looked at, and of how many."""
+ImageCallback = Callable[[int, int], None]
+"""Called with how many images have been embedded, and of how many."""
 
 
 class Renders(Protocol):
@@ -125,7 +125,7 @@ class Photographs(Protocol):
         """Those that are labelled; None where none is."""
         ...
 
-    def some(self, most: int) -> Tensor:
+    def subset(self, max_images: int) -> Tensor:
         """At most so many of them, evenly spread, ``(L, C, H, W)`` uint8."""
         ...
 
@@ -159,17 +159,17 @@ class Features(Protocol):
         """How the network is trained in place; None where there is nothing to train.
 
         Args:
-            photographs: opens the target; a network that learns from it is bound to it, see ``taught_by``.
+            photographs: opens the target; a network that learns from it is bound to it, see ``target_fingerprint``.
             seed: of everything random.
         """
         return None
 
-    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
+    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], callback: ImageCallback) -> dict[str, Any]:
         """Suit a trained network to the target's images, in place, such as by choosing how counts are read in them.
 
         Args:
-            photographs: opens the target; a network that learns from it is bound to it, see ``taught_by``.
-            each: is told how many images have been looked at, and of how many.
+            photographs: opens the target; a network that learns from it is bound to it, see ``target_fingerprint``.
+            callback: called with how many images have been embedded, and of how many.
 
         Returns:
             What was found, for JSON; of features that count, under ``"classes"``, a record of each class with
@@ -181,13 +181,14 @@ class Features(Protocol):
         """The divergence that suits the network's features, given the fit's own."""
         return chosen
 
-    def taught_by(self, net: FeatureNet) -> str:
+    def target_fingerprint(self, net: FeatureNet) -> str:
         """The fingerprint of the photographs that the network has learnt from, empty for none: it is used with no
         others."""
         return ""
 
-    def settings(self, preset: Any) -> dict[str, Any]:
-        """Other values of the preset's fields that suit these features, such as fewer scenes for a slow network."""
+    def settings(self, config: Any) -> dict[str, Any]:
+        """Values of a fit's configuration that suit these features, by their paths, such as ``{"structure.num_scenes":
+        150}`` for a slow network; what the user sets comes after. ``config`` is the ``FitConfig`` without them."""
         return {}
 
 
@@ -213,7 +214,7 @@ def examples(batch: RenderBatch, classes: Tensor, group: Tensor | None = None, a
     Args:
         batch: from a renderer.
         classes: ``(kinds + 1,)`` int64, the class of each kind of the grammar, -1 for none; the last entry is -1.
-        group: ``(N, M)`` int64, the node that each node is counted with, -1 for none; see ``grouping.group_of``.
+        group: ``(N, M)`` int64, the node that each node is counted with, -1 for none; see ``derivation.group_of``.
         along: the axis along which groups follow one another, ``"x"`` or ``"y"``.
     """
     label = classes[batch.kind].masked_fill(batch.pixels == 0, -1)
@@ -246,7 +247,7 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
         # Sums of at most 64 bytes fit in 16 bits; two passes over small integers beat pooling in floating point. Rows
         # go first: they lie whole in memory, planar or interleaved.
         if reduce > 8:
-            raise ProbsceneError(f"Expected reduce at most 8, actual {reduce}.")
+            raise ProbsceneError(f"expected reduce at most 8, got {reduce}.")
         rows = x[..., ::reduce, :].to(torch.int16)
         for i in range(1, reduce):
             rows += x[..., i::reduce, :]
@@ -258,14 +259,14 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
 
 def embed_real(net: FeatureNet, images: Tensor) -> Tensor:
     """Features ``(L, D)`` of target images, which a network may look at in another way than at renders."""
-    return getattr(net, "embed_photographs", net.embed)(images)
+    return getattr(net, "embed_real", net.embed)(images)
 
 
 @torch.no_grad()
 def embed_all(
-    net: FeatureNet, batches: Iterable[Tensor], each: Callable[[int], None] | None = None, real: bool = False
+    net: FeatureNet, batches: Iterable[Tensor], callback: Callable[[int], None] | None = None, real: bool = False
 ) -> Tensor:
-    """Features ``(L, D)`` of a stream of image batches; ``each`` is told how many more images are done.
+    """Features ``(L, D)`` of a stream of image batches; ``callback`` is called with how many more images are done.
 
     Args:
         real: whether they are the target's images.
@@ -276,9 +277,24 @@ def embed_all(
     out = []
     for images in batches:
         out.append(embed_real(net, images) if real else net.embed(images))
-        if each is not None:
-            each(len(images))
+        if callback is not None:
+            callback(len(images))
     features = torch.cat(out)
     if not torch.isfinite(features).all():
-        raise ProbsceneError("Expected finite features, actual NaN or infinity; train the feature network again.")
+        raise ProbsceneError("expected finite features, got NaN or infinity; train the feature network again.")
     return features
+
+
+def slow_settings(config: Any) -> dict[str, Any]:
+    """What suits a network that takes about 20 ms an image on one core where a preset's own takes 1: fewer scenes, each
+    drawn once, and at so noisy a gradient half the step. Marginals, far sharper than the joint density, say of
+    photographs only that they are none. Features come in units of their bandwidth, and the kernel takes them so."""
+    return {
+        "structure.batches": 40,
+        "structure.num_scenes": 150,
+        "structure.draws_per_structure": 1,
+        "structure.learning_rate": min(config.structure.learning_rate, 5e-3),
+        "divergence.marginal_variance": None,
+        "divergence.anscombe": False,
+        "divergence.variance": None if getattr(config.divergence, "variance", 1.0) is None else 1.0,
+    }

@@ -18,5 +18,5 @@ def network_name(choice: str, others: tuple[str, ...] = ()) -> str:
     name, equals, file = choice.partition("=")
     if name not in PRETRAINED or (equals and (not file or name == "efficientnet")):
         own = ", or FILE.py:NAME" if others and "run" not in others else ""
-        raise ProbsceneError(f"Expected features among {', '.join([*others, CHOICES])}{own}, actual {choice!r}.")
+        raise ProbsceneError(f"expected features among {', '.join([*others, CHOICES])}{own}, got {choice!r}.")
     return name

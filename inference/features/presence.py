@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 
-from ..training import Report, batch_seed, check_finite, restore_training, training_state
+from ..training import Callback, TrainingLoop, batch_seed
 from .base import Draw, Examples, Features, Photographs, Renders
 
 PRESENCE, PRESENCE_COUNTS = "presence", "presence=counts"
-WAYS = 25  # of the paper's counts
-LAST = torch.channels_last  # in memory; half as fast again on a CPU
+NUM_COUNTS = 25  # of the paper's counts
+NHWC = torch.channels_last  # in memory; half as fast again on a CPU
 
 
 class PresenceNet(nn.Module):
@@ -50,7 +50,7 @@ class PresenceNet(nn.Module):
     def layers(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Features ``(N, D)`` and logits, ``(N, classes)`` or ``(N, classes, ways)``, of uint8 images ``(N, 1 or 3, H,
         W)``."""
-        pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous(memory_format=LAST).float() / 255).mean((2, 3))
+        pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous(memory_format=NHWC).float() / 255).mean((2, 3))
         first = F.leaky_relu(self.fc1(pool), 0.01)
         second = F.leaky_relu(self.fc2(first), 0.01)
         logits = self.out(second)
@@ -75,7 +75,7 @@ class _Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = F.leaky_relu(self.na(self.a(x)), 0.01)
         # Not a stride in the convolution: with 3 channels, last in memory, torch 2.14 then writes outside its buffers.
-        return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x[..., ::2, ::2].contiguous(memory_format=LAST)), 0.01)
+        return F.leaky_relu(self.nb(self.b(y)) + self.shortcut(x[..., ::2, ::2].contiguous(memory_format=NHWC)), 0.01)
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class PresenceFeatures(Features):
 
     def build(self, model: SceneModel) -> PresenceNet:
         """Untrained. Counts go to 24, as in the paper, or to as many as a derivation has rules, where that is more."""
-        ways = max(WAYS, model.max_steps + 1) if self.counts else 0
+        ways = max(NUM_COUNTS, model.max_steps + 1) if self.counts else 0
         return PresenceNet(model.classes, self.width, self.hidden, ways)
 
     def training(
@@ -111,7 +111,7 @@ class PresenceFeatures(Features):
         return PresenceTraining(net, renders.draw, self.images, self.epochs, seed=batch_seed(seed, 1))
 
 
-class PresenceTraining:
+class PresenceTraining(TrainingLoop):
     """Adam on one fixed set of prior renders until 75 % of the presences, or counts, are right, at most ``epochs``
     (supplement).
 
@@ -122,8 +122,14 @@ class PresenceTraining:
         seed: of everything random.
 
     Attributes:
-        unit, total, done: see ``Training``; it ends early where the presences are right.
+        unit, total, done: see ``Training``; it ends early where enough is right.
+        reached: share of the presences, or counts, that were right in the last epoch.
     """
+
+    unit = "epochs"
+    subject = "the presence network"
+    remedy = "begin again with features=count"
+    seed_path = (1,)
 
     def __init__(
         self,
@@ -136,19 +142,63 @@ class PresenceTraining:
         accuracy: float = 0.75,
         seed: int = 0,
     ):
-        self.net, self.draw, self.seed = net, draw, seed
-        self.images, self.batch_size, self.accuracy = images, batch_size, accuracy
-        self.unit, self.total = "epochs", epochs
         self.optimiser = torch.optim.Adam(net.parameters(), lr=learning_rate)
-        self.done, self.reached = 0, 0.0
+        super().__init__(net, {"adam": self.optimiser}, epochs, seed)
+        self.net, self.draw, self.reached = net, draw, 0.0
+        self.images, self.batch_size, self.accuracy = images, batch_size, accuracy
+        self.image, self.number = torch.empty(0), torch.empty(0)
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the epochs that are left; ``each`` hears the mean loss after every one.
-
-        Raises:
-            ProbsceneError: the loss, or a parameter, is no longer finite.
-        """
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``; the images are drawn first, also after an interruption."""
         seed_everything(batch_seed(self.seed, 0))
+        self.image, self.number = self._draw()
+        self.net.train()
+        super().run(callback)
+        self.net.eval()
+        self.image, self.number = torch.empty(0), torch.empty(0)
+
+    @property
+    def finished(self) -> bool:
+        """See ``TrainingLoop``."""
+        return super().finished or self.reached >= self.accuracy
+
+    def step(self) -> float:
+        """An epoch."""
+        total, right, ways = 0.0, 0.0, self.net.ways
+        for rows in torch.randperm(self.images).split(self.batch_size):
+            logits, number = self.net.layers(self.image[rows])[1], self.number[rows]
+            if ways:
+                loss = F.cross_entropy(logits.flatten(0, 1), number.flatten())
+            else:
+                loss = F.binary_cross_entropy_with_logits(logits, number.float())
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.optimiser.step()
+            total += loss.item() * len(rows)
+            predicted = logits.argmax(-1) if ways else (logits > 0).long()
+            right += (predicted == number).float().mean().item() * len(rows)
+        self.reached = right / self.images
+        return total / self.images
+
+    def report(self, loss: float) -> dict[str, float]:
+        """See ``TrainingLoop``."""
+        return {"loss": loss, "accuracy": self.reached, "demanded": self.accuracy}
+
+    def summary(self) -> dict[str, Any]:
+        """See ``Training``: the accuracy of the last epoch, and what is demanded."""
+        return {"stage": "accuracy", "accuracy": self.reached, "demanded": self.accuracy}
+
+    def state(self) -> dict[str, Tensor]:
+        """See ``Training``."""
+        return super().state() | {"number.reached": torch.tensor(self.reached, dtype=torch.float64)}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """See ``Training``."""
+        super().restore(tensors)
+        self.reached = tensors["number.reached"].item()
+
+    def _draw(self) -> tuple[Tensor, Tensor]:
+        """Images, and ``(N, classes)`` int64 how many objects of each class they show, at most what is told apart."""
         ways = self.net.ways
         classes = self.net.out.out_features // max(ways, 1)
         image, number = torch.empty(0), torch.zeros(self.images, classes, dtype=torch.long)
@@ -158,45 +208,10 @@ class PresenceTraining:
                 image = torch.empty(self.images, *part.image.shape[1:], dtype=torch.uint8)
             image[start : start + 250] = part.image
             number[start : start + 250] = _number(part, classes).clamp(max=max(ways, 2) - 1)
-        self.net.train()
-        while self.done < self.total and self.reached < self.accuracy:
-            seed_everything(batch_seed(self.seed, 1, self.done))
-            total, right = 0.0, 0.0
-            for rows in torch.randperm(len(image)).split(self.batch_size):
-                logits = self.net.layers(image[rows])[1]
-                if ways:
-                    loss = F.cross_entropy(logits.flatten(0, 1), number[rows].flatten())
-                else:
-                    loss = F.binary_cross_entropy_with_logits(logits, number[rows].float())
-                self.optimiser.zero_grad()
-                loss.backward()
-                self.optimiser.step()
-                total += loss.item() * len(rows)
-                said = logits.argmax(-1) if ways else (logits > 0).long()
-                right += (said == number[rows]).float().mean().item() * len(rows)
-            self.done += 1
-            where = f"in epoch {self.done}"
-            check_finite(total, self.net.parameters(), "the presence network", where, "begin again with features=count")
-            self.reached = right / len(image)
-            if each is not None:
-                each(self, {"loss": total / len(image), "accuracy": self.reached, "demanded": self.accuracy})
-        self.net.eval()
-
-    def summary(self) -> dict[str, Any]:
-        """For the log: the share of presences, or counts, that were right in the last epoch, and what is demanded."""
-        return {"stage": "accuracy", "accuracy": self.reached, "demanded": self.accuracy}
-
-    def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
-        return training_state(self.net, {"adam": self.optimiser}, done=self.done, reached=self.reached)
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        numbers = restore_training(self.net, {"adam": self.optimiser}, tensors)
-        self.done, self.reached = int(numbers["done"]), numbers["reached"]
+        return image, number
 
 
 def _number(part: Examples, classes: int) -> Tensor:
     """``(N, classes)`` int64 visible objects."""
-    seen = part.label.where(part.label >= 0, classes)
-    return F.one_hot(seen, classes + 1).sum(1)[:, :classes]
+    label = part.label.where(part.label >= 0, classes)
+    return F.one_hot(label, classes + 1).sum(1)[:, :classes]

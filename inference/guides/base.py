@@ -41,7 +41,7 @@ class GuideModule(nn.Module):
             device = "another device, which this machine lacks"
         if device != "cpu":
             raise ModelError(
-                f"Expected a guide on the CPU, where structures are derived and learnt, actual {device}; leave the "
+                f"expected a guide on the CPU, where structures are derived and learnt, got {device}; leave the "
                 "guide there."
             )
         return super()._apply(fn, recurse)
@@ -89,7 +89,7 @@ class LatentGuide(Guide):
 
     def logits(self, derivation: Derivation, latent: int = 0) -> Tensor:
         """``(N, T, K)`` given latent vector number ``latent``."""
-        raise TypeError(f"Expected a guide with a 'logits' method, actual {type(self).__name__}.")
+        raise TypeError(f"expected a guide with a 'logits' method, got {type(self).__name__}.")
 
     def log_prob_each(self, derivation: Derivation) -> Tensor:
         """``log q(T|z)``, ``(Z, N)``."""

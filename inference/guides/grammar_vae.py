@@ -60,7 +60,7 @@ class GrammarVAE(LatentGuide):
 
     def log_prob_each(self, derivation: Derivation) -> Tensor:
         """``log q(T|z)``, ``(Z, N)``: as the logits know no scene, they are normalised once for all of them."""
-        if self.support is not None and self.support.held is not None:
+        if self.support is not None and self.support.prior_table is not None:
             return super().log_prob_each(derivation)
         rules = derivation.rules
         T = self._steps(rules.shape[1])
@@ -84,7 +84,7 @@ class GrammarVAE(LatentGuide):
     def _steps(self, steps: int) -> int:
         if steps > self.max_steps:
             raise ProbsceneError(
-                f"Expected derivations of at most max_steps = {self.max_steps} rules, actual {steps}; there are no "
+                f"expected derivations of at most max_steps = {self.max_steps} rules, got {steps}; there are no "
                 "logits beyond."
             )
         return steps

@@ -1,7 +1,7 @@
 """The guide: an autoregressive LSTM over rules (Meta-Sim2, section 3.2 and supplement).
 
 At each step it reads the previous rule through a linear embedding and gives logits over all rules. With ``index=True``
-it also reads how far it is in its list and in the list around (``Frontier``), embedded in the input and as additive
+it also reads its list index and its parent list index (``Frontier``), embedded in the input and as additive
 tables of logits. Without them an LSTM of 50 units has to learn to count, which takes much longer.
 
 ``|Z|`` fixed latent vectors set the first state; ``log_prob`` is the exact marginal over them,
@@ -93,8 +93,8 @@ class LSTMGuide(LatentGuide):
         return logits if self.index_logits is None else logits + self._indexed(self.index_logits, frontier)
 
     def _indexed(self, tables: nn.ModuleList, frontier: Frontier) -> Tensor:
-        repeat, around = (i.clamp(max=self.max_index) for i in (frontier.repeat, frontier.parent_repeat))
-        return tables[0](repeat) + tables[1](around)
+        index, parent_index = (i.clamp(max=self.max_index) for i in (frontier.list_index, frontier.parent_list_index))
+        return tables[0](index) + tables[1](parent_index)
 
 
 def make_guide(kind: str, grammar: Grammar, max_steps: int, **settings) -> Guide:
@@ -108,6 +108,6 @@ def make_guide(kind: str, grammar: Grammar, max_steps: int, **settings) -> Guide
         ProbsceneError: another kind.
     """
     if kind not in GUIDES:
-        raise ProbsceneError(f"Expected a guide among {', '.join(GUIDES)}, actual {kind!r}.")
+        raise ProbsceneError(f"expected a guide among {', '.join(GUIDES)}, got {kind!r}.")
     made = {"lstm": LSTMGuide, "pcfg": PCFG, "grammar-vae": GrammarVAE}[kind]
     return made(grammar, max_steps, **settings)

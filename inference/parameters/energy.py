@@ -3,8 +3,8 @@
 Maximum likelihood takes a reader at its word. Where a reading is off by nature, as of an angle that is read as too
 upright, so is what is learnt. Here one reader reads both sides, and its errors with them. The gradient of the energy
 distance [1] by a reading goes on to the value that was drawn, as if what is read moved with it one to one, and from
-there through the quantile of its mixture to the guide's weights (``ParameterNet.moving``). Only the last layers of the
-sites that are read with an error of some size are trained: what is read sharply, likelihood learns better.
+there through the quantile of its mixture to the guide's weights (``ParameterNet.reparameterise``). Only the last layers
+of the sites that are read with an error of some size are trained: what is read sharply, likelihood learns better.
 
 Objects are compared kind by kind, each with its sibling before it, its place among its siblings and their number; so
 are scenes.
@@ -26,16 +26,16 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from ..steps import StepTraining
-from .graph import Graph
+from ..training import AdamTraining
+from .graph import SceneGraph
 from .likelihood import Values
-from .net import ParameterNet, begin, gathered
+from .net import ParameterNet, gather_nodes, init_to_prior
 
-ROWS = 400, 1600  # of the guide's and of the target's objects of a kind that are compared in a step, at most
-PLACE, NUMBER = 2.0, 4.0  # what one place among siblings and one object more count, in u
+MAX_ROWS = 400, 1600  # of the guide's and of the target's objects of a kind that are compared in a step, at most
+RANK_UNIT, NUMBER_UNIT = 2.0, 4.0  # what one place among siblings and one object more count, in u
 
 
-class OwnReadings(NamedTuple):
+class GuideReadings(NamedTuple):
     """Scenes of a guide and what is read in their renders.
 
     Attributes:
@@ -53,7 +53,7 @@ class OwnReadings(NamedTuple):
     which: Tensor
 
 
-class EnergyDistance(StepTraining):
+class EnergyDistance(AdamTraining):
     """Resumable training of a ``ParameterNet``; its loss is the squared energy distance.
 
     Args:
@@ -67,13 +67,13 @@ class EnergyDistance(StepTraining):
         seed: of everything random.
     """
 
-    what = "the parameters"
+    subject = "the parameters"
 
     def __init__(
         self,
         net: ParameterNet,
         values: Values,
-        draw: Callable[[int], OwnReadings],
+        draw: Callable[[int], GuideReadings],
         noisy: Tensor,
         steps: int = 40,
         scenes: int = 100,
@@ -87,15 +87,15 @@ class EnergyDistance(StepTraining):
         self.net, self.values, self.draw, self.scenes = net, values, draw, scenes
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
-        target = self.values.of(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
+        """See ``AdamTraining``."""
+        target = self.values.select(torch.randperm(len(self.values.kind))[: 4 * self.scenes])
         own = self.draw(self.scenes)
         with _only(self.net, self.module):
-            found = energy_distance(moving(self.net, own, self.trained), target)
+            found = energy_distance(reparameterised_readings(self.net, own, self.trained), target)
         return found + 0 * sum(weight.sum() for weight in self.module.parameters())  # where nothing can be compared
 
 
-class WeightedEnergyDistance(StepTraining):
+class WeightedEnergyDistance(AdamTraining):
     """Resumable training of the last layers of some sites of scenes, from the prior.
 
     Its loss is the squared energy distance of each site's weighted readings from what is read in the target, each
@@ -112,13 +112,13 @@ class WeightedEnergyDistance(StepTraining):
         seed: of everything random.
     """
 
-    what = "the parameters"
+    subject = "the parameters"
 
     def __init__(
         self,
         net: ParameterNet,
         values: Values,
-        own: OwnReadings,
+        own: GuideReadings,
         sites: list[int],
         steps: int = 300,
         learning_rate: float = 5e-3,
@@ -126,13 +126,13 @@ class WeightedEnergyDistance(StepTraining):
     ):
         trained = nn.ModuleList(net.scene_out[g] for g in sites)
         for layer in trained:
-            begin(cast(nn.Linear, layer))
+            init_to_prior(cast(nn.Linear, layer))
         super().__init__(trained, torch.optim.Adam(trained.parameters(), lr=learning_rate), steps, seed)
-        self.net, self.own, self.graph = net, own, Graph.of(own.kind, own.parent)
-        self.sites = {g: WeightedRows.of(own.read, values, g) for g in sites}
+        self.net, self.own, self.graph = net, own, SceneGraph.from_nodes(own.kind, own.parent)
+        self.sites = {g: WeightedRows.from_readings(own.read, values, g) for g in sites}
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         with _only(self.net, self.module):
             return torch.stack([self._distance(g, rows) for g, rows in self.sites.items()]).sum()
 
@@ -156,7 +156,7 @@ class WeightedRows(NamedTuple):
     target: float
 
     @staticmethod
-    def of(own: Values, target: Values, g: int) -> "WeightedRows":
+    def from_readings(own: Values, target: Values, g: int) -> "WeightedRows":
         """Of a scene's site."""
         turns = own.turns[own.nodes.shape[2] :][g : g + 1]
         rows, others = (_placed(values.scene[:, g : g + 1].double(), turns) for values in (own, target))
@@ -182,11 +182,11 @@ def _only(net: nn.Module, part: nn.Module) -> Iterator[None]:
             weight.requires_grad_(had)
 
 
-def moving(net: ParameterNet, own: OwnReadings, trained: Sequence[bool]) -> Values:
-    """What is read, moving with what was drawn of the sites that are trained, see ``ParameterNet.moving``."""
-    scene, nodes = net.moving(Graph.of(own.kind, own.parent), own.scene, own.nodes, trained)
+def reparameterised_readings(net: ParameterNet, own: GuideReadings, trained: Sequence[bool]) -> Values:
+    """What is read, moving with what was drawn of the sites that are trained, see ``ParameterNet.reparameterise``."""
+    scene, nodes = net.reparameterise(SceneGraph.from_nodes(own.kind, own.parent), own.scene, own.nodes, trained)
     moved = (nodes - own.nodes).nan_to_num(0.0)
-    moved = gathered(moved, own.which).nan_to_num(0.0)
+    moved = gather_nodes(moved, own.which).nan_to_num(0.0)
     of_scene = (scene - own.scene).nan_to_num(0.0)
     return own.read._replace(nodes=own.read.nodes + moved, scene=own.read.scene + of_scene)
 
@@ -199,7 +199,7 @@ def energy_distance(one: Values, other: Values) -> Tensor:
     read, also = ~one.nodes.isnan().all(2), ~other.nodes.isnan().all(2)
     for kind in other.kind[also].unique().tolist():
         mine, theirs = read & (one.kind == kind), also & (other.kind == kind)
-        here, there = rows[mine][: ROWS[0]], others[theirs][: ROWS[1]]
+        here, there = rows[mine][: MAX_ROWS[0]], others[theirs][: MAX_ROWS[1]]
         if len(here) > 1 and len(there) > 1:
             number = float(theirs.sum()) * other.nodes.shape[2]
             total, weight = total + number * _energy(here, there), weight + number
@@ -222,10 +222,10 @@ def site_rows(values: Values) -> tuple[Tensor, Tensor]:
 
 def _rows(values: Values) -> Tensor:
     """``(N, M, D)`` each object with its sibling before it, its place and their number."""
-    graph = Graph.of(values.kind, values.parent)
+    graph = SceneGraph.from_nodes(values.kind, values.parent)
     own = _placed(values.nodes, values.turns[: values.nodes.shape[2]])
-    before = gathered(own, graph.before).nan_to_num(0.0)
-    place = torch.stack([PLACE * graph.rank, NUMBER * graph.number], -1).to(own.dtype)
+    before = gather_nodes(own, graph.before).nan_to_num(0.0)
+    place = torch.stack([RANK_UNIT * graph.rank, NUMBER_UNIT * graph.number], -1).to(own.dtype)
     return torch.cat([own, before, place], -1)
 
 

@@ -1,4 +1,4 @@
-"""Scene graphs as a parameter guide sees them. Axis letters: N scenes, M nodes."""
+"""Scene graphs of parameter guides. Axis letters: N scenes, M nodes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,8 +11,8 @@ from probscene.derivation import Derivation
 from probscene.grammar import Grammar
 
 
-class Graph(NamedTuple):
-    """What a scene's structure says of its nodes.
+class SceneGraph(NamedTuple):
+    """Relations of the nodes of scenes.
 
     Attributes:
         kind: ``(N, M)`` int64; -1 pads.
@@ -30,13 +30,13 @@ class Graph(NamedTuple):
     same_number: Tensor
 
     @property
-    def together(self) -> Tensor:
-        """``(N, M, M)`` bool, who is whose sibling, itself included."""
+    def siblings(self) -> Tensor:
+        """``(N, M, M)`` bool, which nodes are siblings; each is its own."""
         parent = self.parent.where(self.kind >= 0, -2)
         return (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & (parent > -2).unsqueeze(-1)
 
     @staticmethod
-    def of(kind: Tensor, parent: Tensor) -> "Graph":
+    def from_nodes(kind: Tensor, parent: Tensor) -> "SceneGraph":
         """Of nodes in the order of a derivation, each ``(N, M)``."""
         there = kind >= 0
         siblings = (parent.unsqueeze(-1) == parent.unsqueeze(-2)) & there.unsqueeze(-1) & there.unsqueeze(-2)
@@ -44,10 +44,10 @@ class Graph(NamedTuple):
         earlier = siblings.tril(-1)
         index = torch.arange(kind.shape[1]).expand_as(earlier)
         before = index.where(earlier, -1).amax(-1)
-        return Graph(kind, parent, before, earlier.sum(-1), siblings.sum(-1), same.tril(-1).sum(-1), same.sum(-1))
+        return SceneGraph(kind, parent, before, earlier.sum(-1), siblings.sum(-1), same.tril(-1).sum(-1), same.sum(-1))
 
 
-class Seen(NamedTuple):
+class ClassNodes(NamedTuple):
     """The nodes of derivations that have a class, without gaps: only these can be read in an image.
 
     Attributes:
@@ -62,7 +62,7 @@ class Seen(NamedTuple):
     place: Tensor
 
     @staticmethod
-    def of(grammar: Grammar, classes: Sequence[str], derivation: Derivation) -> "Seen":
+    def from_derivation(grammar: Grammar, classes: Sequence[str], derivation: Derivation) -> "ClassNodes":
         """Of derivations."""
         kind, parent = derivation.kind, derivation.parent
         has_class = torch.zeros(len(grammar.kinds) + 1, dtype=torch.bool)
@@ -79,16 +79,16 @@ class Seen(NamedTuple):
         slot = order[:, : max(1, int(there.sum(1).max()) if len(kind) else 1)]
         mapped = torch.where(parent >= 0, place.gather(1, parent.clamp(min=0)), -1)
         seen = there.gather(1, slot)
-        return Seen(kind.gather(1, slot).where(seen, -1), mapped.gather(1, slot).where(seen, -1), slot, place)
+        return ClassNodes(kind.gather(1, slot).where(seen, -1), mapped.gather(1, slot).where(seen, -1), slot, place)
 
-    def taken(self, values: Tensor) -> Tensor:
+    def gather(self, values: Tensor) -> Tensor:
         """``(N, M', ...)`` of values of the derivation's nodes ``(N, M, ...)``. There may be fewer, or more, where a
         scenario's own program has drawn them; what is taken is of no use in scenes of another."""
         slot = self.slot.clamp(max=values.shape[1] - 1)
         return values.gather(1, slot.view(*slot.shape, *(1,) * (values.ndim - 2)).expand(-1, -1, *values.shape[2:]))
 
-    def put(self, values: Tensor, others: Tensor) -> Tensor:
-        """``(N, M)`` of values ``(N, M')``; ``others (N, M)``, as wide as in ``taken``, where a node has no class."""
+    def scatter(self, values: Tensor, others: Tensor) -> Tensor:
+        """``(N, M)`` of values ``(N, M')``; ``others (N, M)``, as wide as in ``gather``, where a node has no class."""
         M = others.shape[1]
         place = F.pad(self.place[:, :M], (0, max(0, M - self.place.shape[1])), value=values.shape[1])
         at = place.clamp(max=values.shape[1] - 1)

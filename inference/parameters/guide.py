@@ -25,9 +25,9 @@ from probscene.policy import Policy
 from probscene.request import Renderable
 
 from ..guides.base import GuideModule
-from .graph import Graph, Seen
+from .graph import ClassNodes, SceneGraph
 from .net import ParameterNet
-from .sites import NEAR, Site, site_name
+from .sites import U_EPS, Site, site_name
 
 
 class ParameterGuide(GuideModule):
@@ -40,12 +40,12 @@ class ParameterGuide(GuideModule):
         hidden: units of the network.
 
     Attributes:
-        passed: names of sites that draw from their prior all the same; the others' distributions depend on them.
+        prior_sites: names of sites that draw from their prior all the same; the others' distributions depend on them.
     """
 
     def __init__(self, model: SceneModel, sites: tuple[Site, ...], structure: Policy | None = None, hidden: int = 64):
         super().__init__()
-        self.passed: frozenset[str] = frozenset()
+        self.prior_sites: frozenset[str] = frozenset()
         self.model, self.sites = model, sites
         self.structure = model.prior if structure is None else structure
         self.node_sites = tuple(site for site in sites if not site.of_scene)
@@ -61,7 +61,7 @@ class ParameterGuide(GuideModule):
             pyro.module("guide", self.structure)
         return self.program(num_scenes, self.structure)
 
-    def suited(self, model: SceneModel) -> SceneModel:
+    def with_parameters(self, model: SceneModel) -> SceneModel:
         """The model with learnt parameters."""
         return replace(model, program=self.program)
 
@@ -78,30 +78,30 @@ class Learnt(Messenger):
         guide: the guide.
 
     Attributes:
-        seen, graph: of what the program has derived; of all scenarios where it is of several.
-        scene, values: u of the scene's and of the seen nodes' learnt sites so far, ``(N, G)`` and ``(N, M', S)``; NaN
+        class_nodes, graph: of what the program has derived; of all scenarios where it is of several.
+        scene, values: u of the scene's and of the class nodes' learnt sites so far, ``(N, G)`` and ``(N, M', S)``; NaN
             where there are none.
     """
 
     def __init__(self, guide: ParameterGuide):
         super().__init__()
         self.guide = guide
-        self.seen: Seen | None = None
-        self.graph = Graph.of(*torch.full((2, 0, 1), -1))
+        self.class_nodes: ClassNodes | None = None
+        self.graph = SceneGraph.from_nodes(*torch.full((2, 0, 1), -1))
         self.scene, self.values = torch.zeros(0), torch.zeros(0)
 
     def _pyro_post_derive(self, msg: Any) -> None:
         model = self.guide.model
         if msg["args"][0].rules != model.grammar.rules:
             return  # a scenario's own part of what was derived
-        self.seen = Seen.of(model.grammar, model.classes, msg["value"])
-        self.graph = Graph.of(self.seen.kind, self.seen.parent)
-        N, M = self.seen.kind.shape
+        self.class_nodes = ClassNodes.from_derivation(model.grammar, model.classes, msg["value"])
+        self.graph = SceneGraph.from_nodes(self.class_nodes.kind, self.class_nodes.parent)
+        N, M = self.class_nodes.kind.shape
         self.scene = torch.full((N, len(self.guide.scene_sites)), torch.nan)
         self.values = torch.full((N, M, len(self.guide.node_sites)), torch.nan)
 
     def _pyro_sample(self, msg: Any) -> None:
-        if self._own(msg) in self.guide.passed:
+        if self._own(msg) in self.guide.prior_sites:
             return
         learnt = self._learnt(msg)
         if learnt is not None:
@@ -114,7 +114,7 @@ class Learnt(Messenger):
 
     def _learnt(self, msg: Any) -> "_OfSites | None":
         """The distribution that the guide has for a site; None where it is not of the guide."""
-        if self.seen is None:
+        if self.class_nodes is None:
             return None
         for sites, made in ((self.guide.scene_sites, OfScenes), (self.guide.node_sites, OfNodes)):
             names = [site.name for site in sites]
@@ -143,7 +143,7 @@ class _OfSites(TorchDistribution):
 
     def __init__(self, base: Any, learnt: Learnt, index: int, has: Tensor):
         self.base, self.learnt, self.index, self.has = base, learnt, index, has
-        self.net, self.graph, self.seen = learnt.guide.net, learnt.graph, cast(Seen, learnt.seen)
+        self.net, self.graph, self.class_nodes = learnt.guide.net, learnt.graph, cast(ClassNodes, learnt.class_nodes)
         self.scene, self.values = learnt.scene, learnt.values
         super().__init__(base.batch_shape, validate_args=False)
 
@@ -155,14 +155,14 @@ class _OfSites(TorchDistribution):
     def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
         """Values; their gradient by the net's parameters goes through u."""
         if sample_shape:
-            raise NotImplementedError("Expected samples one batch at a time; put the number of scenes in the plate.")
+            raise NotImplementedError("expected samples one batch at a time; put the number of scenes in the plate.")
         drawn = self.base.sample()
-        v = self.base.cdf(drawn).clamp(NEAR, 1 - NEAR)
+        v = self.base.cdf(drawn).clamp(U_EPS, 1 - U_EPS)
         return torch.where(self.has, self.base.icdf(self.quantile(v)), drawn)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Of each node, given the nodes and sites before; 0 where a node has none."""
-        u = self.base.cdf(value).clamp(NEAR, 1 - NEAR)
+        u = self.base.cdf(value).clamp(U_EPS, 1 - U_EPS)
         return (self.density(u) + self.base.log_prob(value)).where(self.has, 0.0)
 
     def quantile(self, v: Tensor) -> Tensor:
@@ -178,27 +178,27 @@ class _OfSites(TorchDistribution):
         raise NotImplementedError
 
     def _u(self, value: Tensor) -> Tensor:
-        return self.base.cdf(value).clamp(NEAR, 1 - NEAR)
+        return self.base.cdf(value).clamp(U_EPS, 1 - U_EPS)
 
 
 class OfNodes(_OfSites):
     """Of a site of nodes."""
 
     def quantile(self, v: Tensor) -> Tensor:
-        taken, has = self.seen.taken(v), self.seen.taken(self.has)
-        return self.seen.put(self.net.sample(self.graph, self.scene, self.values, self.index, taken, has), v)
+        taken, has = self.class_nodes.gather(v), self.class_nodes.gather(self.has)
+        return self.class_nodes.scatter(self.net.sample(self.graph, self.scene, self.values, self.index, taken, has), v)
 
     def density(self, u: Tensor) -> Tensor:
         values = self._with(self.values, u)
-        found = self.net.node_mixture(self.graph, self.scene, values, self.index).log_prob(self.seen.taken(u))
-        return self.seen.put(found, torch.zeros_like(u))
+        found = self.net.node_mixture(self.graph, self.scene, values, self.index).log_prob(self.class_nodes.gather(u))
+        return self.class_nodes.scatter(found, torch.zeros_like(u))
 
     def keep(self, value: Tensor) -> None:
         self.learnt.values = self._with(self.learnt.values, self._u(value))
 
     def _with(self, values: Tensor, u: Tensor) -> Tensor:
         """The values, with u at the nodes that have it: a scenario's program leaves other scenes as they are."""
-        return _put(values, self.index, self.seen.taken(u), self.seen.taken(self.has))
+        return _put(values, self.index, self.class_nodes.gather(u), self.class_nodes.gather(self.has))
 
 
 class OfScenes(_OfSites):

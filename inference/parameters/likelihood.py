@@ -19,15 +19,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..steps import StepTraining
-from .graph import Graph
-from .net import Chosen, Given, ParameterNet
-from .reading.reader import cut_draw
-from .sites import NEAR
+from ..training import AdamTraining
+from .graph import SceneGraph
+from .net import Conditioning, NodeSubset, ParameterNet
+from .reader import truncated_quantile
+from .sites import U_EPS
 
-ALONE = 0.4  # of the steps, the first ones, take what was read as it is
-VALUES, FEWEST = 24_000, 16  # nodes times sites that a step looks at, at most; images, at least
-CANDIDATES = 8  # draws of which one is taken
+UNWEIGHTED_SHARE = 0.4  # of the steps, the first ones, take what was read as it is
+MAX_VALUES, MIN_IMAGES = 24_000, 16  # nodes times sites that a step looks at, at most; images, at least
+NUM_CANDIDATES = 8  # draws of which one is taken
 
 
 class Values(NamedTuple):
@@ -50,7 +50,7 @@ class Values(NamedTuple):
     turns: Tensor
     weight: Tensor | None = None
 
-    def of(self, rows: Tensor) -> "Values":
+    def select(self, rows: Tensor) -> "Values":
         """Some images', without nodes that only pad."""
         kind = self.kind[rows]
         M = max(1, int((kind >= 0).sum(1).max()) if len(kind) else 1)
@@ -81,7 +81,7 @@ class Values(NamedTuple):
             self.weight,
         )
 
-    def drawn(self) -> "Values":
+    def sample(self) -> "Values":
         """u drawn from what was read."""
         return self._replace(
             nodes=_drawn(self.nodes, self.nodes_sd, self.turns[: self.nodes.shape[2]]),
@@ -91,11 +91,11 @@ class Values(NamedTuple):
 
 def _drawn(mean: Tensor, sd: Tensor, turns: Tensor) -> Tensor:
     v = torch.rand_like(mean)
-    line = cut_draw(mean, sd, v)
+    line = truncated_quantile(mean, sd, v)
     if not turns.any():
-        return line.clamp(NEAR, 1 - NEAR)
+        return line.clamp(U_EPS, 1 - U_EPS)
     circle = (mean + sd * math.sqrt(2) * torch.erfinv(2 * v - 1)).remainder(1.0)
-    return torch.where(turns, circle, line).clamp(NEAR, 1 - NEAR)
+    return torch.where(turns, circle, line).clamp(U_EPS, 1 - U_EPS)
 
 
 def log_density(net: ParameterNet, values: Values) -> Tensor:
@@ -110,7 +110,7 @@ def draws_and_density(net: ParameterNet, values: Values, others: Sequence[Values
         values: u drawn from what was read alone; they are the draws where there are no others.
         others: more such draws, of which each u is one, in proportion to the guide's density given the sites before.
     """
-    graph, scene, nodes = Graph.of(values.kind, values.parent), values.scene.clone(), values.nodes.clone()
+    graph, scene, nodes = SceneGraph.from_nodes(values.kind, values.parent), values.scene.clone(), values.nodes.clone()
     for g in range(net.scene_sites if others else 0):
         some = torch.stack([other.scene[:, g] for other in others], -1)
         with torch.no_grad():
@@ -122,12 +122,12 @@ def draws_and_density(net: ParameterNet, values: Values, others: Sequence[Values
         given = sites.given(scene, nodes, s)
         if others:
             some = torch.stack([other.nodes[..., s] for other in others], -1)
-            at = given.some.taken(some).nan_to_num(0.5).movedim(-1, 0)
+            at = given.subset.gather(some).nan_to_num(0.5).movedim(-1, 0)
             with torch.no_grad():
-                density = net.chosen_mixture(given, nodes, s).log_prob(at).movedim(0, -1)
-            nodes[..., s] = _one_of(some, given.some.put(density))
-        at = given.some.taken(nodes[..., s : s + 1]).squeeze(-1).nan_to_num(0.5)
-        found = given.some.put(net.chosen_mixture(given, nodes, s).log_prob(at).unsqueeze(-1)).squeeze(-1)
+                density = net.subset_mixture(given, nodes, s).log_prob(at).movedim(0, -1)
+            nodes[..., s] = _one_of(some, given.subset.scatter(density))
+        at = given.subset.gather(nodes[..., s : s + 1]).squeeze(-1).nan_to_num(0.5)
+        found = given.subset.scatter(net.subset_mixture(given, nodes, s).log_prob(at).unsqueeze(-1)).squeeze(-1)
         parts.append((found if weight is None else weight * found).sum(1))
     for g in range(net.scene_sites):
         u = scene[:, g]
@@ -145,22 +145,22 @@ def _one_of(candidates: Tensor, log_weight: Tensor) -> Tensor:
 class _Sites:
     """The sites of nodes in their order; who is alike whom in a site is found once for sites of the same nodes."""
 
-    def __init__(self, net: ParameterNet, graph: Graph):
+    def __init__(self, net: ParameterNet, graph: SceneGraph):
         self.net, self.graph = net, graph
-        self.some: Chosen | None = None
+        self.some: NodeSubset | None = None
 
-    def given(self, scene: Tensor, nodes: Tensor, s: int) -> Given:
+    def given(self, scene: Tensor, nodes: Tensor, s: int) -> Conditioning:
         """What the mixtures of site ``s`` depend on."""
-        some = Chosen.of(~nodes[..., s].isnan())
+        some = NodeSubset.from_mask(~nodes[..., s].isnan())
         if self.some is None or not torch.equal(self.some.has, some.has):
-            self.some, self.siblings, self.ties, self.next = some, some.siblings(self.graph), None, 0
-        own = some.taken(nodes.where(torch.arange(nodes.shape[2]) < s, torch.nan))
-        self.ties = self.net.mates.ties(self.siblings, own, self.ties, self.next)
+            self.some, self.siblings, self.links, self.next = some, some.siblings(self.graph), None, 0
+        own = some.gather(nodes.where(torch.arange(nodes.shape[2]) < s, torch.nan))
+        self.links = self.net.mates.links(self.siblings, own, self.links, self.next)
         self.next = s
-        return self.net.given(self.graph, scene, nodes, s, some, self.ties)
+        return self.net.given(self.graph, scene, nodes, s, some, self.links)
 
 
-class MaximumLikelihood(StepTraining):
+class MaximumLikelihood(AdamTraining):
     """Resumable training of a ``ParameterNet``; its loss is in nats an image.
 
     Args:
@@ -172,7 +172,7 @@ class MaximumLikelihood(StepTraining):
         seed: of everything random.
     """
 
-    what = "the parameters"
+    subject = "the parameters"
 
     def __init__(
         self,
@@ -183,17 +183,17 @@ class MaximumLikelihood(StepTraining):
         learning_rate: float = 5e-3,
         seed: int = 0,
     ):
-        super().__init__(net, torch.optim.Adam(net.parameters(), lr=learning_rate), steps, seed, longest=10.0)
+        super().__init__(net, torch.optim.Adam(net.parameters(), lr=learning_rate), steps, seed, max_grad_norm=10.0)
         self.net, self.values, self.images = net, values, images
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
-        some = self.values.of(torch.randperm(len(self.values.kind))[: self._number()])
-        drawn, candidates = some.drawn(), 0 if self.done < ALONE * self.total else CANDIDATES
-        others = [some.drawn() for _ in range(candidates)]
+        """See ``AdamTraining``."""
+        some = self.values.select(torch.randperm(len(self.values.kind))[: self._number()])
+        drawn, candidates = some.sample(), 0 if self.done < UNWEIGHTED_SHARE * self.total else NUM_CANDIDATES
+        others = [some.sample() for _ in range(candidates)]
         return -draws_and_density(self.net, drawn, others)[1].sum(1).mean()
 
     def _number(self) -> int:
         """Images a step: fewer where each has many values."""
         each = max(1, self.net.node_sites) * self.values.kind.shape[1]
-        return max(FEWEST, min(self.images, VALUES // each))
+        return max(MIN_IMAGES, min(self.images, MAX_VALUES // each))

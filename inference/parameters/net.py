@@ -15,13 +15,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .graph import Graph
-from .mates import LOGITS, Mates, Ties
+from .graph import SceneGraph
 from .mixture import LogisticMixture
+from .sibling_encoder import LOGITS, SiblingEncoder, SiblingLinks
 
 COMPONENTS = 6
-MOST = 40  # ranks and numbers of siblings from here on are one
-SMALL = 0.3  # spread of the first components' locations, in logits: components that are equal stay equal
+MAX_SIBLINGS = 40  # ranks and numbers of siblings from here on are one
+LOCATION_SPREAD = 0.3  # spread of the first components' locations, in logits: components that are equal stay equal
 
 
 class ParameterNet(nn.Module):
@@ -50,12 +50,12 @@ class ParameterNet(nn.Module):
         S, G, K = node_sites, scene_sites, 3 * components
         self.of_kind = nn.Embedding(kinds + 1, hidden)
         self.of_site = nn.Embedding(max(S, 1), hidden)
-        self.of_rank, self.of_number = nn.Embedding(MOST + 1, hidden), nn.Embedding(MOST + 1, hidden)
+        self.of_rank, self.of_number = nn.Embedding(MAX_SIBLINGS + 1, hidden), nn.Embedding(MAX_SIBLINGS + 1, hidden)
         self.of_scene = nn.Linear(kinds + 3 * G, hidden)
         self.of_place = nn.Linear(6, hidden)
         self.of_values = nn.Linear(9 * max(S, 1), hidden)
         self.of_siblings = nn.Linear(3 * max(S, 1), hidden)
-        self.mates = Mates(S, hidden)
+        self.mates = SiblingEncoder(S, hidden)
         self.read = nn.Linear(hidden + 3 * S, hidden)
         self.cell = nn.GRU(hidden, hidden, batch_first=True)
         self.join = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
@@ -63,65 +63,69 @@ class ParameterNet(nn.Module):
         self.scene_join = nn.ModuleList(nn.Sequential(nn.Linear(hidden, hidden), nn.SiLU()) for _ in range(G))
         self.scene_out = nn.ModuleList(nn.Linear(hidden, K) for _ in range(G))
         for layer in (*self.out, *self.scene_out):
-            begin(cast(nn.Linear, layer))
+            init_to_prior(cast(nn.Linear, layer))
 
-    def scene_mixture(self, graph: Graph, scene: Tensor, g: int) -> LogisticMixture:
+    def scene_mixture(self, graph: SceneGraph, scene: Tensor, g: int) -> LogisticMixture:
         """Of the scenes' site number ``g``, ``(N, 1)``, given those before it.
 
         Args:
             scene: ``(N, G)`` u, NaN where they are not known.
         """
         known = scene.where(torch.arange(self.scene_sites) < g, torch.nan)
-        return LogisticMixture.of(self.scene_out[g](self.scene_join[g](F.silu(self._scene(graph, known)))).unsqueeze(1))
+        return LogisticMixture.from_raw(
+            self.scene_out[g](self.scene_join[g](F.silu(self._scene(graph, known)))).unsqueeze(1)
+        )
 
-    def node_mixture(self, graph: Graph, scene: Tensor, values: Tensor, s: int) -> LogisticMixture:
+    def node_mixture(self, graph: SceneGraph, scene: Tensor, values: Tensor, s: int) -> LogisticMixture:
         """Of the nodes' site number ``s``, ``(N, M)``, given all before it; the uniform one where a node's is NaN.
 
         Args:
             scene: ``(N, G)`` u, NaN where they are not known.
             values: ``(N, M, S)`` u, NaN where there are none; those of later sites are not looked at.
         """
-        given = self.given(graph, scene, values, s, Chosen.of(~values[..., s].isnan()))
-        return LogisticMixture.of(given.some.put(self._raw_of(given, values, s)))
+        given = self.given(graph, scene, values, s, NodeSubset.from_mask(~values[..., s].isnan()))
+        return LogisticMixture.from_raw(given.subset.scatter(self._raw_of(given, values, s)))
 
-    def chosen_mixture(self, given: "Given", values: Tensor, s: int) -> LogisticMixture:
+    def subset_mixture(self, given: "Conditioning", values: Tensor, s: int) -> LogisticMixture:
         """``node_mixture`` of the chosen nodes alone, ``(N, R)``."""
-        return LogisticMixture.of(self._raw_of(given, values, s))
+        return LogisticMixture.from_raw(self._raw_of(given, values, s))
 
-    def _raw_of(self, given: "Given", values: Tensor, s: int) -> Tensor:
+    def _raw_of(self, given: "Conditioning", values: Tensor, s: int) -> Tensor:
         """``(N, R, 3 K)``, from what is given and the values of site ``s`` of the nodes before each."""
-        u = given.some.taken(values[..., s : s + 1]).where(given.some.there.unsqueeze(-1), torch.nan)
-        place = given.place + self.mates(given.ties.place, given.ties.last, u[..., 0])
+        u = given.subset.gather(values[..., s : s + 1]).where(given.subset.there.unsqueeze(-1), torch.nan)
+        place = given.place + self.mates(given.links.place, given.links.last, u[..., 0])
         for number, index in enumerate((given.parent, given.before)):
-            place = place + self._of_one(self.of_values, number + 1, gathered(u, index), s)
-        states, _ = self.cell(F.silu(given.entering + self._of_one(self.read, 0, u, s)))
+            place = place + self._of_one(self.of_values, number + 1, gather_nodes(u, index), s)
+        states, _ = self.cell(F.silu(given.gru_input + self._of_one(self.read, 0, u, s)))
         return self._raw(place, F.pad(states, (0, 0, 1, 0))[:, :-1], s)
 
-    def sample(self, graph: Graph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
+    def sample(self, graph: SceneGraph, scene: Tensor, values: Tensor, s: int, v: Tensor, has: Tensor) -> Tensor:
         """u of the nodes' site number ``s``, ``(N, M)``, at the quantiles ``v (N, M)``, one node after the other.
 
         Args:
             scene, values: as of ``node_mixture``, without site ``s``.
             has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
         """
-        some = Chosen.of(has)
+        some = NodeSubset.from_mask(has)
         given = self.given(graph, scene, values, s, some)
         u = v.new_full((*some.index.shape, 1), torch.nan)  # parents and siblings before come earlier
         at, memory = v.gather(1, some.index), v.new_zeros(len(v), self.cell.hidden_size)
         w: Any = self.cell  # torch names its weights as it makes them
         for r in range(some.index.shape[1]):
             here = slice(r, r + 1)
-            place = given.place[:, here] + self.mates(given.ties.place[:, here], given.ties.last[:, here], u[..., 0])
+            place = given.place[:, here] + self.mates(given.links.place[:, here], given.links.last[:, here], u[..., 0])
             for number, index in enumerate((given.parent, given.before)):
-                place = place + self._of_one(self.of_values, number + 1, gathered(u, index[:, here]), s)
-            found = LogisticMixture.of(self._raw(place[:, 0], memory, s)).icdf(at[:, r])
+                place = place + self._of_one(self.of_values, number + 1, gather_nodes(u, index[:, here]), s)
+            found = LogisticMixture.from_raw(self._raw(place[:, 0], memory, s)).icdf(at[:, r])
             found = found.where(some.there[:, r], torch.nan)[:, None, None]
             u = torch.cat([u[:, :r], found, u[:, r + 1 :]], 1)
-            x = F.silu(given.entering[:, r] + self._of_one(self.read, 0, found, s)[:, 0])
+            x = F.silu(given.gru_input[:, r] + self._of_one(self.read, 0, found, s)[:, 0])
             memory = torch.gru_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
-        return some.put(u)[..., 0].where(has, v)
+        return some.scatter(u)[..., 0].where(has, v)
 
-    def moving(self, graph: Graph, scene: Tensor, values: Tensor, trained: Sequence[bool]) -> tuple[Tensor, Tensor]:
+    def reparameterise(
+        self, graph: SceneGraph, scene: Tensor, values: Tensor, trained: Sequence[bool]
+    ) -> tuple[Tensor, Tensor]:
         """``scene (N, G)`` and ``values (N, M, S)`` of a sample; those of some sites each with the gradient that it has
         as a quantile of the mixture that it was drawn from, what comes before it held [1].
 
@@ -132,11 +136,11 @@ class ParameterNet(nn.Module):
             [1] Figurnov, Mohamed, Mnih, *Implicit reparameterization gradients*, NeurIPS 2018.
         """
         scenes = [
-            self.scene_mixture(graph, scene, g).through(u[:, None].nan_to_num(0.5))[:, 0] if moves else u
+            self.scene_mixture(graph, scene, g).reparameterise(u[:, None].nan_to_num(0.5))[:, 0] if moves else u
             for g, (u, moves) in enumerate(zip(scene.unbind(1), trained[self.node_sites :], strict=True))
         ]
         nodes = [
-            self.node_mixture(graph, scene, values, s).through(u.nan_to_num(0.5)) if moves else u
+            self.node_mixture(graph, scene, values, s).reparameterise(u.nan_to_num(0.5)) if moves else u
             for s, (u, moves) in enumerate(zip(values.unbind(2), trained[: self.node_sites], strict=True))
         ]
         return (
@@ -145,45 +149,51 @@ class ParameterNet(nn.Module):
         )
 
     def given(
-        self, graph: Graph, scene: Tensor, values: Tensor, s: int, some: "Chosen", ties: Ties | None = None
-    ) -> "Given":
+        self,
+        graph: SceneGraph,
+        scene: Tensor,
+        values: Tensor,
+        s: int,
+        some: "NodeSubset",
+        links: SiblingLinks | None = None,
+    ) -> "Conditioning":
         """What some nodes' mixtures depend on, without the values of site ``s`` itself.
 
         Args:
             graph, scene, values: as of ``node_mixture``.
             s: number of the site.
             some: the nodes.
-            ties: see ``Mates``; found here where None.
+            links: see ``SiblingEncoder``; found here where None.
         """
         known = values.where(torch.arange(self.node_sites) < s, torch.nan)
-        own, kind = some.taken(known), graph.kind.gather(1, some.index)
+        own, kind = some.gather(known), graph.kind.gather(1, some.index)
         nodes = (graph.parent.gather(1, some.index), graph.before.gather(1, some.index))
-        around = torch.cat([code(part) for part in (own, *(gathered(known, node) for node in nodes))], -1)
-        share = some.taken(graph.together) / graph.number.gather(1, some.index).clamp(min=1).unsqueeze(-1)
-        place = self.of_values(around) + self.of_siblings(share.to(own.dtype) @ code(known))
+        around = torch.cat([encode_u(part) for part in (own, *(gather_nodes(known, node) for node in nodes))], -1)
+        share = some.gather(graph.siblings) / graph.number.gather(1, some.index).clamp(min=1).unsqueeze(-1)
+        place = self.of_values(around) + self.of_siblings(share.to(own.dtype) @ encode_u(known))
         start = self.of_kind(kind.remainder(self.kinds + 1)) + self.of_site.weight[s]
-        return Given(
+        return Conditioning(
             some,
-            some.taken(self._place(graph, scene, s)) + place,
-            self.read(torch.cat([start, code(own)], -1)),
-            some.number(nodes[0]),
-            some.number(nodes[1]),
-            self.mates.ties(some.siblings(graph), own) if ties is None else ties,
+            some.gather(self._place(graph, scene, s)) + place,
+            self.read(torch.cat([start, encode_u(own)], -1)),
+            some.position(nodes[0]),
+            some.position(nodes[1]),
+            self.mates.links(some.siblings(graph), own) if links is None else links,
         )
 
     def _of_one(self, layer: nn.Linear, part: int, u: Tensor, s: int) -> Tensor:
-        """What a layer adds for the values ``u (N, R, 1)`` of site ``s`` in one part of its ``code``."""
+        """What a layer adds for the values ``u (N, R, 1)`` of site ``s`` in one part of its ``encode_u``."""
         S = max(1, self.node_sites)
         first = layer.in_features - 9 * S if layer is self.of_values else layer.in_features - 3 * S
         columns = [first + 3 * S * part + s + S * i for i in range(3)]
-        return F.linear(code(u), layer.weight[:, columns])
+        return F.linear(encode_u(u), layer.weight[:, columns])
 
     def _raw(self, place: Tensor, memory: Tensor, s: int) -> Tensor:
         return self.out[s](self.join(F.silu(torch.cat([place, memory], -1))))
 
-    def _place(self, graph: Graph, scene: Tensor, s: int) -> Tensor:
+    def _place(self, graph: SceneGraph, scene: Tensor, s: int) -> Tensor:
         """``(N, M, H)``, what does not change from node to node."""
-        rank, number = (x.clamp(max=MOST) for x in (graph.rank, graph.number))
+        rank, number = (x.clamp(max=MAX_SIBLINGS) for x in (graph.rank, graph.number))
         scene = scene.where(torch.arange(self.scene_sites) < self.before[s], torch.nan)
         ranks = [graph.rank, graph.same_rank]
         numbers = [graph.number.clamp(min=1), graph.same_number.clamp(min=1)]
@@ -198,12 +208,12 @@ class ParameterNet(nn.Module):
             + self._scene(graph, scene).unsqueeze(1)
         )
 
-    def _scene(self, graph: Graph, scene: Tensor) -> Tensor:
+    def _scene(self, graph: SceneGraph, scene: Tensor) -> Tensor:
         counts = F.one_hot(graph.kind.remainder(self.kinds + 1), self.kinds + 1).sum(1)[:, : self.kinds]
-        return self.of_scene(torch.cat([counts.to(scene.dtype).log1p(), code(scene)], -1))
+        return self.of_scene(torch.cat([counts.to(scene.dtype).log1p(), encode_u(scene)], -1))
 
 
-class Chosen(NamedTuple):
+class NodeSubset(NamedTuple):
     """Some of a scene's nodes, in their order: R at most, those of a scene first.
 
     Attributes:
@@ -217,68 +227,68 @@ class Chosen(NamedTuple):
     has: Tensor
 
     @staticmethod
-    def of(has: Tensor) -> "Chosen":
+    def from_mask(has: Tensor) -> "NodeSubset":
         """Those that have something, ``(N, M)`` bool; at least one is looked at in each scene."""
         R = max(1, int(has.sum(1).max()) if len(has) else 1)
         index = (~has).long().argsort(dim=1, stable=True)[:, :R]
-        return Chosen(index, has.gather(1, index), has)
+        return NodeSubset(index, has.gather(1, index), has)
 
-    def taken(self, part: Tensor) -> Tensor:
+    def gather(self, part: Tensor) -> Tensor:
         """``(N, R, ...)`` of ``(N, M, ...)``."""
         return part.gather(1, self.index.unsqueeze(-1).expand(-1, -1, part.shape[2]))
 
-    def number(self, node: Tensor) -> Tensor:
+    def position(self, node: Tensor) -> Tensor:
         """``(N, R)`` where among those chosen each of the nodes ``(N, R)`` is; -1 where it is none of them."""
         place = (self.has.cumsum(1) - 1).where(self.has, -1).gather(1, node.clamp(min=0))
         return place.where((node >= 0) & self.there, -1)
 
-    def siblings(self, graph: Graph) -> Tensor:
+    def siblings(self, graph: SceneGraph) -> Tensor:
         """``(N, R, R)`` bool, who is whose sibling among them, itself included."""
-        together = self.taken(graph.together).gather(2, self.index.unsqueeze(1).expand(-1, self.index.shape[1], -1))
+        together = self.gather(graph.siblings).gather(2, self.index.unsqueeze(1).expand(-1, self.index.shape[1], -1))
         return together & (self.there.unsqueeze(1) & self.there.unsqueeze(2))
 
-    def put(self, part: Tensor) -> Tensor:
+    def scatter(self, part: Tensor) -> Tensor:
         """``(N, M, D)`` of ``(N, R, D)``; 0 for the others."""
         place = (self.has.cumsum(1) - 1).clamp(min=0).unsqueeze(-1).expand(-1, -1, part.shape[2])
         return part.gather(1, place).where(self.has.unsqueeze(-1), 0.0)
 
 
-class Given(NamedTuple):
+class Conditioning(NamedTuple):
     """Of the nodes that have a site.
 
     Attributes:
-        some: which nodes they are.
+        subset: which nodes they are.
         place: ``(N, R, H)`` of the mixture.
-        entering: ``(N, R, H)`` of the GRU.
+        gru_input: ``(N, R, H)`` of the GRU.
         parent, before: ``(N, R)`` int64 which of them; -1 for none.
-        ties: see ``Mates``.
+        links: see ``SiblingEncoder``.
     """
 
-    some: "Chosen"
+    subset: "NodeSubset"
     place: Tensor
-    entering: Tensor
+    gru_input: Tensor
     parent: Tensor
     before: Tensor
-    ties: Ties
+    links: SiblingLinks
 
 
 @torch.no_grad()
-def begin(layer: nn.Linear) -> None:
+def init_to_prior(layer: nn.Linear) -> None:
     """The last layer of a mixture from its beginning, the prior."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     _, location, _ = layer.bias.chunk(3)
-    location.copy_(SMALL * torch.linspace(-1, 1, len(location)))
+    location.copy_(LOCATION_SPREAD * torch.linspace(-1, 1, len(location)))
 
 
-def code(u: Tensor) -> Tensor:
+def encode_u(u: Tensor) -> Tensor:
     """``(..., 3 S)`` of u ``(..., S)``, NaN where it is not known: whether it is, and it, on both scales."""
     there = ~u.isnan()
     u = u.nan_to_num(0.5)
     return torch.cat([there.to(u.dtype), 2 * u - 1, u.clamp(1e-4, 1 - 1e-4).logit() / LOGITS], -1)
 
 
-def gathered(values: Tensor, index: Tensor) -> Tensor:
+def gather_nodes(values: Tensor, index: Tensor) -> Tensor:
     """Entries ``(N, M, S)`` of ``values`` at nodes ``index (N, M)``; NaN for -1."""
     at = index.clamp(min=0).unsqueeze(-1).expand(-1, -1, values.shape[2])
     return values.gather(1, at).where((index >= 0).unsqueeze(-1), torch.nan)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 READING, SCENES, LIKELIHOOD, ENERGY = "reading", "scenes", "likelihood", "energy"
-UNCLEAR, WEIGHTS = "unclear", "weights"
-OF_SCENES, OF_GUIDE = (SCENES, UNCLEAR, WEIGHTS), (LIKELIHOOD, ENERGY)
-EACH = 2  # renders for each step in which sites of scenes are learnt to be read
+REFIT, WEIGHTS = "refit", "weights"
+OF_SCENES, OF_GUIDE = (SCENES, REFIT, WEIGHTS), (LIKELIHOOD, ENERGY)
+RENDERS_PER_STEP = 2  # of the training of a head for sites of scenes
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,11 @@ class ParameterSchedule:
         Args:
             of_scenes: whether the model has sites of scenes.
         """
-        overall, again = self.scene_renders // EACH, self.round_scene_renders // EACH
-        first = [(READING, self.reader_steps), (SCENES, overall), (LIKELIHOOD, self.steps)]
-        once_more = [(READING, self.round_reader_steps), (SCENES, again), (LIKELIHOOD, self.round_steps)]
-        last = [(UNCLEAR, overall), (WEIGHTS, self.round_steps)] if self.weighted_scenes else []
-        phases = [*first, *once_more * self.rounds, (ENERGY, self.energy_steps), *last]
+        scene_steps, round_scene_steps = (
+            renders // RENDERS_PER_STEP for renders in (self.scene_renders, self.round_scene_renders)
+        )
+        first = [(READING, self.reader_steps), (SCENES, scene_steps), (LIKELIHOOD, self.steps)]
+        later = [(READING, self.round_reader_steps), (SCENES, round_scene_steps), (LIKELIHOOD, self.round_steps)]
+        last = [(REFIT, scene_steps), (WEIGHTS, self.round_steps)] if self.weighted_scenes else []
+        phases = [*first, *later * self.rounds, (ENERGY, self.energy_steps), *last]
         return [(what, steps) for what, steps in phases if steps and (of_scenes or what not in OF_SCENES)]

@@ -11,26 +11,27 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 from torch.nn.functional import pad
 
+from probscene.branching import Branching
 from probscene.grammar import Grammar
 from probscene.model import SceneModel
 from probscene.policy import Policy
-from probscene.reach import Reach
 from probscene.request import Renderable
 from probscene.sampling import Scenes, run_program, sample
 from probscene.scenarios import JointGrammar
 from probscene.support import Support
 
-DRAWN = 200  # scenes of which a model's sites are found
-ENOUGH, POINT_MASS = 50, 0.05  # values of a site, and the share of them that are one, that show a point mass
-NEAR = 1e-6  # from 0 and 1; the logit of what is nearer is no number
+NUM_SCENES = 200  # scenes of which a model's sites are found
+MIN_VALUES, MAX_POINT_MASS = 50, 0.05  # values of a site, and the share of them that are one, that show a point mass
+U_EPS = 1e-6  # from 0 and 1; the logit of what is nearer is no number
 LEARN = "learn"  # of a site's ``infer``
-MEANT = "the program says so"  # why a site keeps its prior where that is False
+OPTED_OUT = "the program says so"  # why a site keeps its prior where that is False
 
 
 @dataclass(frozen=True)
@@ -70,16 +71,16 @@ class Quantiles(Messenger):
         name, fn = msg["name"], msg["fn"]
         if site_is_subsample(msg) or name.startswith("rule_") or name == "z":
             return
-        because = why_kept(fn, msg["value"], msg["infer"])
+        because = reason_not_learnable(fn, msg["value"], msg["infer"])
         if because:
             self.kept[name] = because
             return
-        u = fn.cdf(msg["value"]).detach().clamp(NEAR, 1 - NEAR)
+        u = fn.cdf(msg["value"]).detach().clamp(U_EPS, 1 - U_EPS)
         mask = msg["mask"]
         self.found[name] = u if mask is None else u.where(torch.as_tensor(mask).expand(u.shape), torch.nan)
 
 
-def why_kept(fn: Any, value: Tensor, infer: dict[str, Any] | None) -> str:
+def reason_not_learnable(fn: Any, value: Tensor, infer: dict[str, Any] | None) -> str:
     """Why a site keeps its prior; empty where it can be learnt.
 
     Args:
@@ -87,7 +88,7 @@ def why_kept(fn: Any, value: Tensor, infer: dict[str, Any] | None) -> str:
         infer: what the program says of it.
     """
     if infer and infer.get(LEARN) is False:
-        return MEANT
+        return OPTED_OUT
     if not value.is_floating_point() or getattr(fn.support, "is_discrete", False):
         return "it is discrete"
     if fn.event_shape:
@@ -114,7 +115,7 @@ def _sites(model: SceneModel, classes: tuple[str, ...]) -> tuple[Site, ...]:
             _sites(part, classes) for _, part in model.scenarios
         ])  # fmt: skip
     quantiles = Quantiles()
-    scenes = sample(within(model, quantiles), model.pretraining_policy, DRAWN)
+    scenes = sample(with_handlers(model, quantiles), model.pretraining_policy, NUM_SCENES)
     kind, found = scenes.derivation.kind, []
     for name, value in scenes.parameters.items():
         mask = scenes.site_mask[name]
@@ -134,16 +135,17 @@ def _sites(model: SceneModel, classes: tuple[str, ...]) -> tuple[Site, ...]:
 def _of_nodes(name: str, kinds: list[str], grammar: Grammar, classes: tuple[str, ...]) -> Site:
     if any(kind in classes for kind in kinds):
         return Site(name, tuple(kinds))
-    if once_in_each(grammar, kinds):
+    if occurs_once(grammar, kinds):
         return Site(name, ())
     return Site(name, tuple(kinds), "it belongs to no node that has a class")
 
 
-def once_in_each(grammar: Grammar, kinds: list[str]) -> bool:
+def occurs_once(grammar: Grammar, kinds: list[str]) -> bool:
     """Whether every scene that a grammar derives has exactly one node of some kinds."""
+    process = Branching(grammar, Support(grammar, grammar.legal[:, None, None]).uniform_table())
     numbers = [grammar.kind(kind) for kind in kinds]
-    reach = Reach(grammar, Support(grammar, grammar.legal[:, None, None]), None, [numbers])
-    return reach.least(0) == reach.most(0) == 1
+    nodes = np.isin(grammar.objects.numpy()[process.rule], numbers).sum(1)
+    return process.max_total(nodes) == -process.max_total(-nodes) == 1
 
 
 def _of_all(grammars: dict[str, Grammar], parts: list[tuple[Site, ...]]) -> tuple[Site, ...]:
@@ -203,10 +205,10 @@ def _unlike_uniform(u: Tensor | None) -> str:
     if u is None:
         return ""
     there = u[~u.isnan()]
-    if len(there) < ENOUGH:
+    if len(there) < MIN_VALUES:
         return ""
     most = int(there.unique(return_counts=True)[1].max())
-    return "its prior has a point mass" if most > POINT_MASS * len(there) else ""
+    return "its prior has a point mass" if most > MAX_POINT_MASS * len(there) else ""
 
 
 def _masked_as_nodes(mask: Tensor, kind: Tensor) -> bool:
@@ -218,7 +220,7 @@ def quantiles_of(model: SceneModel, scenes: Scenes) -> dict[str, Tensor]:
     """The u of all sites that have one by their own names, see ``Quantiles``; the program is run again on the scenes'
     own values. Those of several scenarios are all ``(N, M)``."""
     quantiles = Quantiles()
-    run_program(within(model, quantiles), scenes.derivation, scenes.parameters)
+    run_program(with_handlers(model, quantiles), scenes.derivation, scenes.parameters)
     if not isinstance(model.grammar, JointGrammar):
         return quantiles.found
     M, found = scenes.derivation.trimmed().kind.shape[1], {}
@@ -235,7 +237,7 @@ def of_scenes(u: Tensor) -> Tensor:
     return u.nan_to_num(0.0).sum(1, keepdim=True).where(there.any(1, keepdim=True), torch.nan)
 
 
-def having(grammar: Grammar, sites: tuple[Site, ...], kind: Tensor) -> Tensor:
+def site_mask(grammar: Grammar, sites: tuple[Site, ...], kind: Tensor) -> Tensor:
     """``(..., S)`` bool, which nodes have which of S sites, by the nodes' kinds ``(...)``; -1 pads."""
     has = torch.zeros(len(grammar.kinds) + 1, len(sites), dtype=torch.bool)  # the last is padding
     for s, site in enumerate(sites):
@@ -243,7 +245,7 @@ def having(grammar: Grammar, sites: tuple[Site, ...], kind: Tensor) -> Tensor:
     return has[kind]
 
 
-def within(model: SceneModel, *handlers: Messenger) -> SceneModel:
+def with_handlers(model: SceneModel, *handlers: Messenger) -> SceneModel:
     """The model, its program run inside handlers, the first one outermost; ``run_program`` hides it from others."""
 
     def program(num_scenes: int, structure: Policy) -> Renderable:

@@ -49,7 +49,7 @@ def surfaces() -> dict[str, Surface]:
 
 
 def _asphalt(seed: int, colour, rows: int = 512, columns: int = 256) -> np.ndarray:
-    """Grain, stains drawn out along the road, a few cracks and a mended patch."""
+    """Grain, stains drawn out along the road, a few cracks and a fixed patch."""
     rng = np.random.default_rng(seed)
     grain = 6 * noise(rng, rows, columns, 0.5) + 3 * noise(rng, rows, columns, 1.6)
     stains = 4 * noise(rng, rows, columns, (60.0, 9.0)) + 3 * noise(rng, rows, columns, 30.0)

@@ -59,7 +59,7 @@ def ground(nodes: Nodes, road: Street, surfaces: Mapping[str, Surface]) -> Groun
         cover[f"edge_{side}"], cover[f"dash_{side}"] = line("edge", edged), line("dashed", marked)
         for strip, kind in (("walk", nodes.walk), ("verge", "verge"), ("terrain", "verge")):
             here = nodes.graph.mask(kind) & nodes.below(side)
-            share = nodes.single(here, nodes.of(kind, "look"))
+            share = nodes.single(here, nodes.parameter(kind, "look"))
             cover[f"{strip}_{side}"] = one_of(looks[strip], share)
     surface = torch.cat([cover.get(name, plain) for name in STRIPS], 1)
     return Ground(tuple(surfaces.values()), road.edges, surface, nodes.only("street", "shift"))
@@ -81,7 +81,7 @@ def slabs(nodes: Nodes, road: Street, meshes: Mapping[str, tuple[Mesh, ...]]) ->
         near, far = inner(f"walk_{side}"), outer(f"walk_{side}")
         pieces += [(kerb, near, near + inward, always), (paved, near + inward, far, always)]
         if scenario == "city":
-            share = nodes.single(graph.mask("verge") & nodes.below(side), nodes.of("verge", "look"))
+            share = nodes.single(graph.mask("verge") & nodes.below(side), nodes.parameter("verge", "look"))
             pieces.append((torch.where(share < LAWNS, green, paved), far, outer(f"verge_{side}"), always))
     right, left = road.right("median"), road.left("median")
     median = graph.mask("median").any(1, keepdim=True)
@@ -104,7 +104,7 @@ def fences(nodes: Nodes, road: Street, meshes: Mapping[str, tuple[Mesh, ...]]) -
         return None
     style, y, there = [], [], []
     for side, inner in (("left", road.right), ("right", road.left)):
-        share = nodes.single(nodes.graph.mask("verge") & nodes.below(side), nodes.of("verge", "fence"))
+        share = nodes.single(nodes.graph.mask("verge") & nodes.below(side), nodes.parameter("verge", "fence"))
         which, _ = choice(share / FENCED[nodes.scenario], len(styles))
         style.append(torch.tensor(styles)[which])
         y.append(inner(f"verge_{side}") + (MARGIN if side == "left" else -MARGIN) / 2)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from probscene.photo import Photo
+from probscene.camera_effects import CameraEffects
 from probscene.world import Camera, Light
 
 # Zenith and horizon. A camera that exposes for the road shows a sky that is nearly white.
@@ -43,7 +43,7 @@ def camera(value: Value, canvas: tuple[int, int]) -> Camera:
     return Camera.kitti(canvas, y=value("camera", "offset"), z=value("camera", "height"), **pose)
 
 
-def photo(value: Value) -> Photo:
+def photo(value: Value) -> CameraEffects:
     """What the camera's electronics do."""
     numbers = {name: value("camera", name) for name in ("exposure", "contrast", "saturation", "noise")}
-    return Photo(**numbers, seed=(value("camera", "grain").double() * GRAINS).long())
+    return CameraEffects(**numbers, seed=(value("camera", "grain").double() * GRAINS).long())

@@ -43,23 +43,23 @@ class Nodes:
         """Whether the grammar has such objects."""
         return kind in self.graph.grammar.kinds
 
-    def of(self, kind: str, name: str) -> Tensor:
+    def parameter(self, kind: str, name: str) -> Tensor:
         """``(N, M)``, a parameter of the nodes of a kind."""
         return self.parameters[kind, name]
 
     def only(self, kind: str, name: str) -> Tensor:
         """``(N, 1)``, a parameter of the one node of a kind; 0 in a scene without it."""
-        return self.single(self.graph.mask(kind), self.of(kind, name))
+        return self.single(self.graph.mask(kind), self.parameter(kind, name))
 
     def single(self, mask: Tensor, value: Tensor) -> Tensor:
         """``(N, 1)``, the value of the one node in the mask; 0 in a scene without it."""
         return (value * mask).sum(1, keepdim=True)
 
-    def each(self, name: str) -> Tensor:
+    def thing_parameter(self, name: str) -> Tensor:
         """``(N, M)``, every thing's own parameter; 1 elsewhere."""
         value = torch.ones(self.graph.kind.shape)
         for kind in self.things:
-            value = torch.where(self.graph.mask(kind), self.of(kind, name), value)
+            value = torch.where(self.graph.mask(kind), self.parameter(kind, name), value)
         return value
 
     def among(self, *kinds: str) -> Tensor:

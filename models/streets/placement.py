@@ -41,23 +41,23 @@ def things(nodes: Nodes, meshes: Mapping[str, tuple[Mesh, ...]]) -> tuple[Street
     for kind in nodes.things:
         mine = graph.mask(kind)
         by_size = torch.tensor([float(each.size.prod()) for each in meshes[kind]]).argsort(stable=True)
-        index = by_size[choice(nodes.of(kind, "make"), len(meshes[kind]))[0]]
+        index = by_size[choice(nodes.parameter(kind, "make"), len(meshes[kind]))[0]]
         sizes, bases = map(torch.tensor, zip(*(footprint(each, kind) for each in meshes[kind]), strict=True))
         mesh, mine = torch.where(mine, index, mesh), mine.unsqueeze(-1)
         size, base = torch.where(mine, sizes[index], size), torch.where(mine, bases[index], base)
-        index, rest = choice(nodes.of(kind, "colour"), len(TINTS[kind]))
+        index, rest = choice(nodes.parameter(kind, "colour"), len(TINTS[kind]))
         tint = torch.where(mine, TINTS[kind][index] * (0.85 + 0.15 * rest.unsqueeze(-1)), tint)
     room = torch.where(nodes.below("median"), PLANTED, torch.inf)
-    scale = nodes.each("scale").minimum(room / size.amax(-1).clamp(min=1e-3)).unsqueeze(-1).repeat(1, 1, 3)
-    yaw = facing(nodes) + nodes.each("turn").where(standing, 0.0)
+    scale = nodes.thing_parameter("scale").minimum(room / size.amax(-1).clamp(min=1e-3)).unsqueeze(-1).repeat(1, 1, 3)
+    yaw = facing(nodes) + nodes.thing_parameter("turn").where(standing, 0.0)
     length, breadth = (each * standing for each in extent(size * scale[..., :2], yaw))
     free = [gap(nodes.scenario, kind) * graph.mask(kind) for kind in nodes.things]
     length = length + sum(free, torch.zeros(()))
     road, strip = strips(nodes, length, breadth)
     near, width, start, stop, height, side, lines = (graph.of_parent(value) for value in strip)
-    lines, place = lines.clamp(min=1), nodes.each("place")
+    lines, place = lines.clamp(min=1), nodes.thing_parameter("place")
     place = torch.where(nodes.among("tree", "bush", "building"), place, place**NEAR)
-    line, share = choice(nodes.each("across"), lines)
+    line, share = choice(nodes.thing_parameter("across"), lines)
     x = in_line(nodes.together(standing, line), place, length, start, stop)
     y = near + side * in_width(line, share, lines, width, breadth)
     ahead, aside = (base * scale[..., :2]).unbind(-1)
@@ -84,7 +84,7 @@ def facing(nodes: Nodes) -> Tensor:
         nodes.among(*VEHICLES),
         nodes.below("oncoming"),
         torch.where(
-            graph.mask("sign"), ~(on_left & two_way), graph.mask("cyclist") & (nodes.of("cyclist", "way") < 0.5)
+            graph.mask("sign"), ~(on_left & two_way), graph.mask("cyclist") & (nodes.parameter("cyclist", "way") < 0.5)
         ),
     )
     yaw = torch.where(toward_us, math.pi, 0.0)

@@ -54,9 +54,9 @@ def strips(nodes: Nodes, length: Tensor, breadth: Tensor) -> tuple[Street, Strip
     lane = (widest * nodes.among("lane", "oncoming")).amax(1, keepdim=True)
     lane = torch.maximum(nodes.only("street", "lane"), lane)
     width = {
-        "median": torch.maximum(nodes.of("median", "width"), widest + 2 * CLEARANCE),
-        nodes.walk: torch.maximum(nodes.of(nodes.walk, "width"), widest),
-        "verge": nodes.of("verge", "more") + MARGIN + LINES[nodes.scenario] * widest,
+        "median": torch.maximum(nodes.parameter("median", "width"), widest + 2 * CLEARANCE),
+        nodes.walk: torch.maximum(nodes.parameter(nodes.walk, "width"), widest),
+        "verge": nodes.parameter("verge", "more") + MARGIN + LINES[nodes.scenario] * widest,
     }
     median = nodes.single(graph.mask("median"), width["median"])
     walks, verges = (
@@ -110,7 +110,7 @@ def _outer(
     if nodes.has("row"):
         rows = graph.mask("row") & here
         before = nodes.together(rows, torch.zeros_like(length)).tril(-1).float()
-        reach = torch.maximum(nodes.of("row", "length"), nodes.sum_of_children(length))
+        reach = torch.maximum(nodes.parameter("row", "length"), nodes.sum_of_children(length))
         near = outer(f"verge_{side}")
         start = VIEW * near.abs() - HIDDEN + (before @ (reach * rows).unsqueeze(-1)).squeeze(-1)
         found.append((rows, Strip(near, widest + SETBACK[scenario], start, start + reach, 0.0, sign)))

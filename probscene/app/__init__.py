@@ -1,1 +1,1 @@
-"""The roof: command line, runs and reports; the only library code that joins the folders."""
+"""The application: command line, runs and reports; the only library code that joins the packages."""

@@ -10,7 +10,7 @@ def checked_seed(seed: int) -> int:
         ProbsceneError: it is negative.
     """
     if seed < 0:
-        raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
+        raise ProbsceneError(f"expected a seed of 0 or more, got {seed}.")
     return seed
 
 
@@ -24,7 +24,7 @@ def positive(number: int, what: str) -> int:
         ProbsceneError: it is 0 or negative.
     """
     if number < 1:
-        raise ProbsceneError(f"Expected a positive number of {what}, actual {number}.")
+        raise ProbsceneError(f"expected a positive number of {what}, got {number}.")
     return number
 
 
@@ -40,7 +40,7 @@ def number_or_all(text: str, what: str) -> int | None:
     if text == "all":
         return None
     if not text.isascii() or not text.isdigit():
-        raise ProbsceneError(f"Expected a number of {what}, or all, actual {text!r}.")
+        raise ProbsceneError(f"expected a number of {what}, or all, got {text!r}.")
     return int(text)
 
 
@@ -55,5 +55,5 @@ def range_given(text: str | None) -> tuple[float, float] | None:
     try:
         low, high = map(float, text.split(","))
     except ValueError:
-        raise ProbsceneError(f"Expected --range LOW,HIGH such as 0,4095, actual {text!r}.") from None
+        raise ProbsceneError(f"expected --range LOW,HIGH such as 0,4095, got {text!r}.") from None
     return low, high

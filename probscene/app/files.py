@@ -57,11 +57,11 @@ def make_folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise DataError(f"Expected a folder at {path}, actual a file in the way; name another folder.") from error
+        raise DataError(f"expected a folder at {path}, got a file in the way; name another folder.") from error
     except OSError as error:
         raise machine_error(error, path) from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise MachineError(f"Expected a folder that can be written, actual {path} is read-only; name another folder.")
+        raise MachineError(f"expected a folder that can be written, got {path} is read-only; name another folder.")
     return path
 
 

@@ -21,9 +21,9 @@ from probscene.errors import ModelError, ProbsceneError, RunError
 from probscene.generator import Command
 from probscene.model import SceneModel
 from probscene.render_check import check_renderer
-from probscene.renderers.generated import GeneratedRenderer
-from probscene.renderers.meshes import MeshRenderer
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.generator.renderer import GeneratedRenderer
+from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.request import Renderable, Request
 from probscene.scenarios import join
 from probscene.world import World
@@ -55,7 +55,7 @@ def load_model(reference: str, assets: Path | str | None = None) -> SceneModel:
         return _with_environment(model)
     if model.with_assets is None:
         raise ModelError(
-            f"Expected a model that can be drawn with a folder of assets, actual {reference!r}, which has no "
+            f"expected a model that can be drawn with a folder of assets, got {reference!r}, which has no "
             "with_assets; leave --assets out."
         )
     return model.with_assets(os.path.abspath(assets))
@@ -123,7 +123,7 @@ def recorded_model(record: dict[str, Any], run: Path) -> SceneModel:
     elsewhere = f"Where they lie elsewhere by now, probscene fit --assets FOLDER --out {run} --resume tells the run so."
     given = record.get("assets_folder")
     if given is not None and not Path(given).exists():
-        raise RunError(f"Expected the assets of the run {run} in {given}, actual nothing there. {elsewhere}")
+        raise RunError(f"expected the assets of the run {run} in {given}, got nothing there. {elsewhere}")
     model = load_model(record["model"], given)
     found = assets_record(model, given)
     if not (drawn_alike(found, record) and record["assets"].endswith(_generator(model))):
@@ -131,8 +131,8 @@ def recorded_model(record: dict[str, Any], run: Path) -> SceneModel:
         changed = now == record["assets"]
         hint = f" {elsewhere}" if "assets_sha256" in record and not changed else ""
         raise RunError(
-            f"Expected model {model.name} to draw with {record['assets'] or 'no assets'}, as when the run {run} was "
-            f"begun, actual {now or 'no assets'}{', changed since' * changed}; put them back, or fit again.{hint}"
+            f"expected model {model.name} to draw with {record['assets'] or 'no assets'}, as when the run {run} was "
+            f"begun, got {now or 'no assets'}{', changed since' * changed}; put them back, or fit again.{hint}"
         )
     return model
 
@@ -165,7 +165,7 @@ def _loaded(reference: str) -> SceneModel:
         return _exported(vars(importlib.import_module(BUILT_IN[base])), base, scenarios)
     if Path(base).suffix != ".py":
         raise ModelError(
-            f"Expected a built-in model ({', '.join(BUILT_IN)}) or a path to a .py file, actual {reference!r}."
+            f"expected a built-in model ({', '.join(BUILT_IN)}) or a path to a .py file, got {reference!r}."
         )
     return _exported(vars(import_file(Path(base))), base, scenarios)
 
@@ -176,6 +176,19 @@ def split_reference(reference: str) -> tuple[str, tuple[str, ...]]:
     if colon and (base in BUILT_IN or base.endswith(".py")):
         return base, tuple(name.strip() for name in names.split(","))
     return str(reference), ()
+
+
+def with_scenarios(reference: str, names: str | None) -> str:
+    """A reference that names scenarios, such as ``"a,b"``; as it is where None.
+
+    Raises:
+        ProbsceneError: it names some already.
+    """
+    if names is None:
+        return reference
+    if split_reference(reference)[1]:
+        raise ProbsceneError(f"expected scenarios once, got {reference} and {names}; leave out --scenarios.")
+    return f"{reference}:{names}"
 
 
 def lasting_reference(reference: str) -> str:
@@ -195,7 +208,7 @@ class _AnyRenderer:
     def __call__(self, drawing: Renderable) -> RenderBatch:
         if isinstance(drawing, Request):
             raise ModelError(
-                "Expected a generator of a model whose program returns scene.request(...), actual none; name what "
+                "expected a generator of a model whose program returns scene.request(...), got none; name what "
                 "draws its scenes: scene_model(..., generator=Command([...]))."
             )
         return (self._meshes if isinstance(drawing, World) else self._sprites)(drawing)
@@ -241,8 +254,8 @@ def renderer_for(model: SceneModel, threads: int | None = None) -> Renderer:
     renderer = model.renderer(model.canvas, threads)
     if not callable(renderer):
         raise ModelError(
-            f"Expected the renderer of model {model.name!r}, called with the canvas and a number of threads, to give "
-            f"what can be called with a drawing, actual {type(renderer).__name__}; see Renderer in probscene.batch."
+            f"expected the renderer of model {model.name!r}, called with the canvas and a number of threads, to give "
+            f"what can be called with a drawing, got {type(renderer).__name__}; see Renderer in probscene.batch."
         )
     return _OwnRenderer(renderer, model.canvas)
 
@@ -258,7 +271,7 @@ def _exported(names: dict, reference: str, wanted: tuple[str, ...] = ()) -> Scen
         return found["MODEL"]
     if len({id(value) for value in found.values()}) != 1:
         raise ModelError(
-            f"Expected {reference} to export one SceneModel, or one named MODEL, actual {sorted(found) or 'none'}."
+            f"expected {reference} to export one SceneModel, or one named MODEL, got {sorted(found) or 'none'}."
         )
     return next(iter(found.values()))
 
@@ -270,13 +283,12 @@ def _named(wanted: tuple[str, ...]) -> str:
 def _joined(scenarios: dict[str, SceneModel], reference: str, wanted: tuple[str, ...]) -> SceneModel:
     if not scenarios:
         raise ModelError(
-            f"Expected SCENARIOS in {reference}, from which {_named(wanted)} are chosen, actual none; name no "
-            "scenarios."
+            f"expected SCENARIOS in {reference}, from which {_named(wanted)} are chosen, got none; name no scenarios."
         )
     unknown = [name for name in wanted if name not in scenarios]
     if unknown or len(set(wanted)) < len(wanted):
         raise ModelError(
-            f"Expected scenarios of {reference} among {', '.join(scenarios)}, each once, actual {_named(wanted)}; name "
+            f"expected scenarios of {reference} among {', '.join(scenarios)}, each once, got {_named(wanted)}; name "
             "them with commas between, or none for all."
         )
     chosen = {name: scenarios[name] for name in wanted or scenarios}

@@ -5,7 +5,7 @@ import ctypes
 TRIM, PAD, MAP = -1, -2, -3  # M_TRIM_THRESHOLD, M_TOP_PAD and M_MMAP_THRESHOLD of glibc's malloc.h
 
 
-def keep_freed_memory() -> None:
+def tune_malloc() -> None:
     """Let glibc keep what is freed; elsewhere nothing happens.
 
     It gives large blocks back to the system at once, and the next batch's tensors, of the same size, come as new pages,

@@ -35,7 +35,7 @@ def import_file(path: Path) -> ModuleType:
     """
     path = Path(path)
     if not path.is_file():
-        raise ModelError(f"Expected a Python file, actual {str(path)!r}, which is not there.")
+        raise ModelError(f"expected a Python file, got {str(path)!r}, which is not there.")
     name = PREFIX + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None

@@ -149,8 +149,8 @@ def _imported(source: Path, package: str, folder: Path) -> set[str]:
                 continue
             names |= {".".join(filter(None, [base, alias.name])) for alias in node.names}
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-            said = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
-            names |= {name for name in map(str, said) if _is_beside(folder, name.partition(".")[0])}
+            arguments = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
+            names |= {name for name in map(str, arguments) if _is_beside(folder, name.partition(".")[0])}
     return names
 
 

@@ -1,7 +1,7 @@
 """The images that a fit learns from: a folder, a list of files, or images in memory."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -9,7 +9,6 @@ from probscene.dataset import ImageFolder, Images
 from probscene.image_array import ImageArray
 from probscene.model import SceneModel
 
-from .labelling.few import FewLabels
 from .progress import Display
 
 Target = Path | str | Sequence[Path | str] | Any
@@ -23,7 +22,7 @@ def open_images(
     show: Display,
     value_range: Sequence[float] | None = None,
 ) -> Images:
-    """Images as a model reads them; what a person should know about them is said.
+    """Images as a model reads them; notes on them are shown.
 
     Args:
         target: a folder, a list of files, or images in memory, see ``ImageArray``; images that are open already.
@@ -39,13 +38,13 @@ def open_images(
         images: Images = ImageFolder(target, model.canvas, model.channels, skip_bad, reading, value_range)
     else:
         images = ImageArray(target, model.canvas, model.channels, value_range)
-    say_notes(images, show)
+    say_notes(images.notes, show)
     return images
 
 
-def say_notes(about: Images | FewLabels, show: Display) -> None:
+def say_notes(notes: Iterable[str], show: Display) -> None:
     """Say what a person should know about images or labels."""
-    for note in about.notes:
+    for note in notes:
         show.say(f"Note: {note}")
 
 

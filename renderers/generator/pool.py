@@ -1,7 +1,7 @@
 """As many processes of one ``Command`` as are asked for, shared by all who draw with it in this process.
 
 A scene goes to whichever worker is free; what it draws does not depend on which. A worker that fails is killed with all
-that it has started, and the scene tried again by a fresh one. At the end of this process all are ended, by a guard
+that it has started, and a fresh one tries the scene again. At the end of this process all are ended, by the reaper
 where it was killed.
 """
 
@@ -20,12 +20,12 @@ from probscene import worker
 from probscene.errors import GeneratorError
 from probscene.generator import Command
 
-from .guard import Guard
-from .kept import Kept
-from .process import Process, log_of, no_room, tail
+from .picture_cache import PictureCache
+from .process import Process, log_of, no_space, tail
+from .reaper import Reaper
 from .reply import Fault, Picture
 
-_LONGEST = 80  # characters of a folder's path: a socket's may have 107
+_MAX_PATH_LENGTH = 80  # characters of a folder's path: a socket's may have 107
 _POOLS: dict[tuple[int, Command], "Pool"] = {}
 _LOCK = threading.Lock()
 _Task = tuple[dict[str, Any], "Future[Picture]"]
@@ -60,20 +60,20 @@ class Pool:
 
     def __init__(self, command: Command):
         self.command, self.closed = command, False
-        self._kept = None if command.keep is None else Kept(Path(command.keep), command)
+        self._cache = None if command.keep is None else PictureCache(Path(command.keep), command)
         self._tasks: SimpleQueue[_Task | None] = SimpleQueue()
         self._processes: dict[int, Process] = {}
         self._threads: list[threading.Thread] = []
         self._lock, self._owner = threading.RLock(), os.getpid()
         try:
             self.folder = Path(tempfile.mkdtemp(prefix="probscene-"))
-            if len(str(self.folder)) > _LONGEST:
+            if len(str(self.folder)) > _MAX_PATH_LENGTH:
                 self.folder.rmdir()
                 self.folder = Path(tempfile.mkdtemp(prefix="probscene-", dir="/tmp"))
             shutil.copyfile(worker.__file__, self.folder / "probscene_worker.py")
-            self._guard = Guard(self.folder)
+            self._reaper = Reaper(self.folder)
         except OSError as error:
-            raise no_room(command, error) from error
+            raise no_space(command, error) from error
         Finalize(None, self.close, exitpriority=1)  # also at the end of a process that multiprocessing has started
 
     def grow(self, workers: int) -> None:
@@ -115,7 +115,7 @@ class Pool:
                 process.kill()
             for _ in self._threads:
                 self._tasks.put(None)
-        self._guard.close()
+        self._reaper.close()
 
     def _work(self, number: int) -> None:
         """One worker's thread."""
@@ -132,10 +132,10 @@ class Pool:
                 future.set_exception(error)
 
     def _drawn(self, record: dict[str, Any], number: int) -> Picture:
-        if self._kept is None:
+        if self._cache is None:
             return self._draw(record, number)
-        if (picture := self._kept.load(record)) is None:
-            self._kept.save(record, picture := self._draw(record, number))
+        if (picture := self._cache.load(record)) is None:
+            self._cache.save(record, picture := self._draw(record, number))
         return picture
 
     def _draw(self, record: dict[str, Any], number: int) -> Picture:
@@ -151,14 +151,14 @@ class Pool:
                 faults.append(f"{fault}\nThe end of what it printed:\n{printed}" if printed else str(fault))
                 self._end(number)
                 continue
-            if process.worn:
+            if process.exceeds_memory:
                 self._end(number)
             return picture
         if self.closed:
             raise GeneratorError(f"The generator {self.command.name} was ended while it drew.")
         raise GeneratorError(
-            f"Expected the generator {self.command.name} to draw the scene of seed {record['seed']} "
-            f"({_contents(record)}), actual, in {len(faults)} attempts: {faults[-1]}"
+            f"expected the generator {self.command.name} to draw the scene of seed {record['seed']} "
+            f"({_contents(record)}), got, in {len(faults)} attempts: {faults[-1]}"
         )
 
     def _process(self, number: int) -> Process:
@@ -168,9 +168,9 @@ class Pool:
             if number in self._processes:
                 return self._processes[number]
             process = self._processes[number] = Process(self.command, self.folder, number)
-            self._guard.started(process.pid)
+            self._reaper.started(process.pid)
         try:
-            process.meet()
+            process.connect()
         except BaseException:
             self._end(number)
             raise
@@ -183,7 +183,7 @@ class Pool:
             process.kill()
             with self._lock:  # only now, as close() kills what is still here
                 self._processes.pop(number, None)
-                self._guard.ended(process.pid)
+                self._reaper.ended(process.pid)
 
 
 def _contents(record: dict[str, Any]) -> str:

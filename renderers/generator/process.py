@@ -13,17 +13,17 @@ from probscene import worker
 from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
 
-from .guard import kill_group
-from .reply import Fault, Picture, read
+from .reaper import kill_group
+from .reply import Fault, Picture, parse_reply
 
-TAIL, LOG = 12, 1 << 20  # lines of a log that are told; bytes after which it starts again
-MOST = 1 << 30  # bytes of an answer
-_LOOK = 0.1  # seconds between two looks at whether a process that has not called still runs
-_TOLD = 4000  # characters
+LOG_LINES, MAX_LOG_BYTES = 12, 1 << 20  # lines of a log in a message; bytes after which the log is emptied
+MAX_REPLY_BYTES = 1 << 30  # bytes of an answer
+_POLL_SECONDS = 0.1  # seconds between two checks that a process which has not connected still runs
+_LOG_CHARACTERS = 4000  # characters
 
 
 class Process:
-    """A worker that was started; it draws once it has been met.
+    """A worker that was started; it draws once it is connected.
 
     Args:
         command: what runs.
@@ -46,7 +46,7 @@ class Process:
             self._log.write_bytes(b"")
             self._listening, address = worker.listening(folder, number)
         except OSError as error:
-            raise no_room(command, error) from error
+            raise no_space(command, error) from error
         self._token = secrets.token_hex(16)
         variables = {worker.SOCKET: address, worker.TOKEN: self._token, "PROBSCENE_WORKER": str(folder)}
         try:
@@ -62,20 +62,20 @@ class Process:
         except OSError as error:
             self._listening.close()
             raise GeneratorError(
-                f"Expected to start the generator {command.name}, actual {error.strerror} for {command.argv[0]!r}; "
-                "mend the argv of its Command."
+                f"expected to start the generator {command.name}, got {error.strerror} for {command.argv[0]!r}; "
+                "fix the argv of its Command."
             ) from error
 
-    def meet(self) -> None:
-        """Wait until it calls and says what it is.
+    def connect(self) -> None:
+        """Wait until it connects and names its protocol and version.
 
         Raises:
             GeneratorError: the program is of another version or protocol.
             Fault: it ended, or did not call ``serve`` in time.
         """
         with self._listening:
-            self._wire = self._called()
-            self._greeted()
+            self._wire = self._accepted()
+            self._handshake()
 
     def draw(self, record: dict[str, Any]) -> Picture:
         """Draw a scene.
@@ -86,21 +86,21 @@ class Process:
         wire = _Timed(self._wire, self.command.timeout)
         try:
             worker.send(wire, record)
-            answer = worker.receive(wire, MOST)
+            answer = worker.receive(wire, MAX_REPLY_BYTES)
         except TimeoutError:
             raise Fault(
                 f"it had drawn nothing after {self.command.timeout:g} seconds; raise timeout= of its Command where a "
-                "scene may take longer, or mend the program"
+                "scene may take longer, or fix the program"
             ) from None
         except (OSError, ValueError) as error:
-            raise Fault(f"{self._ended()}{type(error).__name__}: {error}; mend the program") from error
+            raise Fault(f"{self._ended()}{type(error).__name__}: {error}; fix the program") from error
         if answer is None:
-            raise Fault(f"{self._ended()}it hung up; mend the program")
+            raise Fault(f"{self._ended()}it hung up; fix the program")
         self.drawn += 1
         memory = answer[0].get("memory")
         self.memory = memory if isinstance(memory, float) else 0.0
-        picture = read(record, *answer)
-        if self._log.stat().st_size > LOG:
+        picture = parse_reply(record, *answer)
+        if self._log.stat().st_size > MAX_LOG_BYTES:
             os.truncate(self._log, 0)
         return picture
 
@@ -110,7 +110,7 @@ class Process:
         return self._process.pid
 
     @property
-    def worn(self) -> bool:
+    def exceeds_memory(self) -> bool:
         """Whether it is to be replaced by a fresh one."""
         command = self.command
         too_many = command.restart_after is not None and self.drawn >= command.restart_after
@@ -123,9 +123,9 @@ class Process:
         if hasattr(self, "_wire"):
             self._wire.close()
 
-    def _called(self) -> socket.socket:
-        """The connection to the process, once it has called."""
-        self._listening.settimeout(_LOOK)
+    def _accepted(self) -> socket.socket:
+        """The connection to the process, once it has made it."""
+        self._listening.settimeout(_POLL_SECONDS)
         end = time.monotonic() + self.command.start_timeout
         while True:
             try:
@@ -139,27 +139,27 @@ class Process:
                         "start_timeout= of its Command, or run its argv by hand to see what it waits for"
                     ) from None
 
-    def _greeted(self) -> None:
+    def _handshake(self) -> None:
         try:
             hello = worker.receive(_Timed(self._wire, self.command.start_timeout), 1 << 16)
         except TimeoutError:
             raise Fault(f"it had said nothing {self.command.start_timeout:g} seconds after it called") from None
         except (OSError, ValueError) as error:
-            raise GeneratorError(self._stranger("something else")) from error
+            raise GeneratorError(self._protocol_error("something else")) from error
         if hello is None:
             raise Fault(f"{self._ended()}it hung up")
-        said = hello[0]
-        if said.get("protocol") != worker.PROTOCOL or said.get("token") != self._token:
-            raise GeneratorError(self._stranger(f"protocol {said.get('protocol')!r}"))
-        if self.command.version and said.get("version") != self.command.version:
+        greeting = hello[0]
+        if greeting.get("protocol") != worker.PROTOCOL or greeting.get("token") != self._token:
+            raise GeneratorError(self._protocol_error(f"protocol {greeting.get('protocol')!r}"))
+        if self.command.version and greeting.get("version") != self.command.version:
             raise GeneratorError(
-                f"Expected version {self.command.version!r} of the generator {self.command.name}, actual "
-                f"{said.get('version')!r}; start that one, or change version= of the Command and fit again."
+                f"expected version {self.command.version!r} of the generator {self.command.name}, got "
+                f"{greeting.get('version')!r}; start that one, or change version= of the Command and fit again."
             )
 
-    def _stranger(self, actual: str) -> str:
+    def _protocol_error(self, actual: str) -> str:
         return (
-            f"Expected the generator {self.command.name} to speak protocol {worker.PROTOCOL} of probscene, actual "
+            f"expected the generator {self.command.name} to speak protocol {worker.PROTOCOL} of probscene, got "
             f"{actual}; let it import the file probscene_worker in the folder that PROBSCENE_WORKER names, not a copy."
         )
 
@@ -174,10 +174,10 @@ class Process:
         return f"it ended with status {status}; "
 
 
-def no_room(command: Command, error: OSError) -> MachineError:
+def no_space(command: Command, error: OSError) -> MachineError:
     """What to do where temporary files cannot be written."""
     return MachineError(
-        f"Expected to write temporary files for the generator {command.name}, actual {error.strerror}; make room, or "
+        f"expected to write temporary files for the generator {command.name}, got {error.strerror}; make room, or "
         "set TMPDIR."
     )
 
@@ -190,10 +190,10 @@ def log_of(folder: Path, number: int) -> Path:
 def tail(log: Path) -> str:
     """The end of what a worker has printed; empty where that is nothing."""
     try:
-        printed = log.read_bytes()[-_TOLD:]
+        printed = log.read_bytes()[-_LOG_CHARACTERS:]
     except OSError:
         return ""
-    return "\n".join(printed.decode(errors="replace").splitlines()[-TAIL:])
+    return "\n".join(printed.decode(errors="replace").splitlines()[-LOG_LINES:])
 
 
 class _Timed:

@@ -31,14 +31,14 @@ class Picture(NamedTuple):
     amodal_box: np.ndarray | None
 
 
-def read(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
+def parse_reply(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
     """An answer to ``record``, see ``probscene.worker.packed``.
 
     Raises:
         Fault: it is another one.
     """
     if "error" in reply:
-        raise Fault(f"its render(scene) raised an error; mend the program:\n{reply['error']}")
+        raise Fault(f"its render(scene) raised an error; fix the program:\n{reply['error']}")
     arrays, at = {}, 0
     try:
         for each in reply["arrays"]:
@@ -54,20 +54,20 @@ def read(record: dict[str, Any], reply: dict[str, Any], raw: bytes) -> Picture:
     ids = _array(arrays, "instance", (height, width))
     if ids.size and not (0 <= int(ids.min()) and int(ids.max()) <= most):
         raise Fault(
-            f"expected ids of nodes of the scene in instance, 0 to {most}, actual {int(ids.min())} to {int(ids.max())}"
+            f"expected ids of nodes of the scene in instance, 0 to {most}, got {int(ids.min())} to {int(ids.max())}"
         )
     none = set(range(1, most)) - {node["id"] for node in record["nodes"]}
     if none and (strange := np.isin(ids, list(none))).any():
-        raise Fault(f"expected ids of nodes of the scene in instance, actual {int(ids[strange][0])}, which is of none")
+        raise Fault(f"expected ids of nodes of the scene in instance, got {int(ids[strange][0])}, which is of none")
     depth = _array(arrays, "depth", (height, width)) if "depth" in arrays else None
     if depth is not None and np.isnan(depth).any():
-        raise Fault("expected depth without NaN, actual NaN; infinity where there is sky")
+        raise Fault("expected depth without NaN, got NaN; infinity where there is sky")
     return Picture(image, ids.astype(np.int16), depth, None if boxes is None else _boxes(boxes, most, ids))
 
 
 def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
     if name not in arrays:
-        raise Fault(f"expected {name} of shape {shape}, actual none")
+        raise Fault(f"expected {name} of shape {shape}, got none")
     value, size = arrays[name], int(np.prod(shape))
     if value.ndim == 1 and value.dtype == np.uint8 and size:
         value = value.view(_BYTES.get((name, value.size / size), np.uint8))
@@ -76,7 +76,7 @@ def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> 
     if value.shape != shape or value.dtype.char not in _TYPES[name]:
         kind = {"image": "uint8", "instance": "integers", "depth": "float32"}[name]
         more = "; leave its alpha out" if name == "image" and value.shape[2:] == (4,) else ""
-        raise Fault(f"expected {name} as {kind} {shape}, actual {value.dtype} {value.shape}{more}")
+        raise Fault(f"expected {name} as {kind} {shape}, got {value.dtype} {value.shape}{more}")
     return value
 
 
@@ -91,13 +91,13 @@ def _boxes(boxes: Any, most: int, ids: np.ndarray) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise Fault(
             f"expected amodal_box as a dict of a node's id and x0, y0, x1, y1 in pixels with x0 <= x1 and y0 <= y1, "
-            f"actual {error}"
+            f"got {error}"
         ) from error
     shown = np.setdiff1d(ids, 0)
     empty = shown[(found[shown - 1, 2:] <= found[shown - 1, :2]).any(1)]
     if len(empty):
         raise Fault(
-            f"expected amodal_box of each node that instance shows, larger than 0, actual none of node {empty[0]}; "
+            f"expected amodal_box of each node that instance shows, larger than 0, got none of node {empty[0]}; "
             "give all of them, or none"
         )
     return found

@@ -4,7 +4,7 @@ from ..engine import ti
 from .blur import blur
 from .jpeg import compress
 from .lanes import LANES
-from .tone import JPEG, LATER, NOISE, PHOTO, RADIUS, TONED, Colours, develop, read_bytes, tone_of
+from .tone import JPEG, LATER, NOISE, NUM_COLUMNS, RADIUS, TONED, Colours, develop, read_bytes, tone_of
 
 i32, f32 = ti.i32, ti.f32
 
@@ -68,7 +68,7 @@ def blur_images(
         if j % 512 == 0:
             base, scene = ti.cast(j // 512, i32) * room, ti.atomic_add(queue[0], i32(1))
             while scene < scenes:
-                radius = ti.cast(photos[scene * PHOTO + RADIUS], i32)
+                radius = ti.cast(photos[scene * NUM_COLUMNS + RADIUS], i32)
                 if radius > 0:
                     blur(scene * height * width, height, width, radius, scene * reach, base, weights, image, scratch)
                 scene = ti.atomic_add(queue[0], i32(1))
@@ -93,7 +93,7 @@ def compress_images(
         if j % 512 == 0:
             base, scene = ti.cast(j // 512, i32) * room, ti.atomic_add(queue[0], i32(1))
             while scene < scenes:
-                if photos[scene * PHOTO + JPEG] != 0:
+                if photos[scene * NUM_COLUMNS + JPEG] != 0:
                     first = scene * height * width
                     compress(first, height, width, base, scene * i32(128), steps, cosines, image, scratch)
                 scene = ti.atomic_add(queue[0], i32(1))

@@ -1,12 +1,12 @@
-"""What a camera makes of colours, pixel by pixel: vignette, exposure, gains, saturation and contrast, noise, bytes."""
+"""Camera effects on colours, pixel by pixel: vignette, exposure, gains, saturation and contrast, noise, bytes."""
 
 from ..engine import ti
 from .lanes import LANES, SHIFT, floats, high, low, whole
 
-# Columns of a photo, one row a scene, float64: whether colours change, by what 3 x 3 matrix and bias, what is missing a
-# square pixel from the middle, where that is; noise before the blur and after it, of 1; radius of the blur, pixels;
-# whether there is JPEG.
-TONED, MATRIX, BIAS, VIGNETTE, MIDDLE_U, MIDDLE_V, NOISE, LATER, RADIUS, JPEG, PHOTO = (
+# Columns of the table of effects, one row a scene, float64: whether colours change, by what 3 x 3 matrix and bias, what
+# is missing a square pixel from the middle, where that is; noise before the blur and after it, of 1; radius of the
+# blur, pixels; whether there is JPEG.
+TONED, MATRIX, BIAS, VIGNETTE, MIDDLE_U, MIDDLE_V, NOISE, LATER, RADIUS, JPEG, NUM_COLUMNS = (
     0,
     1,
     10,
@@ -34,8 +34,8 @@ class Colours:
 
 @ti.func
 def tone_of(scene: i32, photos: ti.template()):
-    """The columns of a scene's photo, in registers."""
-    return ti.Vector([ti.cast(photos[scene * PHOTO + i], f32) for i in range(PHOTO)], dt=f32)
+    """A scene's row of the table of effects, in registers."""
+    return ti.Vector([ti.cast(photos[scene * NUM_COLUMNS + i], f32) for i in range(NUM_COLUMNS)], dt=f32)
 
 
 @ti.func

@@ -10,9 +10,9 @@ import numpy as np
 from probscene.errors import ModelError
 from probscene.world import World
 
-from . import tables
-from .atlas import MeshAtlas
 from .scenes import MAX_POSITION, Sight, dot, fit, ground_tables, product, scene_table, view
+from .tables import layout
+from .tables.atlas import MeshAtlas
 
 MAX_NODES, MAX_INSTANCES, MAX_SCALE = 32767, 65535, 1e4
 
@@ -39,8 +39,8 @@ class Placed(NamedTuple):
 class Instances(NamedTuple):
     """The kernel's tables, flat, of at least one row each, and what the host tells about the scenes.
 
-    ``first (N + 1,)`` int32, where each scene's instances begin; ``drawn (N, M)`` bool, which nodes have a label;
-    ``box (N, M, 7)`` float64 as of ``Space``; ``most``: vertices of the largest mesh, and triangles in sight of the
+    ``first (N + 1,)`` int32, where each scene's instances begin; ``drawn (N, M)`` bool, which nodes have a label; ``box
+    (N, M, 7)`` float64 as of ``SceneGeometry``; ``most``: vertices of the largest mesh, and triangles in sight of the
     fullest scene.
     """
 
@@ -71,10 +71,10 @@ def instances(world: World, atlas: MeshAtlas, canvas: tuple[int, int], map_size:
     """
     N, M = world.kind.shape
     if M > MAX_NODES:
-        raise ModelError(f"Expected at most {MAX_NODES} nodes a scene, actual {M}; draw fewer things.")
+        raise ModelError(f"expected at most {MAX_NODES} nodes a scene, got {M}; draw fewer things.")
     classes = names(world)
     if len(classes) > 256:
-        raise ModelError(f"Expected at most 256 classes in a world, actual {len(classes)}; join some of them.")
+        raise ModelError(f"expected at most 256 classes in a world, got {len(classes)}; join some of them.")
     atlas.add(
         [mesh for layer in world.layers for mesh in layer.meshes],
         [] if world.ground is None else list(world.ground.surfaces),
@@ -84,23 +84,23 @@ def instances(world: World, atlas: MeshAtlas, canvas: tuple[int, int], map_size:
     placed = Placed(*(values[order] for values in placed))
     count = np.bincount(placed.scene, minlength=N)
     if len(count) and count.max() > MAX_INSTANCES:
-        raise ModelError(f"Expected at most {MAX_INSTANCES} meshes in a scene, actual {count.max()}; draw fewer.")
+        raise ModelError(f"expected at most {MAX_INSTANCES} meshes in a scene, got {count.max()}; draw fewer.")
 
     sight = view(world)
     rows = max(1, len(order))
-    whole, real = np.zeros((rows, tables.INTEGERS), np.int64), np.zeros((rows, tables.REALS))
+    whole, real = np.zeros((rows, layout.INTEGERS), np.int64), np.zeros((rows, layout.REALS))
     shadow = _fill(whole, real, placed, sight, canvas, map_size)
     first_surface = 1 + len(world.kinds)
     if len(order):
         kind = world.kind.cpu().numpy()[placed.scene, np.maximum(placed.node, 0)] if M else placed.node
         unknown = (placed.node < 0) | (kind < 0)
-        whole[:, tables.SEMANTIC] = np.where(unknown, len(classes) - 1, 1 + kind)
+        whole[:, layout.SEMANTIC] = np.where(unknown, len(classes) - 1, 1 + kind)
     semantic = {name: first_surface + i for i, name in enumerate(classes[first_surface:-1])}
     drawn = np.zeros((N, M), bool)
     labelled = placed.node >= 0
     drawn[placed.scene[labelled], placed.node[labelled]] = True
     in_sight = np.zeros(max(1, N), np.int64)
-    np.add.at(in_sight, placed.scene, (whole[:, tables.TRIANGLES] * whole[:, tables.SEEN])[: len(order)])
+    np.add.at(in_sight, placed.scene, (whole[:, layout.TRIANGLES] * whole[:, layout.SEEN])[: len(order)])
     return Instances(
         whole=whole.ravel(),
         real=real.ravel(),
@@ -109,7 +109,7 @@ def instances(world: World, atlas: MeshAtlas, canvas: tuple[int, int], map_size:
         first=np.searchsorted(placed.scene, np.arange(N + 1)).astype(np.int32),
         drawn=drawn,
         box=_boxes(placed, sight, N, M),
-        most=(int(whole[:, tables.VERTICES].max()), int(in_sight.max())),
+        most=(int(whole[:, layout.VERTICES].max()), int(in_sight.max())),
     )
 
 
@@ -120,7 +120,7 @@ def _placed(world: World, atlas: MeshAtlas) -> Placed:
         for name, value in vars(layer).items():
             if hasattr(value, "shape") and (tuple(value.shape[:2]) != shape or len(shape) != 2):
                 raise ModelError(
-                    f"Expected {name} of layer {i} as (scenes, nodes) = {shape}, actual {tuple(value.shape)}; "
+                    f"expected {name} of layer {i} as (scenes, nodes) = {shape}, got {tuple(value.shape)}; "
                     "make layers with SceneGraph.build."
                 )
         present = layer.present.cpu().numpy()
@@ -130,7 +130,7 @@ def _placed(world: World, atlas: MeshAtlas) -> Placed:
         mesh = layer.mesh.cpu().numpy()[present]
         if mesh.min() < 0 or mesh.max() >= len(layer.meshes):
             raise ModelError(
-                f"Expected meshes of layer {i} in 0..{len(layer.meshes) - 1}, actual {mesh.min()}..{mesh.max()}; "
+                f"expected meshes of layer {i} in 0..{len(layer.meshes) - 1}, got {mesh.min()}..{mesh.max()}; "
                 "choose meshes that it has."
             )
         values = {
@@ -156,17 +156,17 @@ def _placed(world: World, atlas: MeshAtlas) -> Placed:
 def _check(values: dict[str, np.ndarray]) -> None:
     for name, value in values.items():
         if not np.isfinite(value).all():
-            raise ModelError(f"Expected finite {name} in a world, actual NaN or infinity; check the program.")
+            raise ModelError(f"expected finite {name} in a world, got NaN or infinity; check the program.")
     for name in ("x", "y", "z"):
         if (np.abs(values[name]) > MAX_POSITION).any():
             raise ModelError(
-                f"Expected {name} within {MAX_POSITION:g} m, actual {np.abs(values[name]).max():g} away; "
+                f"expected {name} within {MAX_POSITION:g} m, got {np.abs(values[name]).max():g} away; "
                 "check the program's units."
             )
     if not ((values["scale"] > 0) & (values["scale"] <= MAX_SCALE)).all():
         worst = values["scale"].min() if (values["scale"] <= 0).any() else values["scale"].max()
         raise ModelError(
-            f"Expected scales above 0 and at most {MAX_SCALE:g} in a world, actual {worst:g}; bound the scale."
+            f"expected scales above 0 and at most {MAX_SCALE:g} in a world, got {worst:g}; bound the scale."
         )
 
 
@@ -204,28 +204,28 @@ def _fill(whole, real, placed: Placed, sight: Sight, canvas: tuple[int, int], ma
     sides = np.stack([u + 0.5 * z, (width - 0.5) * z - u, v + 0.5 * z, (height - 0.5) * z - v, z], 1)
     u, v, z = image_at[:, 0], image_at[:, 1], image_at[:, 2]
     sides_at = np.stack([u + 0.5 * z, (width - 0.5) * z - u, v + 0.5 * z, (height - 0.5) * z - v, z], 1)
-    seen = (extent(sides, sides_at)[1] >= [0, 0, 0, 0, tables.NEAR]).all(1)
+    seen = (extent(sides, sides_at)[1] >= [0, 0, 0, 0, layout.NEAR]).all(1)
     last = first + map_size / per_metre
     casts = mapped[scene] & (cast_high >= first[scene]).all(1) & (cast_low <= last[scene]).all(1)
 
     lit[:, :2] *= per_metre[scene][..., None]
     lit_at[:, :2] = (lit_at[:, :2] - first[scene]) * per_metre[scene]
-    whole[:, : tables.CLOSED + 1] = placed.rows
+    whole[:, : layout.CLOSED + 1] = placed.rows
     least, largest = ((across - first[scene]) * per_metre[scene] for across in (cast_low, cast_high))
     reach = np.concatenate([np.floor(least) - 1, largest + 1], 1)
     reach = np.clip(reach, [0, 0, -1, -1], [map_size, map_size, map_size - 1, map_size - 1])
-    whole[:, tables.MAP_BOX : tables.MAP_BOX + 4] = np.where(casts[:, None], reach, [0, 0, -1, -1])
-    whole[:, tables.NODE], whole[:, tables.SEEN], whole[:, tables.CASTS] = placed.node, seen, casts
-    real[:, tables.TO_IMAGE : tables.TO_IMAGE + 12] = np.dstack([image, image_at]).reshape(-1, 12)
-    real[:, tables.TO_MAP : tables.TO_MAP + 12] = np.dstack([lit, lit_at]).reshape(-1, 12)
-    real[:, tables.TO_SUN : tables.TO_SUN + 3] = dot(np.swapaxes(turned, 1, 2), sun[:, 2:]) / scale
-    real[:, tables.UNSCALE : tables.UNSCALE + 3] = 1 / scale
-    real[:, tables.TINT : tables.TINT + 3] = np.clip(placed.tint, 0, 1)
+    whole[:, layout.MAP_BOX : layout.MAP_BOX + 4] = np.where(casts[:, None], reach, [0, 0, -1, -1])
+    whole[:, layout.NODE], whole[:, layout.SEEN], whole[:, layout.CASTS] = placed.node, seen, casts
+    real[:, layout.TO_IMAGE : layout.TO_IMAGE + 12] = np.dstack([image, image_at]).reshape(-1, 12)
+    real[:, layout.TO_MAP : layout.TO_MAP + 12] = np.dstack([lit, lit_at]).reshape(-1, 12)
+    real[:, layout.TO_SUN : layout.TO_SUN + 3] = dot(np.swapaxes(turned, 1, 2), sun[:, 2:]) / scale
+    real[:, layout.UNSCALE : layout.UNSCALE + 3] = 1 / scale
+    real[:, layout.TINT : layout.TINT + 3] = np.clip(placed.tint, 0, 1)
     return mapped, first, per_metre
 
 
 def _boxes(placed: Placed, sight: Sight, N: int, M: int) -> np.ndarray:
-    """3D boxes as of ``Space``; several layers of a node share one, turned as the first of them is."""
+    """3D boxes as of ``SceneGeometry``; several layers of a node share one, turned as the first of them is."""
     box = np.zeros((N * M, 7))
     labelled = placed.node >= 0
     scene, at, yaw = placed.scene[labelled], placed.at[labelled], placed.yaw[labelled]

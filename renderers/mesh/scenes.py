@@ -11,8 +11,8 @@ import numpy as np
 from probscene.errors import ModelError
 from probscene.world import World
 
-from . import tables
-from .atlas import MeshAtlas
+from .tables import layout
+from .tables.atlas import MeshAtlas
 
 MAX_POSITION = 1e6  # metres
 SHADOW_RANGE, SHADOW_HEIGHTS = 60.0, 36.0  # shadows fall as far as this, metres, and as many heights of the camera
@@ -59,9 +59,9 @@ def view(world: World) -> Sight:
     yaw, pitch, roll = numbers(world.camera, "yaw", "pitch", "roll")
     eye = np.stack([x, y, z], 1)
     if not (np.isfinite([*eye.T, yaw, pitch, roll, u, v, focal]).all() and (np.abs(eye) <= MAX_POSITION).all()):
-        raise ModelError(f"Expected finite cameras within {MAX_POSITION:g} m, actual others; check its units.")
+        raise ModelError(f"expected finite cameras within {MAX_POSITION:g} m, got others; check its units.")
     if not (focal > 0).all():
-        raise ModelError(f"Expected a positive focal length in pixels, actual {focal.min():g}.")
+        raise ModelError(f"expected a positive focal length in pixels, got {focal.min():g}.")
     zero = np.zeros_like(yaw)
     level = np.stack([np.cos(yaw), np.sin(yaw), zero], 1)
     right = np.stack([np.sin(yaw), -np.cos(yaw), zero], 1)
@@ -129,34 +129,34 @@ def fit(sight: Sight, canvas: tuple[int, int], size: int, low, high, cast_low, c
 
 def scene_table(world: World, sight: Sight, shadow: tuple[np.ndarray, ...]) -> np.ndarray:
     """``(N, SCENE)`` float64, at least one row; ``shadow`` is what ``fit`` returned."""
-    table = np.zeros((max(1, len(world)), tables.SCENE))
+    table = np.zeros((max(1, len(world)), layout.SCENE))
     rows, light = table[: len(world)], world.light
-    rows[:, tables.RAY : tables.RAY + 9] = sight.ray.reshape(-1, 9)
-    rows[:, tables.EYE : tables.EYE + 3] = sight.eye
+    rows[:, layout.RAY : layout.RAY + 9] = sight.ray.reshape(-1, 9)
+    rows[:, layout.EYE : layout.EYE + 3] = sight.eye
     if world.ground is not None:
-        rows[:, tables.GROUNDED] = sight.eye[:, 2] > 0
-        (rows[:, tables.OFFSET],) = numbers(world.ground, "offset")
-    lights = rows[:, tables.LIGHT :]
-    focal, lights[:, tables.LENS + 1], lights[:, tables.LENS + 2] = numbers(
+        rows[:, layout.GROUNDED] = sight.eye[:, 2] > 0
+        (rows[:, layout.OFFSET],) = numbers(world.ground, "offset")
+    lights = rows[:, layout.LIGHT :]
+    focal, lights[:, layout.LENS + 1], lights[:, layout.LENS + 2] = numbers(
         world.camera, "focal", "centre_x", "centre_y"
     )
-    lights[:, tables.LENS] = 1 / focal
+    lights[:, layout.LENS] = 1 / focal
     (exposure,) = numbers(world.photo, "exposure")
     sun, ambient, haze, zenith, horizon = numbers(light, "sun", "ambient", "haze", "zenith", "horizon")
-    rows[:, tables.SUN_UP] = sight.sun[:, 2, 2]
-    lights[:, tables.SUN] = np.where(sight.sun[:, 2, 2] > 0, sun, 0) * exposure
-    lights[:, tables.AMBIENT], lights[:, tables.HAZE] = ambient * exposure, haze
-    lights[:, tables.HORIZON : tables.HORIZON + 3] = horizon * exposure[:, None]
-    lights[:, tables.MORE : tables.MORE + 3] = (zenith - horizon) * exposure[:, None]
-    lights[:, tables.CLIMB : tables.CLIMB + 3] = sight.ray[:, 2]
+    rows[:, layout.SUN_UP] = sight.sun[:, 2, 2]
+    lights[:, layout.SUN] = np.where(sight.sun[:, 2, 2] > 0, sun, 0) * exposure
+    lights[:, layout.AMBIENT], lights[:, layout.HAZE] = ambient * exposure, haze
+    lights[:, layout.HORIZON : layout.HORIZON + 3] = horizon * exposure[:, None]
+    lights[:, layout.MORE : layout.MORE + 3] = (zenith - horizon) * exposure[:, None]
+    lights[:, layout.CLIMB : layout.CLIMB + 3] = sight.ray[:, 2]
     mapped, first, per_metre = shadow
-    rows[:, tables.TEXEL] = np.sqrt(1 / per_metre[:, 0] ** 2 + 1 / per_metre[:, 1] ** 2)
-    lights[:, tables.SHADOWED] = mapped & (lights[:, tables.SUN] > 0)
-    on_map = lights[:, tables.ON_MAP : tables.ON_MAP + 12].reshape(-1, 3, 4)
+    rows[:, layout.TEXEL] = np.sqrt(1 / per_metre[:, 0] ** 2 + 1 / per_metre[:, 1] ** 2)
+    lights[:, layout.SHADOWED] = mapped & (lights[:, layout.SUN] > 0)
+    on_map = lights[:, layout.ON_MAP : layout.ON_MAP + 12].reshape(-1, 3, 4)
     on_map[:, :, 1:] = product(sight.sun, sight.ray)
     on_map[:, :2, 1:] *= per_metre[..., None]
     on_map[:, :2, 0] = -first * per_metre
-    lights[:, tables.ON_MAP : tables.ON_MAP + 12] = on_map.reshape(-1, 12)
+    lights[:, layout.ON_MAP : layout.ON_MAP + 12] = on_map.reshape(-1, 12)
     return table
 
 

@@ -51,13 +51,13 @@ def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int], coloured:
     """
     shape = tuple(drawing.kind.shape)
     if shape[1] > MAX_NODES:
-        raise ModelError(f"Expected at most {MAX_NODES} nodes a scene, actual {shape[1]}; draw fewer things.")
+        raise ModelError(f"expected at most {MAX_NODES} nodes a scene, got {shape[1]}; draw fewer things.")
     for i, layer in enumerate(drawing.layers):
         for name, value in vars(layer).items():
             expected = shape if layer.labelled else tuple(layer.present.shape)
             if isinstance(value, torch.Tensor) and tuple(value.shape[:2]) != expected:
                 raise ModelError(
-                    f"Expected {name} of layer {i} as (scenes, nodes) = {expected}, actual {tuple(value.shape)}; "
+                    f"expected {name} of layer {i} as (scenes, nodes) = {expected}, got {tuple(value.shape)}; "
                     "make layers with probscene.drawing.resolve."
                 )
     present = _joined(drawing, "present")
@@ -90,17 +90,17 @@ def _columns(drawing: Drawing) -> np.ndarray:
 def _check(values: dict[str, np.ndarray]) -> None:
     for name in _REAL:
         if not np.isfinite(values[name]).all():
-            raise ModelError(f"Expected finite {name} in a drawing, actual NaN or infinity; check the program.")
+            raise ModelError(f"expected finite {name} in a drawing, got NaN or infinity; check the program.")
     for name in ("x", "y"):
         if (np.abs(values[name]) > MAX_POSITION).any():
             raise ModelError(
-                f"Expected {name} within {MAX_POSITION} pixels, actual {np.abs(values[name]).max():g} away; "
+                f"expected {name} within {MAX_POSITION} pixels, got {np.abs(values[name]).max():g} away; "
                 "check the program's units."
             )
     for name in ("scale_x", "scale_y"):
         if (values[name] <= 0).any():
             raise ModelError(
-                f"Expected a positive {name} in a drawing, actual {values[name].min():g}; "
+                f"expected a positive {name} in a drawing, got {values[name].min():g}; "
                 "draw scales, widths and radii above 0."
             )
 
@@ -146,8 +146,8 @@ def _fill(whole, real, values, layer, drawing, sheet, canvas, coloured) -> None:
     if too_large.any():
         worst = int(too_large.argmax())
         raise ModelError(
-            f"Expected sprites whose boxes cover at most {most} pixels, {MAX_CANVASES} canvases, "
-            f"actual one of {2 * half_x[worst]:.4g} by {2 * half_y[worst]:.4g} pixels; bound the scale."
+            f"expected sprites whose boxes cover at most {most} pixels, {MAX_CANVASES} canvases, "
+            f"got one of {2 * half_x[worst]:.4g} by {2 * half_y[worst]:.4g} pixels; bound the scale."
         )
     x0, y0 = np.floor(middle_x - half_x - 0.5), np.floor(middle_y - half_y - 0.5)
     x1, y1 = np.ceil(middle_x + half_x + 0.5), np.ceil(middle_y + half_y + 0.5)
@@ -181,7 +181,7 @@ def _variants(sprite, level, magnified, layer, drawing, sheet) -> tuple[Variant[
         index = sprite[mine].astype(np.int64)
         if index.min() < 0 or index.max() >= len(atlas):
             raise ModelError(
-                f"Expected sprites of layer {i} in 0..{len(atlas) - 1}, actual {index.min()}..{index.max()}; "
+                f"expected sprites of layer {i} in 0..{len(atlas) - 1}, got {index.min()}..{index.max()}; "
                 "choose sprites that its atlas has."
             )
         found[mine] = sheet.find(atlas, index, level[mine], magnified[mine].astype(np.int64))

@@ -103,7 +103,7 @@ class Sheet:
     def _store(self, words: np.ndarray) -> int:
         offset, self._used = self._used, self._used + words.size
         if self._used > _MOST:
-            raise ModelError(f"Expected at most {_MOST} texels in one drawing, actual more; draw fewer.")
+            raise ModelError(f"expected at most {_MOST} texels in one drawing, got more; draw fewer.")
         if self._used > self.texels.size:
             size = min(max(2 * self.texels.size, self._used), _MOST)
             self.texels, self.colours = (np.resize(kept, size) for kept in (self.texels, self.colours))

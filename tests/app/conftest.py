@@ -12,19 +12,22 @@ from typer.testing import CliRunner
 from probscene.app.cli import app
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import counts_of_dataset
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
+from probscene.inference.features.pretrained import EfficientNetLite
 
 DISCS = Path(__file__).with_name("discs.py")
-SHORT = {
-    "count.steps": 48,
-    "count.images": 4,
-    "count.crops": 4,
-    "width": "4,8,8",
-    "pretrain_derivations": 100,
-    "pretrain_epochs": 2,
-    "batches": 4,
-    "num_scenes": 30,
+STRUCTURE = {
+    "features.schedule.steps": 48,
+    "features.schedule.images": 4,
+    "features.schedule.crops": 4,
+    "features.width": "4,8,8",
+    "pretrain.derivations": 100,
+    "pretrain.epochs": 2,
+    "structure.batches": 4,
+    "structure.num_scenes": 30,
+}
+PARAMETERS = {
     "parameters.reader_steps": 6,
     "parameters.reader_images": 4,
     "parameters.steps": 4,
@@ -34,15 +37,16 @@ SHORT = {
     "parameters.energy_steps": 2,
     "parameters.energy_scenes": 6,
 }
-WORDS = ["--preset", "quick", "--threads", "1", "--no-cache", "--no-verdict"]
+# With the features named, a fit does not ask whether its target looks like renders: 320 images through EfficientNet.
+WORDS = ["--preset", "quick", "--features", "count", "--threads", "1", "--no-cache", "--no-verdict"]
 
 
 def _without(*begins: str) -> list[str]:
-    left = {key: value for key, value in SHORT.items() if not key.startswith(begins)}
+    left = {key: value for key, value in (STRUCTURE | PARAMETERS).items() if not key.startswith(begins)}
     return [*WORDS, *(word for key, value in left.items() for word in ("--set", f"{key}={value}"))]
 
 
-SETTINGS = _without()
+SETTINGS = [*_without("parameters"), "--learn", "structure"]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -54,12 +58,13 @@ def _own_cache(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _few_images_are_looked_at():
-    """By a verdict."""
+@pytest.fixture(scope="module", autouse=True)
+def _few_and_small_images_are_looked_at():
+    """By a verdict; EfficientNet takes a fifth of the pixels, which tells these models' scenes apart as well."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("probscene.app.judging.looked.IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.judge.SCENES", 60)
+        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
+        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
         yield
 
 
@@ -88,9 +93,10 @@ def idx_folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def discs() -> SimpleNamespace:
-    """``file``: a model; ``settings``: words that make a fit of it short; ``short``: the preset's fields among them;
-    ``without``: the words without those of fields that begin so, for fits that do not read them."""
-    return SimpleNamespace(file=DISCS, settings=SETTINGS, short=SHORT, without=_without)
+    """``file``: a model; ``settings``: words that make a fit of its structure short; ``short``: the preset's fields
+    among them; ``parameters``: further ones that make a fit of parameters short; ``without``: words of such a fit,
+    without those of fields that begin so, for fits that do not read them."""
+    return SimpleNamespace(file=DISCS, settings=SETTINGS, short=STRUCTURE, parameters=PARAMETERS, without=_without)
 
 
 @pytest.fixture(scope="session")

@@ -67,19 +67,9 @@ def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, d
     folder = copied(target, tmp_path / "images", 40)
     spoil_corrupt(folder)
     Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(folder / "small.png")
-    words = [
-        "fit",
-        discs.file,
-        "--target",
-        folder,
-        "--out",
-        tmp_path / "run",
-        *discs.without("parameters"),
-        "--learn",
-        "structure",
-    ]
-    words += ["--set", "batches=1"]
-    result = call(*words, "--skip-bad", "--set", "count.steps=16")
+    unnamed = [word for word in discs.settings if word not in ("--features", "count")]  # so that the fit asks for it
+    words = ["fit", discs.file, "--target", folder, "--out", tmp_path / "run", *unnamed, "--set", "structure.batches=1"]
+    result = call(*words, "--skip-bad", "--set", "features.schedule.steps=16")
     assert result.code == 0, result.err
     assert result.err.count("000003.png") == 1 and result.err.count("resized to 64x64") == 1
     lines = [line for line in result.err.splitlines() if not line.startswith(("Note: ", "Warning: "))]
@@ -95,14 +85,18 @@ def test_images_that_no_distribution_can_be_learnt_from(call, discs, target, tmp
     for i in range(50):
         shutil.copy(target.images / "000000.png", same / f"{i}.png")
     out = tmp_path / "run"
-    check_fault(call("fit", discs.file, "--target", few, "--out", out), 2, "at least 40 images", "actual 39")
+    check_fault(call("fit", discs.file, "--target", few, "--out", out), 2, "at least 40 images", "got 39")
     check_fault(call("fit", discs.file, "--target", same, "--out", out), 2, "images that differ", "50 that are all the")
     assert not out.exists()
 
 
 @pytest.mark.parametrize(
     ("setting", "where"),
-    [("count.learning_rate=1e38", "at step"), ("pretrain_rate=1e37", "epoch "), ("learning_rate=1e37", "At batch ")],
+    [
+        ("features.schedule.learning_rate=1e38", " steps "),
+        ("pretrain.learning_rate=1e37", "epoch "),
+        ("structure.learning_rate=1e37", "At batch "),
+    ],
 )
 def test_what_is_no_longer_finite_stops_with_the_step_and_a_remedy(call, discs, target, tmp_path, setting, where):
     out = tmp_path / "run"

@@ -12,9 +12,8 @@ from PIL import Image
 
 import probscene
 from probscene.app.cli.options import PresetName
-from probscene.app.fitting import fit
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.preset import OBJECTIVES
+from probscene.app.fitting import pipeline as fit
+from probscene.app.fitting.config import DIVERGENCES
 from probscene.app.fitting.presets import PRESETS, QUICK
 from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES
@@ -49,8 +48,8 @@ def test_version_and_help(call):
 
 def test_presets_are_those_of_the_library():
     assert [str(name) for name in PresetName] == list(PRESETS)
-    assert {override(QUICK, [f"objective={name}"]).objective for name in OBJECTIVES} == set(OBJECTIVES)
-    assert {override(QUICK, [f"guide={name}"]).guide for name in GUIDES} == set(GUIDES)
+    assert {QUICK.set(f"divergence={name}").divergence_name for name in DIVERGENCES} == set(DIVERGENCES)
+    assert {QUICK.set(f"guide={name}").guide.kind for name in GUIDES} == set(GUIDES)
 
 
 def test_check_says_what_a_person_should_know(call, discs):
@@ -73,10 +72,11 @@ def test_preview_of_a_prior_and_of_a_run(call, discs, fitted, tmp_path):
 
 def test_a_fit_leaves_a_run_that_says_how_it_was_made(fitted, discs, target, call):
     record = json.loads((fitted / "run.json").read_text())
-    assert record["preset"]["count"]["steps"] == 48 and record["preset"]["width"] == [4, 8, 8]
+    features = record["config"]["features"]
+    assert features["schedule"]["steps"] == 48 and features["width"] == [4, 8, 8]
     assert record["seed"] == 0 and record["target"] == str(target.images) and record["model"] == str(discs.file)
     log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
-    assert [line.get("step", line.get("batch")) for line in log] == [16, 32, 48, 1, 2, 3, 4, 6]
+    assert [line.get("step", line.get("batch")) for line in log] == [16, 32, 48, 1, 2, 3, 4]
     assert set(json.loads((fitted / "timing.json").read_text())) >= {"reading", "features", "target", "structure"}
     again = call("fit", "--resume", "--out", fitted)
     assert again.code == 0 and again.err == ""
@@ -96,7 +96,7 @@ MODELS = {
     "syntax": ("def f(:\n", "does not import: SyntaxError"),
     "import": ("import nothing_of_this_name\n", "ModuleNotFoundError"),
     "raises": ("1 / 0\n", "ZeroDivisionError"),
-    "none": ("x = 1\n", "actual none"),
+    "none": ("x = 1\n", "got none"),
     "two": (GOOD + "\nOTHER = target(1)\nMODEL2 = MODEL\ndel MODEL\n", "to export one SceneModel"),
     "undefined": (GOOD.replace("red | blue\n", "red | Blue\n"), "Undefined nonterminal: Blue"),
     "unreachable": (GOOD.replace("| blue\n", "| blue\n    Lost -> lost\n", 1), "Unreachable nonterminal: Lost"),
@@ -138,7 +138,7 @@ def test_runs_that_cannot_be_read(call, fitted, target, tmp_path):
     record = json.loads((fitted / "run.json").read_text())
     runs = {
         "other": (json.dumps(record | {"format": 0, "version": "0.0.1"}), "another version of probscene (0.0.1)"),
-        "damaged": ("{", "actual something else"),
+        "damaged": ("{", "got something else"),
     }
     for name, (text, part) in runs.items():
         (tmp_path / name).mkdir()
@@ -170,14 +170,14 @@ def test_resume_takes_the_settings_of_the_run_or_none(call, discs, fitted, targe
     same = [discs.file, "--target", target.images, *discs.settings, "--seed", 0]
     assert call(*words, *same).code == 0
     for other, *parts in (
-        (["multi_mnist"], "Expected the model"),
-        (["--target", tmp_path], "Expected PNG, JPEG or TIFF images in", "an empty folder"),
-        (["--seed", 1], "(0), actual 1"),
+        (["multi_mnist"], "expected the model"),
+        (["--target", tmp_path], "expected PNG, JPEG or TIFF images in", "an empty folder"),
+        (["--seed", 1], "(0), got 1"),
         (["--threads", 7], "threads"),
         (["--skip-bad"], "skip_bad"),
-        ([*discs.settings, "--set", "batches=5"], "batches", "(4), actual 5"),
-        ([*discs.settings, "--objective", "mmd"], "(kde), actual mmd"),
-        ([*discs.settings, "--guide", "pcfg"], "the guide", "(lstm), actual pcfg"),
+        ([*discs.settings, "--set", "structure.batches=5"], "batches", "(4), got 5"),
+        ([*discs.settings, "--divergence", "mmd"], "the divergence.kind", "(KDELogRatio), got MMD"),
+        ([*discs.settings, "--guide", "pcfg"], "the guide.kind", "(LSTMConfig), got PCFGConfig"),
     ):
         check_fault(call(*words, *other), 2, *parts)
 
@@ -195,7 +195,7 @@ def test_numbers_out_of_range(call, discs, fitted, target, tmp_path):
         check_fault(call(*fitting, "--threads", number), 2, "threads")
     check_fault(call(*fitting, "--seed", -1), 2, "seed of 0 or more")
     check_fault(call("generate", fitted, "--num", 1, "--out", out, "--format", "voc"), 2, "'voc'")
-    check_fault(call("fit", "--out", out), 2, "Expected MODEL and --target")
+    check_fault(call("fit", "--out", out), 2, "expected a model and target images (MODEL and --target DIR)")
     assert not out.exists()
 
 
@@ -208,13 +208,26 @@ def test_what_typer_refuses_exits_with_2(call, discs, tmp_path):
 
 @pytest.mark.parametrize(
     "setting, part",
-    [("batches", "key=value"), ("batches=x", "batches=<int>"), ("speed=1", "among features,"), ("width=1,2", "width="),
-     ("count=3", "count.steps"), ("count.speed=1", "of count among steps"), ("batches.x=1", "batches=..."),
-     ("cosine=5", "cosine=<bool>"), ("count.steps=1.5", "count.steps=<int>"), ("num_scenes=1", "at least 2"),
-     ("batches=-1", "at least 0"), ("learning_rate=0", "above 0"), ("count.whole=-1", "at least 0"),
-     ("variance=nan", "above 0"), ("objective=kl", "kde, js"), ("guide=hmm", "lstm, pcfg"),
-     ("num_scenes=none", "num_scenes=<int>")],
-)  # fmt: skip
+    [
+        ("batches", "key=value"),
+        ("structure.batches=x", "structure.batches=<int>"),
+        ("speed=1", "among features,"),
+        ("features.width=1,2", "features.width="),
+        ("features=count=3", "among count,"),
+        ("features.schedule.speed=1", "CountSchedule) among steps"),
+        ("structure.batches.x=1", "no setting of structure.batches"),
+        ("structure.cosine=5", "structure.cosine=<bool>"),
+        ("features.schedule.steps=1.5", "features.schedule.steps=<int>"),
+        ("structure.num_scenes=1", "at least 2"),
+        ("structure.batches=-1", "at least 0"),
+        ("structure.learning_rate=0", "above 0"),
+        ("features.schedule.whole=-1", "at least 0"),
+        ("divergence.variance=nan", "above 0"),
+        ("divergence=kl", "kde, js"),
+        ("guide=hmm", "lstm, pcfg"),
+        ("structure.num_scenes=none", "structure.num_scenes=<int>"),
+    ],
+)
 def test_wrong_settings(setting, part, call, discs, target, tmp_path):
     words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--set", setting]
     check_fault(call(*words), 2, part)
@@ -222,18 +235,21 @@ def test_wrong_settings(setting, part, call, discs, target, tmp_path):
 
 
 def test_settings_change_what_they_name_and_nothing_else():
-    settings = ["batches=2", "count.steps=32", "width=8,16,32", "variance=none", "cosine=false", "learning_rate=1e-3"]
-    changed = override(QUICK, settings)
-    assert (changed.batches, changed.count.steps, changed.width) == (2, 32, (8, 16, 32))
-    assert (changed.variance, changed.cosine, changed.learning_rate) == (None, False, 1e-3)
-    back = override(
-        changed,
-        [f"batches={QUICK.batches}", f"count.steps={QUICK.count.steps}", f"width={QUICK.width}", "cosine=true",
-         f"variance={QUICK.variance}", f"learning_rate={QUICK.learning_rate}"],
-    )  # fmt: skip
-    assert back == QUICK
+    before = QUICK.for_renders()
+    settings = {
+        "structure.batches": 2,
+        "features.schedule.steps": 32,
+        "features.width": (8, 16, 32),
+        "divergence.variance": None,
+        "structure.cosine": False,
+        "structure.learning_rate": 1e-3,
+    }
+    changed = before.set(settings)
+    found = changed.flat()
+    assert {key: tuple(found[key]) if isinstance(found[key], list) else found[key] for key in settings} == settings
+    assert changed.set({key: before.flat()[key] for key in settings}) == before
     with pytest.raises(ProbsceneError):
-        override(QUICK, ["=1"])
+        QUICK.set("=1")
 
 
 def test_another_target_is_refused_on_resuming(call, discs, target, tmp_path, monkeypatch):

@@ -6,21 +6,35 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from probscene.app import demo as module
-from probscene.app.demo import demo
-from probscene.app.fitting import fit
-from probscene.app.fitting.overrides import override
+from probscene.app.api import demo as module
+from probscene.app.api.demo import demo
+from probscene.app.evaluation import source_features
+from probscene.app.fitting import pipeline as fit
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
-from probscene.app.judging import looked
 from probscene.errors import DataError, ModelError
 
-SHORT = override(
-    QUICK, ["count.steps=16", "count.images=4", "count.crops=4", "width=4,8,8", "batches=2", "num_scenes=20",
-            "pretrain_derivations=50", "pretrain_epochs=1", "parameters.reader_steps=4", "parameters.rounds=1",
-            "parameters.steps=2", "parameters.round_reader_steps=2", "parameters.round_steps=2",
-            "parameters.energy_steps=2", "parameters.energy_scenes=6"]
-)  # fmt: skip
+SHORT = QUICK.set(
+    {
+        "features.schedule.steps": 16,
+        "features.schedule.images": 4,
+        "features.schedule.crops": 4,
+        "features.width": (4, 8, 8),
+        "structure.batches": 2,
+        "structure.num_scenes": 20,
+        "pretrain.derivations": 50,
+        "pretrain.epochs": 1,
+        "parameters.reader_steps": 4,
+        "parameters.rounds": 1,
+        "parameters.steps": 2,
+        "parameters.round_reader_steps": 2,
+        "parameters.round_steps": 2,
+        "parameters.energy_steps": 2,
+        "parameters.energy_scenes": 6,
+    }
+)
+ONE_THREAD = Execution(threads=1)
 
 
 def contents(folder: Path) -> dict[Path, tuple[bytes, int]]:
@@ -30,10 +44,10 @@ def contents(folder: Path) -> dict[Path, tuple[bytes, int]]:
 
 def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     out = tmp_path / "demo"
-    monkeypatch.setattr(looked, "IMAGES", 40)
+    monkeypatch.setattr(source_features, "NUM_IMAGES", 40)
 
     def go():
-        demo(out, 0, str(discs.file), SHORT, images=40, num=5, threads=1)
+        demo(out, 0, str(discs.file), SHORT, images=40, num=5, execution=ONE_THREAD)
 
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -69,7 +83,7 @@ def test_a_folder_of_another_seed_and_a_model_without_a_target(discs, tmp_path):
     module.generate_scenes(module.load_model(str(discs.file)).target(0), module.load_model(str(discs.file)).prior, 40,
                            tmp_path / "demo" / "target", 0, "images")  # fmt: skip
     with pytest.raises(DataError, match="seed 0.*seed 1"):
-        demo(tmp_path / "demo", 1, str(discs.file), SHORT, images=40, num=5, threads=1)
+        demo(tmp_path / "demo", 1, str(discs.file), SHORT, images=40, num=5, execution=ONE_THREAD)
     plates = Path(__file__).with_name("plates.py")
     with pytest.raises(ModelError, match="has none"):
         demo(tmp_path / "other", 0, str(plates), SHORT)

@@ -30,27 +30,76 @@ def test_tabletop_is_fitted_and_generated(call, discs, photos, tmp_path):
     assert (dataset / "annotations.json").is_file()
 
 
+FEW_RENDERS = ["--set", "features.images=40", "--set", "features.epochs=1"]
+FEW_COUNTS = ["--features", "count", "--set", "features.schedule.steps=16", "--set", "features.width=4,8,8"]
+
+
 @pytest.mark.parametrize(
     "words",
     [
-        ["--preset", "paper", "--set", "presence_images=40", "--set", "presence_epochs=1", "--set", "num_real=10"],
-        ["--preset", "paper-aerial", "--set", "presence_images=40", "--set", "presence_epochs=1"],
-        ["--preset", "paper-driving", "--features", "efficientnet", "--set", "num_real=10"],
-        ["--preset", "quick", "--objective", "mmd", "--set", "count.steps=16", "--set", "width=4,8,8"],
-        ["--preset", "quick", "--set", "num_latents=3", "--set", "count.steps=16", "--set", "width=4,8,8"],
-        ["--preset", "quick", "--guide", "pcfg", "--set", "count.steps=16", "--set", "width=4,8,8"],
-        ["--preset", "quick", "--guide", "grammar-vae", "--set", "count.steps=16", "--set", "width=4,8,8"],
+        [
+            "--preset",
+            "paper",
+            "--set",
+            "features.images=40",
+            "--set",
+            "features.epochs=1",
+            "--set",
+            "structure.num_real=10",
+        ],
+        ["--preset", "paper-aerial", *FEW_RENDERS],
+        ["--preset", "paper-driving", "--features", "efficientnet", "--set", "structure.num_real=10"],
+        [
+            "--preset",
+            "quick",
+            "--divergence",
+            "mmd",
+            "--set",
+            "features.schedule.steps=16",
+            "--set",
+            "features.width=4,8,8",
+        ],
+        [
+            "--preset",
+            "quick",
+            "--set",
+            "guide.num_latents=3",
+            "--set",
+            "features.schedule.steps=16",
+            "--set",
+            "features.width=4,8,8",
+        ],
+        [
+            "--preset",
+            "quick",
+            "--guide",
+            "pcfg",
+            "--set",
+            "features.schedule.steps=16",
+            "--set",
+            "features.width=4,8,8",
+        ],
+        [
+            "--preset",
+            "quick",
+            "--guide",
+            "grammar-vae",
+            "--set",
+            "features.schedule.steps=16",
+            "--set",
+            "features.width=4,8,8",
+        ],
     ],
     ids=["paper", "paper-aerial", "paper-driving", "mmd", "latents", "pcfg", "grammar-vae"],
 )
 def test_other_presets_and_objectives_run(words, call, photos, tmp_path):
     few = (
-        "pretrain_derivations=100",
-        "batches=2",
-        "num_scenes=20",
-        "learning_rate=1e-3",
-        "prior_if_worse=false",
-        "learn=structure",
+        "pretrain.derivations=100",
+        "structure.batches=2",
+        "structure.num_scenes=20",
+        "structure.learning_rate=1e-3",
+        "fallback_to_prior=false",
+        "parameters=none",
     )
     few = [word for setting in few for word in ("--set", setting)]
     out = ["--target", photos, "--out", tmp_path / "run", "--threads", 1, "--no-verdict"]
@@ -58,6 +107,6 @@ def test_other_presets_and_objectives_run(words, call, photos, tmp_path):
     assert done.code == 0, done.err
     run = RunFolder.at(tmp_path / "run")
     guide = "lstm" if "--guide" not in words else words[words.index("--guide") + 1]
-    assert run.record["guide"]["kind"] == run.record["preset"]["guide"] == guide
-    assert len(getattr(run.guide, "latents", [0])) == run.record["preset"]["num_latents"]
-    assert run.record["preset"]["objective"] == ("mmd" if "mmd" in words else "kde")
+    assert run.config.guide.kind == guide
+    assert len(getattr(run.guide, "latents", [0])) == getattr(run.config.guide, "num_latents", 1)
+    assert run.config.divergence_name == ("mmd" if "mmd" in words else "kde")

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CHILD = """
 import os, signal, sys
 from probscene.app import cli, files
-from probscene.app.fitting import storage as checkpoints
+from probscene.app.fitting import store as checkpoints
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so its children
 kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
@@ -24,7 +24,7 @@ def at_once():
     if line[0].get("stage") == stage and line[0].get("step", line[0].get("batch")) >= number:
         os.kill(os.getpid(), kind)
 
-keep = checkpoints.Keeper.__call__
+keep = checkpoints.Checkpointer.__call__
 def keeping(self, said):
     line[0] = said
     keep(self, said)
@@ -36,7 +36,7 @@ def replacing(source, path):  # the worst moment: the log is ahead, the checkpoi
         at_once()
     replace(source, path)
 
-checkpoints.Keeper.__call__, os.replace = keeping, replacing
+checkpoints.Checkpointer.__call__, os.replace = keeping, replacing
 del sys.argv[1:4]
 cli.main()
 """

@@ -13,16 +13,16 @@ import torch
 from PIL import Image
 
 from probscene.app.arguments import range_given
-from probscene.app.fitting import session
-from probscene.app.fitting.fit import open_target
-from probscene.app.fitting.preset import Preset
+from probscene.app.fitting.begin import FitRequest, ModelFile, TargetImages, begin, resume
+from probscene.app.fitting.pipeline import open_target
+from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.sheet import write_sheet
+from probscene.app.labels.sheet import write_sheet
 from probscene.app.progress import Display
 from probscene.app.trial.jobs import Job
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures
-from probscene.app.trial.trial import trial
+from probscene.app.trial.trial import TrialOptions, trial
 from probscene.dataset import ImageFolder
 from probscene.decoding import read_rgb
 from probscene.errors import DataError, ProbsceneError, RunError
@@ -178,7 +178,7 @@ def test_all_refuse_the_same_files(tmp_path, name):
         with pytest.raises(DataError, match=rf"{name}.*{fault}"):
             reader(tmp_path / name)
     if not name.startswith(("web", "moving")):
-        said = f"Expected image 0 .*actual one that {fault}"
+        said = f"expected image 0 .*got one that {fault}"
         with Image.open(tmp_path / name) as opened, pytest.raises(DataError, match=said):
             ImageArray([opened], CANVAS, 3)
 
@@ -189,7 +189,7 @@ def test_pillow_images_that_no_file_has():
     assert images.value_range == (0, 4095) and not images.load(1).any() and (images.load(0) == images.load(2)).all()
     assert "2 of 3 images have 16 bits" in images.notes[0]
     for wrong, fault in ((Image.new("F", (4, 4)), "floating-point"), (Image.new("I", (4, 4), 70_000), "70000")):
-        with pytest.raises(DataError, match=f"Expected image 0 to have pixels of 8 or 16 bits, actual one.*{fault}"):
+        with pytest.raises(DataError, match=f"expected image 0 to have pixels of 8 or 16 bits, got one.*{fault}"):
             ImageArray([wrong], CANVAS, 3)
 
 
@@ -217,18 +217,18 @@ def test_a_run_keeps_its_range(discs, tmp_path):
     (tmp_path / "images").mkdir()
     for i in range(40):
         Image.fromarray(rng.integers(0, 4000, (64, 64), np.uint16)).save(tmp_path / "images" / f"{i}.png")
-    run, images = session.begin(
-        str(discs.file), tmp_path / "images", tmp_path / "run", Preset(), 0, False, 1, show, value_range=(0, 4095)
-    )
+    target = TargetImages(tmp_path / "images", value_range=(0, 4095))
+    request = FitRequest(ModelFile(str(discs.file)), target, QUICK, threads=1)
+    run, images, *_ = begin(request, tmp_path / "run", show)
     assert run.record["value_range"] == [0, 4095] and images.value_range == (0, 4095)
     assert ImageFolder(tmp_path / "images", (64, 64), 3).fingerprint == images.fingerprint
     again = RunFolder.at(tmp_path / "run")
     for file in (tmp_path / "images").iterdir():  # what is found later makes no difference
         Image.fromarray(np.full((64, 64), 100, np.uint16)).save(file)
     assert int(open_target(again, lambda *_: None).load(0).max()) == 100 >> 4
-    session.resume(tmp_path / "run", show, value_range=(0, 4095))
-    with pytest.raises(RunError, match=r"value_range that the run.*\[0.0, 4095.0\].*actual \[0.0, 255.0\]"):
-        session.resume(tmp_path / "run", show, value_range=(0, 255))
+    resume(FitRequest(target=TargetImages(None, value_range=(0, 4095))), tmp_path / "run", show)
+    with pytest.raises(RunError, match=r"value_range that the run.*\[0.0, 4095.0\].*got \[0.0, 255.0\]"):
+        resume(FitRequest(target=TargetImages(None, value_range=(0, 255))), tmp_path / "run", show)
 
 
 def test_a_trial_reads_all_its_sets_over_one_range(folder, tmp_path, monkeypatch):
@@ -246,18 +246,20 @@ def test_a_trial_reads_all_its_sets_over_one_range(folder, tmp_path, monkeypatch
     for given, used in ((None, [0, 4095]), ((500, 5000), [500, 5000])):
         out = tmp_path / f"out {given}"
         with pytest.raises(SystemExit):
-            trial(tmp_path / "bright", out, {"dim": tmp_path / "dim"}, value_range=given, say=said.append)
+            options = TrialOptions(value_range=given)
+            trial(tmp_path / "bright", out, {"dim": tmp_path / "dim"}, options, callback=said.append)
         assert json.loads((out / "trial.json").read_text())["value_range"] == used == list(jobs.pop().value_range)
     assert "Note: 4 of 4 images have 16 bits" in said[0] and "500 to 5000" in said[1]
 
 
 def test_a_run_on_images_of_8_bits_has_no_range(target, discs, tmp_path):
-    run, _ = session.begin(str(discs.file), target.images, tmp_path / "run", Preset(), 0, False, 1, Display())
+    request = FitRequest(ModelFile(str(discs.file)), TargetImages(target.images), QUICK, threads=1)
+    run = begin(request, tmp_path / "run", Display()).run
     assert "value_range" not in run.record
 
 
 def test_the_words_of_a_range():
     assert range_given(None) is None and range_given("0,4095") == (0, 4095) and range_given(" 1.5, 2e3") == (1.5, 2000)
     for wrong in ("4095", "a,b", "1,2,3", ""):
-        with pytest.raises(ProbsceneError, match="Expected --range LOW,HIGH"):
+        with pytest.raises(ProbsceneError, match="expected --range LOW,HIGH"):
             range_given(wrong)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from probscene.app.fitting import session
+from probscene.app.fitting import begin
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.modules import import_file
@@ -173,7 +173,7 @@ def test_a_run_takes_the_same_files_elsewhere(tmp_path, changed):
     before, copy = run.record["model"], tmp_path / "run" / "model" / "scene.py"
     if changed:
         (copy.parent / "looks" / "colours.py").write_text("RG = (1, 1)")
-    session._relocate(run, str(copy), None, None, None, Display(Console(quiet=True)))
+    begin._relocate(run, begin.FitRequest(begin.ModelFile(str(copy))), Display(Console(quiet=True)))
     assert run.record["model"] == (before if changed else str(copy))
 
 
@@ -186,7 +186,7 @@ def test_a_model_without_leaves_no_more_than_its_file(tmp_path):
 
 def test_check_finds_nothing_to_mend(tmp_path, call):
     done = call("check", folder(tmp_path))
-    assert done.code == 0 and "Nothing to mend" in done.out, done.err
+    assert done.code == 0 and "Nothing to fix" in done.out, done.err
 
 
 def test_another_process_finds_them(tmp_path):

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from probscene.app.loading import load_model, renderer_for
-from probscene.batch import Space
+from probscene.batch import SceneGeometry
 from probscene.errors import ModelError
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.scenarios import join
 from probscene.structure import StructurePrior, counts
@@ -76,7 +76,7 @@ def without_labels(batch):
 def in_space(batch, **more):
     N, M, (H, W) = *batch.kind.shape, batch.image.shape[2:]
     sky, nothing = torch.zeros(N, H, W, dtype=torch.uint8), torch.zeros(N, M)
-    space = Space(torch.ones(N, H, W), sky, ("sky",), nothing, torch.zeros(N, M, 7), torch.zeros(N, 3, 3))
+    space = SceneGeometry(torch.ones(N, H, W), sky, ("sky",), nothing, torch.zeros(N, M, 7), torch.zeros(N, 3, 3))
     return batch._replace(space=space._replace(**more))
 
 
@@ -90,35 +90,35 @@ class Noise:
 
 
 FAULTS = {
-    "no batch": (lambda batch: batch.image, "a RenderBatch .* actual Tensor"),
-    "nothing": (lambda batch: None, "a RenderBatch .* actual NoneType"),
-    "array": (set_("image", lambda image: image.numpy()), "image as a tensor of torch.uint8 .* actual ndarray"),
+    "no batch": (lambda batch: batch.image, "a RenderBatch .* got Tensor"),
+    "nothing": (lambda batch: None, "a RenderBatch .* got NoneType"),
+    "array": (set_("image", lambda image: image.numpy()), "image as a tensor of torch.uint8 .* got ndarray"),
     "channels last": (set_("image", lambda image: image.permute(0, 2, 3, 1)), r"image as torch.uint8 \(5, 3, 64, 64\)"),
-    "floats": (set_("image", lambda image: image / 255), "image as torch.uint8 .* actual torch.float32"),
-    "canvas": (set_("image", lambda image: image[..., :32]), r"actual torch.uint8 \(5, 3, 64, 32\)"),
-    "one scene": (set_("image", lambda image: image[:1]), r"actual torch.uint8 \(1, 3, 64, 64\)"),
-    "fewer nodes": (set_("kind", lambda kind: kind[:, :2]), r"kind as torch.int64 \(5, 3\) .* actual .* \(5, 2\)"),
-    "doubles": (set_("box", lambda box: box.double()), "box as torch.float32 .* actual torch.float64"),
-    "ids": (set_("instance", put(9, 0, 0, 0)), r"instance in 0..3, .* actual 0..9"),
-    "another kind": (set_("kind", put(5, 0, 0)), "kind as the drawing's, .* actual 5 where the drawing has"),
-    "no kind": (without_labels, "ids of nodes that kind labels, actual pixels of a node whose kind is -1"),
+    "floats": (set_("image", lambda image: image / 255), "image as torch.uint8 .* got torch.float32"),
+    "canvas": (set_("image", lambda image: image[..., :32]), r"got torch.uint8 \(5, 3, 64, 32\)"),
+    "one scene": (set_("image", lambda image: image[:1]), r"got torch.uint8 \(1, 3, 64, 64\)"),
+    "fewer nodes": (set_("kind", lambda kind: kind[:, :2]), r"kind as torch.int64 \(5, 3\) .* got .* \(5, 2\)"),
+    "doubles": (set_("box", lambda box: box.double()), "box as torch.float32 .* got torch.float64"),
+    "ids": (set_("instance", put(9, 0, 0, 0)), r"instance in 0..3, .* got 0..9"),
+    "another kind": (set_("kind", put(5, 0, 0)), "kind as the drawing's, .* got 5 where the drawing has"),
+    "no kind": (without_labels, "ids of nodes that kind labels, got pixels of a node whose kind is -1"),
     "pixels": (set_("pixels", put(5, 0, 0)), "pixels as instance has them"),
-    "visible": (set_("visible", lambda visible: visible * 100), r"visible in 0..1, .* actual .*\.\.100"),
+    "visible": (set_("visible", lambda visible: visible * 100), r"visible in 0..1, .* got .*\.\.100"),
     "NaN": (set_("visible", put(float("nan"), 1, 1)), "visible without NaN"),
     "width": (set_("box", lambda box: box[..., [0, 1, 3, 2]]), "box as x0, y0, x1, y1 on the canvas of 64 x 64 pixels"),
     "beyond": (set_("box", lambda box: box + 60), "box as x0, y0, x1, y1 on the canvas"),
     "amodal": (set_("amodal_box", lambda box: box[..., [2, 3, 0, 1]]), "amodal_box as x0, y0, x1, y1 with x0 <= x1"),
-    "no space": (lambda batch: batch._replace(space=(1,)), "a Space as space, or None, actual tuple"),
+    "no space": (lambda batch: batch._replace(space=(1,)), "a Space as space, or None, got tuple"),
     "depth": (lambda batch: in_space(batch, depth=torch.ones(5, 64)), r"space.depth as torch.float32 \(5, 64, 64\)"),
-    "names": (lambda batch: in_space(batch, names=()), r"semantic below the number of space.names \(0\), actual 0"),
-    "noise": (Noise(), "bytes whenever it renders a scene, .* actual another image in a second call"),
+    "names": (lambda batch: in_space(batch, names=()), r"semantic below the number of space.names \(0\), got 0"),
+    "noise": (Noise(), "bytes whenever it renders a scene, .* got another image in a second call"),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_a_renderer_must_not_return(fault, model, drawing):
     change, message = FAULTS[fault]
-    with pytest.raises(ModelError, match=f"Expected Flawed.__call__ to (return|give the) .*{message}"):
+    with pytest.raises(ModelError, match=f"expected Flawed.__call__ to (return|give the) .*{message}"):
         renderer_for(own(model, change), threads=1)(drawing)
 
 
@@ -131,12 +131,12 @@ def test_a_function_is_called_by_its_name(model, drawing):
     def night(drawing):
         return 5
 
-    with pytest.raises(ModelError, match="Expected .*night to return a RenderBatch .* actual int"):
+    with pytest.raises(ModelError, match="expected .*night to return a RenderBatch .* got int"):
         renderer_for(replace(model, renderer=lambda canvas, threads: night))(drawing)
 
 
 def test_a_renderer_that_is_none(model):
-    with pytest.raises(ModelError, match="called with the canvas and a number of threads, to give .* actual NoneType"):
+    with pytest.raises(ModelError, match="called with the canvas and a number of threads, to give .* got NoneType"):
         renderer_for(replace(model, renderer=lambda canvas, threads: None))
 
 

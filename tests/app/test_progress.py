@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from probscene.app import progress
-from probscene.app.fitting import session
-from probscene.app.fitting.storage import OTHER, timing
+from probscene.app.fitting import pipeline
+from probscene.app.fitting.store import OTHER, timing
 from probscene.app.progress import EVERY, STAGES, Display
 
 
@@ -167,7 +167,7 @@ def test_the_times_of_a_fits_stages_and_of_what_is_none_add_up_to_the_whole(repo
     """Also over two sittings; what is no stage of a fit, such as the drawing of a target, is none of its times."""
     now = 0.0
 
-    def fit(run, show, *_):
+    def take_stages(begun, show, *_):
         nonlocal now
         for name, done, seconds in reports:
             now += seconds
@@ -175,11 +175,11 @@ def test_the_times_of_a_fits_stages_and_of_what_is_none_add_up_to_the_whole(repo
         now += 1.5
 
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "fit", fit)
-        run, beside = SimpleNamespace(path=Path(folder), few=None), 0.0
+        patch.setattr(pipeline, "_take_stages", take_stages)
+        run, beside = SimpleNamespace(path=Path(folder), is_finished=False, objects={}), 0.0
         for _ in range(1 + again):
             with Display(Console(quiet=True), lambda: now) as show:
-                session.carry_out(run, None, show)
-            beside += sum(seconds for name, seconds in show.seconds.items() if name not in session.STAGES)
+                pipeline.carry_out(pipeline.Begun(run), show)
+            beside += sum(seconds for name, seconds in show.seconds.items() if name not in pipeline.STAGES)
         assert sum(timing(run).values()) == pytest.approx(now - beside, abs=1e-6)
         assert timing(run)[OTHER] >= 1.5 * (1 + again) - 1e-6

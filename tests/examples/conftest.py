@@ -1,5 +1,7 @@
 """Each example of a part of one's own, in a fit of a few seconds: by the command line and from Python."""
 
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,22 +10,32 @@ from typer.testing import CliRunner
 
 import probscene as ps
 from probscene.app.cli import app
+from probscene.app.fitting.config import configuration
+from probscene.app.modules import import_file
+from probscene.inference.features.pretrained import EfficientNetLite
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLETOP = EXAMPLES / "tabletop.py"
 SHORT = {
-    "count.steps": 16,
-    "count.images": 4,
-    "count.crops": 4,
-    "width": "4,8,8",
-    "pretrain_derivations": 100,
-    "pretrain_epochs": 1,
-    "prior_if_worse": "false",
-    "learn": "structure",
-    "batches": 2,
-    "num_scenes": 20,
+    "features.schedule.steps": 16,
+    "features.schedule.images": 4,
+    "features.schedule.crops": 4,
+    "features.width": "4,8,8",
+    "pretrain.derivations": 100,
+    "pretrain.epochs": 1,
+    "fallback_to_prior": "false",
+    "parameters": "none",
+    "structure.batches": 2,
+    "structure.num_scenes": 20,
+    "structure.draws_per_structure": 1,
 }
+EXECUTION = ps.Execution(threads=1, cache=False, progress=False)
 FILES = ("features.safetensors", "real.safetensors", "guide.safetensors", "log.jsonl")
+
+
+def settings_for(features) -> dict[str, str | int]:
+    """Those of ``SHORT`` that features read; None for the preset's."""
+    return {key: value for key, value in SHORT.items() if features is None or not key.startswith("features.")}
 
 
 def probscene(*words):
@@ -41,9 +53,35 @@ def _own_cache(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_and_small_images_are_looked_at():
+    """By a verdict."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
+        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
+        yield
+
+
 @pytest.fixture(scope="session")
 def call():
     return probscene
+
+
+@pytest.fixture
+def script(monkeypatch, capsys):
+    """``script(file, *words)``: its ``main`` here, without seconds of imports, as ``subprocess.run`` gives it."""
+
+    def run(file, *words):
+        monkeypatch.setattr(sys, "argv", [str(file), *map(str, words)])
+        try:
+            code = import_file(file).main()
+        except SystemExit as end:
+            code = end.code
+        said = capsys.readouterr()
+        return subprocess.CompletedProcess(words, code or 0, said.out, said.err)
+
+    return run
 
 
 @pytest.fixture(scope="session")
@@ -64,18 +102,17 @@ def tables(tmp_path_factory) -> Path:
 def both_ways(tmp_path_factory, tables):
     """Fits of a model by the command line and from Python: ``command`` and ``python``, which have the same bytes.
 
-    ``both_ways(words, options)`` takes the command's further words and the further arguments of ``ps.fit``.
+    ``both_ways(words, options)`` takes the command's further words and the further arguments of ``configuration``.
     """
 
     def fitted(words, options, model=TABLETOP, target=tables):
         folder = tmp_path_factory.mktemp("ways")
-        short = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
-        common = ["--preset", "quick", "--threads", 1, "--seed", 3, "--no-cache", *short]
-        probscene("fit", model, "--target", target, "--out", folder / "command", *common, *words)
-        fit = ps.fit(
-            model, target, "quick", 3, settings=SHORT, threads=1, cache=False, progress=False,
-            out=folder / "python", **options,
-        )  # fmt: skip
+        settings = settings_for(options.get("features"))
+        short = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+        common = ["--preset", "quick", "--features", "count", "--threads", 1, "--seed", 3, "--no-cache", "--no-verdict"]
+        probscene("fit", model, "--target", target, "--out", folder / "command", *common, *short, *words)
+        config = configuration(ps.preset("quick"), **{"features": "count", **options}, settings=settings)
+        fit = ps.fit(model, target, config, seed=3, out=folder / "python", execution=EXECUTION)
         for name in FILES:
             assert (folder / "command" / name).read_bytes() == (fit.path / name).read_bytes(), name
         return SimpleNamespace(command=folder / "command", python=fit)
@@ -88,7 +125,7 @@ def goes_on(tmp_path, tables, monkeypatch):
     """Checks that a fit with parts of one's own, interrupted in a stage of its log, goes on to the same bytes."""
 
     def check(stage, **options):
-        from probscene.app.fitting import storage as checkpoints
+        from probscene.app.fitting import store as checkpoints
 
         class Interrupted(Exception):
             pass
@@ -98,16 +135,17 @@ def goes_on(tmp_path, tables, monkeypatch):
             if line is not None and line["stage"] == stage:
                 raise Interrupted
 
-        options = {"preset": "quick", "settings": SHORT, "threads": 1, "cache": False, "progress": False, **options}
-        whole = ps.fit(TABLETOP, tables, out=tmp_path / "whole", **options)
-        kept = checkpoints.Keeper.__call__
+        settings = settings_for(options.get("features"))
+        config = configuration(ps.preset("quick"), **{"features": "count", **options}, settings=settings)
+        whole = ps.fit(TABLETOP, tables, config, out=tmp_path / "whole", execution=EXECUTION)
+        kept = checkpoints.Checkpointer.__call__
         with monkeypatch.context() as patch:
             patch.setattr(checkpoints, "SAVE_EVERY", -1.0)
-            patch.setattr(checkpoints.Keeper, "__call__", stop)
+            patch.setattr(checkpoints.Checkpointer, "__call__", stop)
             with pytest.raises(Interrupted):
-                ps.fit(TABLETOP, tables, out=tmp_path / "parts", **options)
+                ps.fit(TABLETOP, tables, config, out=tmp_path / "parts", execution=EXECUTION)
         assert list((tmp_path / "parts").glob("*-checkpoint.safetensors"))
-        again = ps.fit(TABLETOP, tables, out=tmp_path / "parts", resume=True, **options)
+        again = ps.fit(TABLETOP, tables, config, out=tmp_path / "parts", resume=True, execution=EXECUTION)
         for name in FILES:
             assert (whole.path / name).read_bytes() == (again.path / name).read_bytes(), name
 

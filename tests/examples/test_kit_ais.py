@@ -68,7 +68,7 @@ def test_crops_and_their_counts(frames, tmp_path):
 
 
 FAULTS = {
-    "no frames": (lambda folder: [file.unlink() for file in folder.iterdir()], "Expected frames"),
+    "no frames": (lambda folder: [file.unlink() for file in folder.iterdir()], "expected frames"),
     "no labels": (lambda folder: (folder / "A10.txt").unlink(), "A10.txt"),
     "no YOLO": (lambda folder: (folder / "A9.txt").write_text("0 0.5 0.5\n"), "line 1"),
     "no image": (lambda folder: (folder / "B3.png").write_bytes(b"no image"), "B3.png"),
@@ -77,19 +77,19 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_bad_frames_are_named(fault, frames, tmp_path):
+def test_bad_frames_are_named(fault, frames, tmp_path, script):
     spoil, part = FAULTS[fault]
     spoil(frames)
-    done = run(frames, "--out", tmp_path / "out", "--held-out", "B3")
+    done = script(EXAMPLE, frames, "--out", tmp_path / "out", "--held-out", "B3")
     assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert part in done.stderr and done.stderr.startswith("kit_ais: Expected ")
+    assert part in done.stderr and done.stderr.startswith("kit_ais: expected ")
 
 
-def test_the_real_frames(data_dir, tmp_path):
+def test_the_real_frames(data_dir, tmp_path, script):
     data = data_dir / "aerial" / "kit_ais"
     if not data.is_dir():
         pytest.skip(f"no KIT AIS frames in {data}")
-    done = run(data, "--out", tmp_path, "--stride", "256")
+    done = script(EXAMPLE, data, "--out", tmp_path, "--stride", "256")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("frames times") == 3
     model = load_model("aerial2d")

@@ -40,8 +40,8 @@ def test_scenes_near_the_real_ones_cost_less():
 
 
 def test_it_is_fitted(both_ways):
-    ways = both_ways(["--objective", f"{FILE}:energy"], {"divergence": ENERGY})
-    assert ps.Run.open(ways.command).record["preset"]["objective"] == f"{FILE}:energy"
+    ways = both_ways(["--divergence", f"{FILE}:energy"], {"divergence": ENERGY})
+    assert ps.Run.open(ways.command).record["config"]["divergence"] == f"{FILE}:energy"
 
 
 def test_it_goes_on_to_the_same_bytes(goes_on):

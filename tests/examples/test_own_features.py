@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import probscene as ps
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.app.modules import import_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -40,7 +40,7 @@ def test_the_long_form_is_fitted(both_ways, few_steps):
     lines = (ways.command / "log.jsonl").read_text().splitlines()
     assert sum('"features"' in line for line in lines) == 4
     run = ps.Run.open(ways.command)
-    assert run.record["preset"]["features"] == f"{few_steps}:TinyCounts" and run.features.resolution == 0.5
+    assert run.record["config"]["features"] == f"{few_steps}:TinyCounts" and run.features.resolution == 0.5
     again = ps.Run.open(ways.python.path, features=OWN.TinyCounts(steps=4))
     images = torch.randint(0, 256, (2, 3, 256, 256), dtype=torch.uint8)
     assert torch.equal(run.network().embed(images), again.network().embed(images))
@@ -53,7 +53,7 @@ def test_it_goes_on_to_the_same_bytes(goes_on, stage):
 
 def test_it_learns_to_count():
     ps.seed_everything(0)
-    renders, net = Observer(MODEL, 1), OWN.TinyNet(MODEL.classes)
+    renders, net = RenderedFeatures(MODEL, 1), OWN.TinyNet(MODEL.classes)
     shown = renders.draw(100)
     counts = OWN.visible_counts(shown, len(MODEL.classes))
     OWN.TinyTraining(net, renders, 80, seed=1).run()

@@ -77,8 +77,9 @@ def test_it_is_fitted_and_generated(tmp_path, call, both_ways, short):
     generate_scenes(truth, truth.prior, 40, tmp_path / "drawn", format="images")
     plain = replace(MODEL, renderer=None)
     drawn = tmp_path / "drawn" / "images"
-    run = both_ways([], {"renderer": MODEL.renderer}, FILE, drawn).command
-    given = ps.fit(plain, drawn, "quick", 3, renderer=MODEL.renderer, settings=short, threads=1, progress=False)
+    run = both_ways([], {}, FILE, drawn).command
+    config, execution = ps.preset("quick").set(short), ps.Execution(threads=1, progress=False)
+    given = ps.fit(replace(plain, renderer=MODEL.renderer), drawn, config, seed=3, execution=execution)
     assert (given.path / "guide.safetensors").read_bytes() == (run / "guide.safetensors").read_bytes()
     assert torch.equal(given.render(3).image, ps.Run.open(run).render(3).image)
     call("generate", run, "--num", 4, "--out", tmp_path / "dataset")

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from probscene.app.checking.generator_check import check_generator
+from probscene.app.fitting.presets import images_drawn
 from probscene.app.loading import load_model, renderer_for
 from probscene.sampling import sample, seed_everything
 
@@ -29,7 +30,7 @@ def drawn(model):
 
 
 def test_bytes_are_the_same_in_fresh_processes(model):
-    report = check_generator(model)
+    report = check_generator(model, images_drawn())
     assert not report.differs and report.command == "draw.py"
 
 

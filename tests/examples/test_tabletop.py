@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from probscene.app.loading import load_model
 from probscene.checks import check
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 ROOT = Path(__file__).parents[2]
@@ -33,9 +33,10 @@ def test_a_newcomer_reads_it_in_one_go():
 
 
 @pytest.mark.parametrize(("number", "rows"), [(3, 1), (8, 2)])
-def test_the_script_draws_a_grid(tmp_path, number, rows):
+def test_the_script_draws_a_grid(tmp_path, number, rows, script):
     out = tmp_path / "grid.png"
-    done = run("--num", str(number), "--out", str(out))
+    words = ("--num", str(number), "--out", str(out))
+    done = run(*words) if rows == 1 else script(FILE, *words)
     assert done.returncode == 0, done.stderr
     grid = cv2.imread(str(out))
     assert grid.shape == (256 * rows, 256 * 4, 3)
@@ -45,8 +46,8 @@ def test_the_script_draws_a_grid(tmp_path, number, rows):
 
 
 @pytest.mark.parametrize("arguments", [("--num", "0"), ("--num", "1", "--out", "no/such/folder/grid.png")])
-def test_the_script_says_what_it_expects(arguments):
-    done = run(*arguments)
+def test_the_script_says_what_it_expects(arguments, script):
+    done = script(FILE, *arguments)
     assert done.returncode == 2
     assert "expected" in done.stderr and "Traceback" not in done.stderr
 

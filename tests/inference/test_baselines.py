@@ -17,9 +17,9 @@ from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.grammar_vae import GrammarVAE
 from probscene.inference.guides.lstm import GUIDES, LSTMGuide, make_guide
 from probscene.inference.guides.pcfg import PCFG
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
 from probscene.inference.pretrain import pretrain
+from probscene.inference.structure_training import StructureTraining
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, ranked, weights
 
@@ -152,7 +152,7 @@ def test_the_score_function_brings_a_pcfg_to_the_closed_form():
             return SceneGraph(grammar, derive(grammar, structure, num_scenes, 40)).draw()
 
     objective = ScoreFunction(lambda scenes: counted(scenes.derivation), KDELogRatio(), updates=3)
-    Trainer(program, guide, objective, real, 60, num_scenes=500, num_real=500).run()
+    StructureTraining(program, guide, objective, real, 60, num_scenes=500, num_real=500).run()
     again = torch.softmax(guide.weights.detach()[grammar.rules_of("Items")], 0)[0].item()
     closed = 1 - 1 / (1 + real.mean().item())  # a repeat's share of all expansions of Items
     assert again == pytest.approx(closed, abs=0.02)
@@ -174,18 +174,18 @@ def test_the_score_function_learns_what_needs_context(small, kind):
         return scenes.derivation.counts(len(small.grammar.kinds)).float()
 
     objective = ScoreFunction(counted, KDELogRatio(0.2, None), updates=3)
-    Trainer(small.program, guide, objective, real, 60, num_scenes=300).run()
+    StructureTraining(small.program, guide, objective, real, 60, num_scenes=300).run()
     assert distance() < 0.12 < before
 
 
 def test_make_guide():
     assert [type(make_guide(kind, COIN, 5)) for kind in GUIDES] == [LSTMGuide, PCFG, GrammarVAE]
     assert len(make_guide("grammar-vae", COIN, 5, num_latents=7).latents) == 7
-    with pytest.raises(ProbsceneError, match="lstm, pcfg, grammar-vae, actual 'hmm'"):
+    with pytest.raises(ProbsceneError, match="lstm, pcfg, grammar-vae, got 'hmm'"):
         make_guide("hmm", COIN, 5)
 
 
 def test_a_grammar_vae_has_no_logits_beyond_its_last_step():
     guide = GrammarVAE(LISTS, max_steps=6)
-    with pytest.raises(ProbsceneError, match="at most max_steps = 6 rules, actual 8"):
+    with pytest.raises(ProbsceneError, match="at most max_steps = 6 rules, got 8"):
         guide.log_prob(enumerate_derivations(LISTS, 8))

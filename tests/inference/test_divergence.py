@@ -10,7 +10,7 @@ from scipy.stats import gaussian_kde as scipy_kde
 
 from probscene.errors import ProbsceneError
 from probscene.inference import divergence as module
-from probscene.inference.divergence import MMD, Blockwise, JensenShannon, KDELogRatio, anscombe, gaussian_kde
+from probscene.inference.divergence import MMD, Blockwise, JensenShannon, KDELogRatio, anscombe_transform, gaussian_kde
 from probscene.inference.guides.lstm import LSTMGuide
 
 
@@ -77,12 +77,12 @@ def test_the_ratio_is_that_of_plain_sums_in_blocks_of_any_size(D, N, L, leave_on
         return log_kernel.logsumexp(1) - np.log(len(data) - leave_one_out)
 
     expected = log_density(generated, 0.7, leave_one_out) - log_density(real, 0.7, False)
-    before, module.BLOCK = module.BLOCK, block
+    before, module.BLOCK_SIZE = module.BLOCK_SIZE, block
     try:
         found = KDELogRatio(0.7, None, leave_one_out)(generated, real)
         bounded = JensenShannon(0.7, None, leave_one_out)(generated.double(), real.double())
     finally:
-        module.BLOCK = before
+        module.BLOCK_SIZE = before
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=3e-5 * (1 + 60 + away) ** 2)
     # log q / ((p + q) / 2), of densities and not of their logarithms' ratio
     middle = torch.logaddexp(expected, torch.zeros_like(expected)) - np.log(2)
@@ -113,22 +113,22 @@ def test_equal_sizes_are_parts_of_the_larger_sample(D, N, L, leave_one_out, seed
 @given(st.floats(4, 200), st.integers(0, 2**31))
 def test_anscombe_gives_counts_of_any_mean_a_variance_of_one(mean, seed):
     counts = torch.from_numpy(np.random.default_rng(seed).poisson(mean, 20000)).double()
-    assert 0.9 < anscombe(counts).var() < 1.1
+    assert 0.9 < anscombe_transform(counts).var() < 1.1
 
 
 @given(st.lists(st.floats(-50, 500), min_size=2, max_size=40))
 def test_anscombe_keeps_the_order_and_is_odd(values):
     x = torch.tensor(values, dtype=torch.float64).sort().values
-    assert (anscombe(x).diff() >= 0).all()
-    assert torch.equal(anscombe(-x), -anscombe(x))
-    assert torch.allclose(anscombe(x.abs()), 2 * (x.abs() + 3 / 8).sqrt() - 2 * (3 / 8) ** 0.5)
+    assert (anscombe_transform(x).diff() >= 0).all()
+    assert torch.equal(anscombe_transform(-x), -anscombe_transform(x))
+    assert torch.allclose(anscombe_transform(x.abs()), 2 * (x.abs() + 3 / 8).sqrt() - 2 * (3 / 8) ** 0.5)
 
 
 @pytest.mark.parametrize("kind", [KDELogRatio, JensenShannon, partial(MMD, shared=False)])
 def test_stabilised_costs_are_those_of_transformed_counts(kind):
     generated, real = torch.rand(20, 3) * 30, torch.rand(50, 3) * 30
-    plain, stabilised = kind(0.8), kind(0.8, stabilised=True)
-    assert torch.equal(stabilised(generated, real), plain(anscombe(generated), anscombe(real)))
+    plain, stabilised = kind(0.8), kind(0.8, anscombe=True)
+    assert torch.equal(stabilised(generated, real), plain(anscombe_transform(generated), anscombe_transform(real)))
     assert not torch.allclose(stabilised(generated, real), plain(generated, real))
 
 
@@ -201,7 +201,7 @@ def test_the_bounded_cost_is_the_gradient_of_jensen_shannon(small):
     log_m = ((p + q) / 2).log()
     divergence = ((q * (log_q - log_m)).sum() + (p * (p.log() - log_m)).sum()) / 2
     exact = torch.autograd.grad(divergence, guide.parameters(), retain_graph=True)
-    cost = JensenShannon().of_ratio(log_q - p.log()).detach()
+    cost = JensenShannon().cost_of_log_ratio(log_q - p.log()).detach()
     score = torch.autograd.grad((q.detach() * cost * log_q).sum(), guide.parameters())
     for a, b in zip(exact, score, strict=True):
         assert torch.allclose(2 * a, b, atol=1e-6)
@@ -210,7 +210,7 @@ def test_the_bounded_cost_is_the_gradient_of_jensen_shannon(small):
 @pytest.mark.parametrize(
     ("generated", "real", "says"),
     [
-        (torch.zeros(5, 2), torch.zeros(5, 3), "Expected generated"),
+        (torch.zeros(5, 2), torch.zeros(5, 3), "expected generated"),
         (torch.zeros(1, 2), torch.zeros(5, 2), "at least 2 generated"),
         (torch.zeros(5, 2), torch.zeros(0, 2), "at least 2 generated"),
         (torch.full((5, 2), torch.nan), torch.zeros(5, 2), "finite"),
@@ -233,5 +233,5 @@ def test_blocks_have_densities_of_their_own():
     assert torch.allclose(Blockwise((2, 3), (each[0], None))(*both), each[0](one, real))
     joint = each[1](*both)
     assert joint.std() < 1e-5 < found.std()
-    with pytest.raises(ProbsceneError, match="Expected generated"):
+    with pytest.raises(ProbsceneError, match="expected generated"):
         Blockwise((2, 3), each)(one, torch.cat([real, far], 1))

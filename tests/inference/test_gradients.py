@@ -214,7 +214,7 @@ def test_the_gradient_of_each_objective_is_exact_where_derivations_may_not_end(d
 
     def ratio(x, variance):
         own, real = densities(x, variance)
-        return objective.of_ratio((own / real).log())
+        return objective.cost_of_log_ratio((own / real).log())
 
     if isinstance(objective, MMD):
         own, real = densities(features, objective.variance)

@@ -1,7 +1,5 @@
 """The objective: what a batch, its baseline and its costs are, and that a guide learns by it."""
 
-from dataclasses import replace
-
 import pyro
 import pytest
 import torch
@@ -12,8 +10,8 @@ from probscene.app.fitting.presets import QUICK
 from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.learn import Trainer
-from probscene.inference.objective import FAR, ScoreFunction
+from probscene.inference.objective import MAX_LOG_RATIO, ScoreFunction
+from probscene.inference.structure_training import StructureTraining
 from probscene.structure import StructurePrior, counts
 
 
@@ -48,7 +46,11 @@ def test_each_objective_descends_toward_the_target(small, objective):
         q = log_q.detach().exp()
         away.append(0.5 * (q - small.target).abs().sum().item())
         log_ratio = ((kernel @ q) / (kernel @ small.target)).log()
-        costs = {"kde": log_ratio, "js": JensenShannon().of_ratio(log_ratio), "witness": kernel @ (q - small.target)}
+        costs = {
+            "kde": log_ratio,
+            "js": JensenShannon().cost_of_log_ratio(log_ratio),
+            "witness": kernel @ (q - small.target),
+        }
         optimiser.zero_grad()
         (q * costs[objective] * log_q).sum().backward()
         optimiser.step()
@@ -59,10 +61,11 @@ def test_each_objective_descends_toward_the_target(small, objective):
 def test_each_objective_learns_from_samples(small, objective):
     torch.manual_seed(0)
     guide = LSTMGuide(small.grammar, 4, hidden=16)
-    preset = replace(QUICK, variance=0.2, marginal_variance=None).with_objective(objective)
-    loss = ScoreFunction(small.observe, preset.divergence(), preset.baseline, updates=preset.updates)
+    config = QUICK.set("divergence.variance=0.2", "divergence.marginal_variance=none").with_divergence(objective)
+    training = config.structure
+    loss = ScoreFunction(small.observe, config.make_divergence(), training.baseline, updates=training.updates)
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
-    Trainer(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=preset.learning_rate).run()
+    StructureTraining(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=training.learning_rate).run()
     with torch.no_grad():
         assert 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item() < 0.12
 
@@ -98,7 +101,7 @@ def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
     pyro.set_rng_seed(5)
     loss(dots, LSTMGuide(dots.grammar, 12, hidden=8), 200, real=None)
     something = loss.batch.derivation.lengths > 2
-    assert something.any() and (loss.batch.cost[something] == 0.1 * FAR).all()
+    assert something.any() and (loss.batch.cost[something] == 0.1 * MAX_LOG_RATIO).all()
 
 
 def test_evaluating_the_loss_changes_nothing(small):
@@ -133,13 +136,19 @@ def test_other_arguments_start_another_batch(small):
 
 def test_a_guide_that_is_none_is_told_what_is_missing(small):
     loss = ScoreFunction(small.observe, small.cost)
-    with pytest.raises(ModelError, match="log_prob and max_steps, actual StructurePrior without max_steps"):
+    with pytest.raises(ModelError, match="log_prob and max_steps, got StructurePrior without max_steps"):
         loss(small.program, StructurePrior(small.grammar), 20, real=None)
-    with pytest.raises(ModelError, match="actual function without grammar, log_prob, max_steps"):
+    with pytest.raises(ModelError, match="got function without grammar, log_prob, max_steps"):
         loss(small.program, lambda num_scenes: None, 20, real=None)
 
 
 def test_bad_arguments_are_named(small):
-    for arguments in ({"baseline": "median"}, {"updates": 0}, {"decay": 0.0}, {"clip": -1.0}, {"reject_threshold": -1}):
-        with pytest.raises(ProbsceneError, match="Expected"):
+    for arguments in (
+        {"baseline": "median"},
+        {"updates": 0},
+        {"decay": 0.0},
+        {"clip": -1.0},
+        {"reject_threshold": -1},
+    ):
+        with pytest.raises(ProbsceneError, match="expected"):
             ScoreFunction(small.observe, small.cost, **arguments)

@@ -10,20 +10,19 @@ from pyro.infer import SVI
 from pyro.optim.lr_scheduler import PyroLRScheduler
 from torch.optim.lr_scheduler import LambdaLR
 
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.features.counting.training import CountTraining
-from probscene.inference.features.photographs.heads import PretrainedCountNet
+from probscene.inference.features.photographs.net import PretrainedCountNet
 from probscene.inference.features.photographs.training import PretrainedCountTraining
 from probscene.inference.features.presence import PresenceNet, PresenceTraining
-from probscene.inference.features.projected import ProjectionTraining
-from probscene.inference.features.projection import Projected
+from probscene.inference.features.projection import Projected, ProjectionTraining
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
+from probscene.inference.structure_training import StructureTraining
 from probscene.inference.training import batch_seed
 from probscene.sampling import seed_everything
 
@@ -46,28 +45,30 @@ class Means(torch.nn.Module):
 def counting(dots, small):
     net = CountNet(dots.classes, 3, dots.canvas, width=(4, 8, 8), blocks=(0, 0))
     schedule = CountSchedule(steps=20, images=2, crops=4, crop=32, window=2)
-    return CountTraining(net, Observer(dots, 1).draw, schedule, seed=1), net
+    return CountTraining(net, RenderedFeatures(dots, 1).draw, schedule, seed=1), net
 
 
 def presence(dots, small):
     net = PresenceNet(dots.classes, 4, 8)
-    return PresenceTraining(net, Observer(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
+    return PresenceTraining(net, RenderedFeatures(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
 
 
 def counts_one_hot(dots, small):
     net = PresenceNet(dots.classes, 4, 8, ways=5)
-    return PresenceTraining(net, Observer(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
+    return PresenceTraining(net, RenderedFeatures(dots, 1).draw, 40, 3, 20, accuracy=1.1, seed=1), net
 
 
 def pretrained_counting(dots, small):
     net = PretrainedCountNet(dots.classes, dots.canvas, held=8, sizes=(160, 160))
     photographs = torch.randint(0, 256, (5, 3, *dots.canvas), dtype=torch.uint8)
-    return PretrainedCountTraining(net, Observer(dots, 1).draw_twice, 8, 2, 4, photographs=photographs, seed=1), net
+    return PretrainedCountTraining(
+        net, RenderedFeatures(dots, 1).draw_twice, 8, 2, 4, photographs=photographs, seed=1
+    ), net
 
 
 def projection(dots, small):
     net = Projected(Means(), 2)
-    return ProjectionTraining(net, Observer(dots, 1), 140, 2, 30, seed=1), net
+    return ProjectionTraining(net, RenderedFeatures(dots, 1), 140, 2, 30, seed=1), net
 
 
 def structure(dots, small, divergence=None, **options):
@@ -78,7 +79,7 @@ def structure(dots, small, divergence=None, **options):
         updates=2,
     )
     real = small.features[torch.multinomial(small.target, 200, replacement=True)]
-    return Trainer(small.program, guide, loss, real, 4, num_scenes=40, seed=5, **options), guide
+    return StructureTraining(small.program, guide, loss, real, 4, num_scenes=40, seed=5, **options), guide
 
 
 ALL = {
@@ -139,14 +140,14 @@ def test_interrupted_anywhere_it_goes_on_to_the_same_bits(made):
         first, _ = made()
         kept, heard = {}, []
 
-        def each(training, line, stop=stop, kept=kept, heard=heard):
+        def callback(training, line, stop=stop, kept=kept, heard=heard):
             if len(heard) == stop:
                 kept.update({key: value.clone() for key, value in training.state().items()})
                 raise Interrupted
             heard.append(line)
 
         with pytest.raises(Interrupted):
-            first.run(each)
+            first.run(callback)
         second, again = made()
         second.restore(kept)
         assert 0 <= second.done <= first.done
@@ -165,13 +166,13 @@ def test_what_is_not_finite_ends_it(name, dots, small):
         spoilt = module.pretrained if name == "projection" else getattr(module, "heads", module)
         with torch.no_grad():
             next(p for p in spoilt.parameters()).fill_(math.nan)
-    with pytest.raises(ProbsceneError, match=r"(^|: )Expected .*finite .* actual .*(nan|NaN).*; "):
+    with pytest.raises(ProbsceneError, match=r"(^|: )expected .*finite .* got .*(nan|NaN).*; "):
         training.run()
 
 
 @pytest.mark.parametrize("cosine", [True, False])
 def test_pyros_own_loop_takes_the_same_steps(dots, small, cosine):
-    """The loop of examples/multi_mnist.py, seeded as ``Trainer`` seeds its batches."""
+    """The loop of examples/multi_mnist.py, seeded as ``StructureTraining`` seeds its batches."""
     torch.manual_seed(0)
     trainer, learnt = structure(dots, small, cosine=cosine)
     trainer.run()

@@ -17,7 +17,7 @@ from probscene.errors import DataError
 from probscene.models.aerial2d import APART, CANVAS, GRAMMAR, LANE, MODEL, PRETRAINING, ROAD, TARGET
 from probscene.models.aerial_sprites import folder
 from probscene.relations import per_parent
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.structure import StructurePrior, counts
 
@@ -170,7 +170,7 @@ def test_hidden_files_are_no_pictures(tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ("missing", "Expected PNG files in .*tree"),
+        ("missing", "expected PNG files in .*tree"),
         ("no alpha", r"tree/one\.png, which has no alpha channel;"),
         ("no picture", r"tree/one\.png, which is not a PNG"),
         ("web", r"tree/one\.png, which is a WebP file"),

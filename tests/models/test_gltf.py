@@ -473,7 +473,7 @@ def test_a_grey_picture_of_16_bits(tmp_path):
 def test_an_extension_that_is_needed_and_not_drawn_is_named(tmp_path, name):
     file = File()
     file.tree["extensionsRequired"] = ["KHR_texture_transform", name]
-    with pytest.raises(DataError, match=rf"a plain glTF, actual one that needs {name} in .*a\.glb; export it without"):
+    with pytest.raises(DataError, match=rf"a plain glTF, got one that needs {name} in .*a\.glb; export it without"):
         file.read(tmp_path)
     file.tree["extensionsRequired"], file.tree["extensionsUsed"] = [], [name]
     assert (middles(file.read(tmp_path)) == RED).all()
@@ -489,7 +489,7 @@ def test_data_that_only_an_extension_has_is_named(tmp_path):
     file = File()
     file.tree["textures"] = [{}]
     file.extension(file.tree["textures"][0], "KHR_texture_basisu", {"source": 0}, required=False)
-    with pytest.raises(DataError, match=r"PNG or JPEG, actual KHR_texture_basisu in .*a\.glb"):
+    with pytest.raises(DataError, match=r"PNG or JPEG, got KHR_texture_basisu in .*a\.glb"):
         file.read(tmp_path)
 
 
@@ -497,7 +497,7 @@ def test_too_many_instances_are_counted_before_they_are_made(tmp_path):
     file = File()
     move = file.accessor(np.zeros((20_000, 3), np.float32))
     file.extension(file.tree["nodes"][0], "EXT_mesh_gpu_instancing", {"attributes": {"TRANSLATION": move}})
-    with pytest.raises(DataError, match=r"at most 200000 triangles, actual 240000 in .*a\.glb"):
+    with pytest.raises(DataError, match=r"at most 200000 triangles, got 240000 in .*a\.glb"):
         file.read(tmp_path)
 
 

@@ -17,9 +17,9 @@ import trimesh
 from PIL import Image
 
 from probscene.errors import DataError
-from probscene.models.assets.catalogue import DECORATION, KINDS, street
 from probscene.models.assets.meshes.folder import SIZES, described, folder
 from probscene.models.assets.meshes.part import decoded, opened
+from probscene.models.assets.things.catalogue import DECORATION, KINDS, street
 
 TO_Y_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # x forward, y left, z up to z forward, x left, y up
 CAR = (4.4, 1.8, 1.5)
@@ -260,34 +260,34 @@ PLY = (
     "property list uchar int vertex_indices\nend_header\n-2.2 -0.9 0\n-2.2 0.9 0\n0 -0.5 0\n2.2 0.9 0\n2.2 -0.9 0\n"
 )
 FAULTS = {
-    "no triangle": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 0 4\n", "actual"),
-    "an empty file": ("a.obj", "", "actual"),
-    "an empty glb": ("a.glb", "", "Expected a glTF file"),
-    "no glb": ("a.glb", "hello there, this is no glTF file", "Expected a glTF file"),
-    "an empty ply": ("a.ply", "", "Expected a mesh"),
-    "a cut stl": ("a.stl", "\0" * 90, "Expected a mesh"),
+    "no triangle": ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 0 4\n", "got"),
+    "an empty file": ("a.obj", "", "got"),
+    "an empty glb": ("a.glb", "", "expected a glTF file"),
+    "no glb": ("a.glb", "hello there, this is no glTF file", "expected a glTF file"),
+    "an empty ply": ("a.ply", "", "expected a mesh"),
+    "a cut stl": ("a.stl", "\0" * 90, "expected a mesh"),
     "no area": ("a.obj", "v 0 0 0\nv 0 0 2\nv 0 0 4\nf 1 2 3\n", "with an area"),
     "NaN": ("a.obj", CAR_OBJ.replace("v -0.9 0 -2.2", "v nan 0 -2.2"), "finite vertices"),
     "infinity": ("a.obj", CAR_OBJ.replace("v -0.9 0 -2.2", "v inf 0 -2.2"), "finite vertices"),
-    "a vertex that is not there": ("a.obj", CAR_OBJ + "f 1 2 99\n", "Expected"),
-    "centimetres": ("a.obj", HUGE, "Expected a car 2.2 to 6.5 m long, actual 440 m in .*centimetres.*a@3.8m.obj"),
-    "a toy": ("a.obj", CAR_OBJ.replace("2.2", "0.022"), "actual 0.044 m .*in metres"),
-    "sideways": ("a.obj", CAR_OBJ.replace("0.9", "3.9"), "longer than wide, actual 4.4 m long and 7.8 m wide"),
-    "too high": ("a.obj", CAR_OBJ.replace("1.5", "500"), "at most 200 m, actual 500 m"),
+    "a vertex that is not there": ("a.obj", CAR_OBJ + "f 1 2 99\n", "expected"),
+    "centimetres": ("a.obj", HUGE, "expected a car 2.2 to 6.5 m long, got 440 m in .*centimetres.*a@3.8m.obj"),
+    "a toy": ("a.obj", CAR_OBJ.replace("2.2", "0.022"), "got 0.044 m .*in metres"),
+    "sideways": ("a.obj", CAR_OBJ.replace("0.9", "3.9"), "longer than wide, got 4.4 m long and 7.8 m wide"),
+    "too high": ("a.obj", CAR_OBJ.replace("1.5", "500"), "at most 200 m, got 500 m"),
     "a named size of none": ("a@0m.obj", CAR_OBJ, "above 0 m"),
-    "no materials": ("a.obj", "mtllib gone.mtl\n" + CAR_OBJ, "gone.mtl, actual no such file"),
+    "no materials": ("a.obj", "mtllib gone.mtl\n" + CAR_OBJ, "gone.mtl, got no such file"),
     "no texture": ("a.obj", TEXTURED, "texture my brick.png of .*no such file", "map_Kd -s 1 1 1 my brick.png\n"),
     "a texture's scale of words": (
         "a.obj",
         TEXTURED,
-        "numbers after -s and -o of .*actual -s on",
+        "numbers after -s and -o of .*got -s on",
         "map_Kd -s on a.png\n",
     ),
-    "a texture that is none": ("a.obj", TEXTURED, r"Expected a picture, actual .*a\.mtl", "map_Kd a.mtl\n"),
+    "a texture that is none": ("a.obj", TEXTURED, r"expected a picture, got .*a\.mtl", "map_Kd a.mtl\n"),
     "a broken texture": (
         "a.obj",
         ALL_TEXTURED,
-        r"a picture that decodes, actual .*a\.png, which .*truncated",
+        r"a picture that decodes, got .*a\.png, which .*truncated",
         "map_Kd a.png\n",
     ),
     "a polygon with a dent": ("a.obj", DENTED + "f 1 2 3 4 5\n", "one with a dent in line 6 of"),
@@ -373,7 +373,7 @@ def test_a_folder_is_described_by_all_that_it_holds(tmp_path):
     assert a.startswith(f"meshes in {tmp_path / 'a'} (") and a.split("(")[1] != b.split("(")[1]
     write(tmp_path / "c", "car", "a.obj", CAR_OBJ)
     assert described(tmp_path / "c").split("(")[1] == a.split("(")[1]
-    with pytest.raises(DataError, match="Expected a folder of meshes"):
+    with pytest.raises(DataError, match="expected a folder of meshes"):
         described(tmp_path / "d")
 
 
@@ -385,19 +385,19 @@ def test_a_gltf_that_is_whole_is_read(tmp_path):
 
 
 def test_folders_that_cannot_be_used(tmp_path):
-    with pytest.raises(DataError, match="Expected a folder of meshes, actual .*nowhere"):
+    with pytest.raises(DataError, match="expected a folder of meshes, got .*nowhere"):
         folder(tmp_path / "nowhere")
     with pytest.raises(DataError, match="subfolders such as car"):
         folder(tmp_path)
     (tmp_path / "b" / "car").mkdir(parents=True)
-    with pytest.raises(DataError, match="mesh files .* in .*car, actual none"):
+    with pytest.raises(DataError, match="mesh files .* in .*car, got none"):
         folder(tmp_path / "b")
     write(tmp_path / "c", "zeppelin", "a.obj", CAR_OBJ)
     with pytest.raises(DataError, match="subfolders among car, van, .*zeppelin"):
         folder(tmp_path / "c")
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "a.obj").write_text(CAR_OBJ)
-    with pytest.raises(DataError, match="a subfolder for their kind, actual .*a.obj"):
+    with pytest.raises(DataError, match="a subfolder for their kind, got .*a.obj"):
         folder(tmp_path / "d")
 
 

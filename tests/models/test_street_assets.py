@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from probscene.models.assets.catalogue import DECORATION, GROUPS, KINDS, street
 from probscene.models.assets.kerbs import LENGTHS
 from probscene.models.assets.surfaces import ASPHALTS, DASH, MARKING, PITCH, surfaces
+from probscene.models.assets.things.catalogue import DECORATION, GROUPS, KINDS, street
 
 # Length, width and height in metres, and triangles: the least and the most.
 EXPECTED = {

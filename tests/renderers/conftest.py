@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from probscene.camera_effects import CameraEffects
 from probscene.mesh import Mesh, Surface
-from probscene.photo import Photo
 from probscene.world import Camera, Ground, Light, Meshes, World, resolve_ground, resolve_meshes, resolve_scene
 
 QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -49,7 +49,7 @@ def world(
     number = len(kind)
     everything = torch.ones(kind.shape, dtype=torch.bool) if present is None else present
     resolved = [resolve_meshes(layer, everything if layer.present is None else layer.present) for layer in layers]
-    parts = {"camera": camera or Camera(), "light": light or Light(), "photo": photo or Photo()}
+    parts = {"camera": camera or Camera(), "light": light or Light(), "photo": photo or CameraEffects()}
     parts = {name: resolve_scene(part, number) for name, part in parts.items()}
     ground = None if ground is None else resolve_ground(ground, number)
     return World(kind, kinds, tuple(resolved), ground=ground, **parts)

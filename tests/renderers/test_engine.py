@@ -10,7 +10,7 @@ import os, torch
 from probscene.drawing import Drawing, Sprites, resolve
 from probscene.errors import ProbsceneError
 from probscene.renderers import engine
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 one = torch.ones(1, 1)
 layer = resolve(Sprites.disc("a", 9 * one, 9 * one, 5 * one), one > 0)
 drawing = Drawing(torch.zeros(1, 1, dtype=torch.int64), ("a",), (layer,))
@@ -59,9 +59,9 @@ EVERY_KERNEL = """
 from collections import defaultdict
 import numpy as np
 from probscene.mesh import Mesh
-from probscene.photo import Photo
-from probscene.renderers.meshes import MeshRenderer
-from probscene.renderers.photo import photographed
+from probscene.camera_effects import CameraEffects
+from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.camera.effects import apply_camera_effects
 from probscene.world import Camera, Light, Meshes, World, resolve_meshes, resolve_scene
 
 function, called = engine.ti.lang.kernel_impl.Func, defaultdict(set)
@@ -72,10 +72,10 @@ def recorded(self, key, args):
 function.func_call_rvalue = recorded
 
 renderer(drawing)
-effects = Photo(contrast=0.5, blur=1.0, noise=1.0, jpeg_quality=50.0)
-photographed(resolve_scene(effects, 1), torch.zeros(1, 3, 20, 20, dtype=torch.uint8))
+effects = CameraEffects(contrast=0.5, blur=1.0, noise=1.0, jpeg_quality=50.0)
+apply_camera_effects(resolve_scene(effects, 1), torch.zeros(1, 3, 20, 20, dtype=torch.uint8))
 mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]), (9, 9, 9))
-camera, light, photo = (resolve_scene(part, 1) for part in (Camera(), Light(), Photo()))
+camera, light, photo = (resolve_scene(part, 1) for part in (Camera(), Light(), CameraEffects()))
 layer = resolve_meshes(Meshes("a", (mesh,), 0, 9.0, 0.0), one > 0)
 world = World(drawing.kind, ("a",), (layer,), camera=camera, light=light, photo=photo, ground=None)
 for samples in (1, 4):

@@ -6,10 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from probscene.camera_effects import CameraEffects
 from probscene.mesh import Surface
-from probscene.photo import Photo
-from probscene.renderers.mesh.texture_atlas import TextureAtlas
-from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.mesh.tables.texture_atlas import TextureAtlas
 from probscene.world import Camera, Ground, Light, Meshes
 
 CANVAS = (188, 300)
@@ -168,7 +168,7 @@ def test_what_the_camera_makes_of_colours(shapes):
 
     def seen(**photo):
         lit = light(sun=0.0, ambient=1.0)
-        world = shapes.world(camera=above(), ground=plain(colour), light=lit, photo=Photo(**photo))
+        world = shapes.world(camera=above(), ground=plain(colour), light=lit, photo=CameraEffects(**photo))
         return RENDERER(world).image[0, :, 50, 50].numpy()
 
     np.testing.assert_allclose(seen(), colour, atol=0.6)
@@ -182,7 +182,7 @@ def test_what_the_camera_makes_of_colours(shapes):
 
 def test_noise_is_normal_and_of_its_seed(shapes):
     kind = torch.zeros(3, 0, dtype=torch.int64)
-    photo = Photo(noise=8.0, seed=torch.tensor([[7], [8], [7]]))
+    photo = CameraEffects(noise=8.0, seed=torch.tensor([[7], [8], [7]]))
     world = shapes.world(
         kind=kind, camera=above(), ground=plain((128, 128, 128)), light=light(sun=0.0, ambient=1.0), photo=photo
     )

@@ -10,15 +10,15 @@ from reference.sprites import ReferenceRenderer, spread
 from probscene.batch import RenderBatch
 from probscene.drawing import Atlas, Drawing, Layer, Sprites, box, disc, resolve
 from probscene.errors import ModelError
-from probscene.renderers import sprites as sprites_module
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite import renderer as sprites_module
+from probscene.renderers.sprite.renderer import SpriteRenderer
 
 CANVAS = (37, 43)
 RENDERER = SpriteRenderer(CANVAS, threads=1)
 
 
 def _atlas(generator) -> Atlas:
-    """Noise of every sort of outline, and the two that the hub has."""
+    """Noise of every sort of outline, and the two that the core has."""
     sprites = [disc(), box()]
     for sort in range(5):
         height, width = generator.integers(1, 18, 2)
@@ -355,5 +355,5 @@ def test_malformed_drawings_are_named():
 
 @pytest.mark.parametrize(("canvas", "threads"), [((0, 5), 1), ((5, -1), 1), ((1 << 14, 1 << 14), 1), ((5, 5), 0)])
 def test_malformed_renderers_are_named(canvas, threads):
-    with pytest.raises(ModelError, match="Expected"):
+    with pytest.raises(ModelError, match="expected"):
         SpriteRenderer(canvas, threads)

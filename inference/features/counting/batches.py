@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from probscene.ahead import ahead
+from probscene.prefetch import ahead
 from probscene.sampling import seed_everything
 
 from ...training import batch_seed
@@ -20,8 +20,8 @@ from ..base import Draw, Examples
 from .net import BORDER, STRIDE, CountNet
 
 STEPS_A_DRAW = 16
-FULL = 128**2  # pixels of a reduced image of which a step takes as many as the schedule says
-FEWEST = 4  # images a step, however large
+FULL_AREA = 128**2  # pixels of a reduced image of which a step takes as many as the schedule says
+MIN_IMAGES = 4  # images a step, however large
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,10 @@ class CountBatch(NamedTuple):
     group_cells: Tensor | None
 
 
-def images_a_step(most: int, area: float) -> int:
+def images_per_step(most: int, area: float) -> int:
     """``most``, of images of up to 128 x 128 pixels when reduced; of images of a larger ``area``, which hold more
     objects, as many as have those pixels together, but at least 4."""
-    return min(most, max(FEWEST, round(most * FULL / area)))
+    return min(most, max(MIN_IMAGES, round(most * FULL_AREA / area)))
 
 
 class CountBatches:
@@ -125,7 +125,7 @@ class CountBatches:
     @property
     def images(self) -> int:
         """Images a step."""
-        return images_a_step(self.schedule.images, self.net.area)
+        return images_per_step(self.schedule.images, self.net.area)
 
     def after(self, done: int) -> Generator[list[CountBatch]]:
         """The batches that are left after ``done`` steps, a draw at a time, while another thread makes the next."""

@@ -13,24 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-SPREAD = 2.0  # pixels, standard deviation of a vote
-SHARE = 0.25  # of an ordinary group's votes that a peak must have
+VOTE_SD = 2.0  # pixels, standard deviation of a vote
+MIN_PEAK_SHARE = 0.25  # of an ordinary group's votes that a peak must have
 ABSENT = -1.0  # the count of a group that is not there, so that it is none of those that are there and empty
-
-
-def group_of(kind: Tensor, parent: Tensor, group: int) -> Tensor:
-    """The node of kind ``group`` that each node is or belongs to, ``(N, M)`` int64, -1 for none.
-
-    Args:
-        kind, parent: ``(N, M)`` int64 of a derivation.
-    """
-    own = torch.arange(kind.shape[1]).expand_as(kind)
-    found, above = torch.where(kind == group, own, -1), parent
-    while ((found < 0) & (above >= 0)).any():
-        at = above.clamp(min=0)
-        found = torch.where((found < 0) & (above >= 0) & (kind.gather(1, at) == group), above, found)
-        above = torch.where(above >= 0, parent.gather(1, at), above)
-    return found
 
 
 def tally_groups(
@@ -52,7 +37,7 @@ def tally_groups(
     """
     N, C = objects.shape[:2]
     height = _density(vote.flatten(1).clamp(0, length - 1), surface.flatten(1), length)
-    peak = height > SHARE * mass / (SPREAD * (2 * torch.pi) ** 0.5)
+    peak = height > MIN_PEAK_SHARE * mass / (VOTE_SD * (2 * torch.pi) ** 0.5)
     peak[:, 1:] &= height[:, 1:] > height[:, :-1]
     peak[:, :-1] &= height[:, :-1] >= height[:, 1:]
     number = peak.sum(1)
@@ -72,6 +57,6 @@ def _density(place: Tensor, weight: Tensor, length: int) -> Tensor:
     votes = torch.zeros(len(place), length + 1)
     votes.scatter_add_(1, low, weight * (1 - part))
     votes.scatter_add_(1, low + 1, weight * part)
-    reach = int(4 * SPREAD)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / SPREAD) ** 2)
+    reach = int(4 * VOTE_SD)
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / VOTE_SD) ** 2)
     return F.conv1d(votes[:, None, :length], (kernel / kernel.sum())[None, None], padding=reach)[:, 0]

@@ -40,7 +40,7 @@ class Muon(torch.optim.Optimizer):
         for parameter in (p for group in self.param_groups for p in group["params"]):
             if parameter.ndim != 2:
                 raise ProbsceneError(
-                    f"Expected matrices as Muon's parameters, actual shape {tuple(parameter.shape)}; give the others "
+                    f"expected matrices as Muon's parameters, got shape {tuple(parameter.shape)}; give the others "
                     "to another optimiser."
                 )
 

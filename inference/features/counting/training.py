@@ -1,4 +1,4 @@
-"""Training the count network on prior renders with their free labels.
+"""Features that count by a network of the fit's own, trained on prior renders with their free labels.
 
 The loss is the cross-entropy of the cells and the squared error of the soft counts, and the error of the votes where
 objects are counted by groups. What the steps look at is drawn ahead in a thread of its own: the network is so small
@@ -9,23 +9,67 @@ Reference:
 """
 
 import math
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.model import SceneModel
+from probscene.sampling import seed_everything
 from probscene.threads import threads
 
-from ...training import Report, check_finite, restore_training, training_state
-from ..base import Draw
-from .batches import CountBatch, CountBatches, CountSchedule, Votes
+from ...training import Callback, TrainingLoop, batch_seed
+from ..base import Draw, Features, Photographs, Renders
+from .batches import STEPS_A_DRAW, CountBatch, CountBatches, CountSchedule, Votes
 from .muon import Muon
 from .net import CountNet
 
+WARMUP_STEPS, MAX_GRAD_NORM = 50, 5.0
 
-class CountTraining:
-    """Resumable training.
+
+@dataclass(frozen=True)
+class CountFeatures(Features):
+    """``CountNet``, trained on renders of the prior, or of what guides are pretrained on.
+
+    Args:
+        schedule: of its training.
+        width, blocks: its size, see ``CountNet``.
+    """
+
+    schedule: CountSchedule = field(default_factory=CountSchedule)
+    width: tuple[int, int, int] = (16, 32, 64)
+    blocks: tuple[int, int] = (1, 1)
+
+    name = "count"
+    resolution = 0.5  # of a count
+
+    @property
+    def images(self) -> int:
+        """See ``Features``; fewer of a canvas above 128 x 128 pixels."""
+        return self.schedule.steps * self.schedule.images
+
+    def build(self, model: SceneModel) -> CountNet:
+        """Untrained."""
+        rounding = self.schedule.rounding
+        return CountNet(model.classes, model.channels, model.canvas, self.width, self.blocks, model.groups, rounding)
+
+    def training(
+        self, net: CountNet, renders: Renders, photographs: Callable[[], Photographs], seed: int
+    ) -> "CountTraining":
+        """On renders alone, reduced no more than the model's small objects bear."""
+        seed_everything(0)  # how large objects are is the model's, and the same for all seeds
+        net.fit_to(renders.object_size())
+        draw = partial(renders.draw, beyond_prior=self.schedule.beyond_prior)
+        return CountTraining(net, draw, self.schedule, seed=batch_seed(seed, 1))
+
+
+class CountTraining(TrainingLoop):
+    """Adam and Muon on the loss of ``count_loss`` and ``group_loss``.
 
     Args:
         net: trained in place.
@@ -37,56 +81,44 @@ class CountTraining:
         unit, total, done: see ``Training``.
     """
 
+    subject = "the count network"
+    report_every = STEPS_A_DRAW
+
     def __init__(self, net: CountNet, draw: Draw, schedule: CountSchedule, seed: int = 0):
-        self.net, self.schedule, self.unit, self.total = net, schedule, "steps", schedule.steps
+        self.net, self.schedule = net, schedule
         self.batches = CountBatches(net, draw, schedule, seed)
+        self.left: Iterator[CountBatch] = iter(())
         # Muon [1] takes matrices: a second parameter over the storage of each convolution that batch norm follows.
         inner = [m.weight for m in net.modules() if isinstance(m, nn.Conv2d) and m.bias is None and m.in_channels > 3]
         self.matrices = [(weight, nn.Parameter(weight.detach().view(len(weight), -1))) for weight in inner]
         rest = [p for p in net.parameters() if not any(p is weight for weight in inner)]
-        self.optimisers = {
+        optimisers: dict[str, torch.optim.Optimizer] = {
             "adam": torch.optim.AdamW(rest, lr=schedule.learning_rate, betas=(0.9, 0.99), weight_decay=1e-3),
             "muon": Muon([matrix for _, matrix in self.matrices], lr=schedule.muon_rate, momentum=0.8),
         }
-        self.done = 0
+        super().__init__(net, optimisers, schedule.steps, seed)
+        self.remedy = (
+            f"begin again with lower rates, such as count.muon_rate={schedule.muon_rate / 4:g} and "
+            f"count.learning_rate={schedule.learning_rate / 4:g}"
+        )
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the steps that are left; ``each`` hears the mean loss after every draw.
-
-        Raises:
-            ProbsceneError: the loss is no longer finite.
-        """
-        s = self.schedule
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``; the callback is given the mean loss after every draw of batches."""
         self.net.train()
         # The next batches are drawn on another core meanwhile.
         with threads(1), closing(self.batches.after(self.done)) as draws:
-            for batches in draws:
-                loss = sum(map(self._step, batches)) / len(batches)
-                remedy = (
-                    f"begin again with lower rates, such as count.muon_rate={s.muon_rate / 4:g} and "
-                    f"count.learning_rate={s.learning_rate / 4:g}"
-                )
-                check_finite(loss, self.net.parameters(), "the count network", f"at step {self.done}", remedy)
-                if each is not None:
-                    each(self, {"loss": loss})
+            self.left = chain.from_iterable(draws)
+            super().run(callback)
         self.net.eval()
 
-    def summary(self) -> dict[str, float]:
-        """Nothing more for the log."""
-        return {}
+    def seed_step(self) -> None:
+        """Nothing: the thread that draws the batches seeds them, and steps draw no random numbers."""
 
-    def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
-        return training_state(self.net, self.optimisers, done=self.done)
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        numbers = restore_training(self.net, self.optimisers, tensors)
-        self.done = int(numbers["done"])
-
-    def _step(self, batch: CountBatch) -> float:
+    def step(self) -> float:
+        """See ``TrainingLoop``."""
+        batch = next(self.left)
         s = self.schedule
-        factor = min(1.0, (self.done + 1) / 50) * 0.5 * (1 + math.cos(math.pi * self.done / s.steps))
+        factor = min(1.0, (self.done + 1) / WARMUP_STEPS) * 0.5 * (1 + math.cos(math.pi * self.done / s.steps))
         for optimiser, rate in zip(self.optimisers.values(), (s.learning_rate, s.muon_rate), strict=True):
             for group in optimiser.param_groups:
                 group["lr"] = rate * factor
@@ -98,14 +130,13 @@ class CountTraining:
             self.net.group_cells.lerp_(batch.group_cells, max(0.01, 1 / (self.done + 1)))
         self.net.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        nn.utils.clip_grad_norm_(self.net.parameters(), MAX_GRAD_NORM)
         for weight, matrix in self.matrices:
             matrix.grad = None if weight.grad is None else weight.grad.view_as(matrix)
             with torch.no_grad():  # batch norm makes the scale free; fixed, the rate means the same all the way
                 matrix.mul_(len(matrix) ** 0.5 / matrix.norm())
         for optimiser in self.optimisers.values():
             optimiser.step()
-        self.done += 1
         return loss.item()
 
 

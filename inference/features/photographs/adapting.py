@@ -8,30 +8,30 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..base import Photographs, Seen
-from .heads import SMALLEST, PretrainedCountNet
+from ..base import ImageCallback, Photographs
+from .net import MIN_PIXELS, PretrainedCountNet
 from .readability import Read, Reading, rules_for_renders, with_labels, without_labels
 from .reading import RULES, SCOPES
 
 LOOKED_AT_ONCE = 64  # images
 
 
-def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Seen) -> dict[str, Any]:
+def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback: ImageCallback) -> dict[str, Any]:
     """Choose rules, scopes and what is compared, in place.
 
     Args:
         net: with heads that are trained and have learnt from photographs.
         most: photographs that are looked at, beside the labelled ones.
-        each: see ``Features.adapt``.
+        callback: see ``Features.adapt``.
 
     Returns:
         ``"classes"``: a record of each.
     """
-    images, labelled = photographs.some(most), photographs.labelled
+    images, labelled = photographs.subset(most), photographs.labelled
     marked = images[:0] if labelled is None else labelled.images
     total = len(images) + len(marked)
-    whole = _look(net, images, 0, total, each)
-    of_labelled = _look(net, marked, len(images), total, each) if len(marked) else whole[:0]
+    whole = _look(net, images, 0, total, callback)
+    of_labelled = _look(net, marked, len(images), total, callback) if len(marked) else whole[:0]
     read = Read(whole, of_labelled, net.apart, net.held_read, net.held_true)
     counts = {} if labelled is None else dict(zip(labelled.classes, labelled.counts.T, strict=True))
     records: dict[str, Any] = {}
@@ -40,7 +40,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
             found = without_labels(read, c)
             because = f"{found.mean:.1f} an image, not compared: stuff has no definite number"
             found = found._replace(readable=True, because=because)
-        elif net.size[c] < SMALLEST:
+        elif net.size[c] < MIN_PIXELS:
             found = without_labels(read, c)._replace(readable=False, because=_too_small(net, c))
         elif name in counts:
             found = with_labels(read, c, counts[name])
@@ -52,13 +52,13 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, each: Se
     return {"classes": records}
 
 
-def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, each: Seen) -> Tensor:
+def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, callback: ImageCallback) -> Tensor:
     """Readings ``(L, S, R, C)``."""
     parts = []
     for some in images.split(LOOKED_AT_ONCE):
-        parts.append(net.readings(net.look(some))[0])
+        parts.append(net.readings(net.compute_maps(some))[0])
         done += len(some)
-        each(done, total)
+        callback(done, total)
     return torch.cat(parts)
 
 
@@ -94,7 +94,7 @@ def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:
 
 
 def _too_small(net: PretrainedCountNet, c: int) -> str:
-    pixels, needed = float(net.size[c]), SMALLEST
+    pixels, needed = float(net.size[c]), MIN_PIXELS
     height, width = net.canvas
     entering = net.frozen[0].entering(height, width)
     scale = needed / pixels * 1.1

@@ -8,10 +8,10 @@ from probscene.model import SceneModel
 
 from ...divergence import Blockwise, Divergence
 from ...training import Training, batch_seed
-from ..base import FeatureNet, Features, Photographs, Renders, Seen
+from ..base import FeatureNet, Features, ImageCallback, Photographs, Renders
 
 if TYPE_CHECKING:
-    from .heads import PretrainedCountNet
+    from .net import PretrainedCountNet
 
 COUNT_ON_PRETRAINED = "count=efficientnet"
 
@@ -44,7 +44,7 @@ class PretrainedCountFeatures(Features):
 
     def build(self, model: SceneModel) -> FeatureNet:
         """Pretrained, with untrained heads."""
-        from .heads import PretrainedCountNet  # torchvision takes seconds to import
+        from .net import PretrainedCountNet  # torchvision takes seconds to import
 
         return PretrainedCountNet(model.classes, model.canvas, model.stuff, self.scenes)
 
@@ -57,38 +57,38 @@ class PretrainedCountFeatures(Features):
 
         heads, target = cast("PretrainedCountNet", net), photographs()
         heads.bind(target.fingerprint)
-        draw, images = renders.draw_twice, target.some(self.photographs)
+        draw, images = renders.draw_twice, target.subset(self.photographs)
         return PretrainedCountTraining(
             heads, draw, self.pairs, self.epochs, photographs=images, seed=batch_seed(seed, 1)
         )
 
-    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], each: Seen) -> dict[str, Any]:
+    def adapt(self, net: FeatureNet, photographs: Callable[[], Photographs], callback: ImageCallback) -> dict[str, Any]:
         """Choose how each class is read."""
         from .adapting import adapt
 
-        return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, each)
+        return adapt(cast("PretrainedCountNet", net), photographs(), self.photographs, callback)
 
     def divergence(self, net: FeatureNet, chosen: Divergence) -> Divergence:
         """Of things as chosen, of stuff none."""
         return Blockwise(cast("PretrainedCountNet", net).blocks, (chosen, None))
 
-    def taught_by(self, net: FeatureNet) -> str:
+    def target_fingerprint(self, net: FeatureNet) -> str:
         """The images that heads and rules are suited to."""
         return cast("PretrainedCountNet", net).taught_by_fingerprint
 
-    def settings(self, preset: Any) -> dict[str, Any]:
+    def settings(self, config: Any) -> dict[str, Any]:
         """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
         each structure is drawn once. Photographs' counts are noisy, and few: the prior of a preset that has such a
         weight holds them more. They come in units of their bandwidth, which the kernel takes as they are. Parameters
         are not learnt by what a reader reads in photographs, of which it has seen none."""
+        weight = config.structure.prior_kl_weight
         return {
-            "parameter_method": "tilting",
-            "pairs": 1000,
-            "batches": 40,
-            "num_scenes": 250,
-            "draws_per_structure": 1,
-            "variance": None if preset.variance is None else 1.0,
-            "marginal_variance": 0.1,
-            "stabilised": False,
-            "prior_kl_weight": max(preset.prior_kl_weight, 0.1) if preset.prior_kl_weight else 0.0,
+            "parameters": "tilting",
+            "structure.batches": 40,
+            "structure.num_scenes": 250,
+            "structure.draws_per_structure": 1,
+            "structure.prior_kl_weight": max(weight, 0.1) if weight else 0.0,
+            "divergence.variance": None if getattr(config.divergence, "variance", 1.0) is None else 1.0,
+            "divergence.marginal_variance": 0.1,
+            "divergence.anscombe": False,
         }

@@ -28,18 +28,20 @@ from torch import Tensor
 
 from .reading import LARGE, RULES, SCOPES, SMALL
 
-AGREE = 0.25  # largest disagreement of heads, a mean difference over the mean count and ``BASE``
-CLOSE = 0.7  # largest difference of the means that rules read, over their own mean and ``BASE``
-AS_WELL, TIE_SLACK = 1.1, 0.02  # by which factor, and how many objects, errors that are as good may exceed the least
-MOSTLY = 0.7  # of a class's objects must be in the scope of large ones for this to be read
-SKILL = 0.8  # least correlation with the true counts of renders
+MAX_DISAGREEMENT = 0.25  # largest disagreement of heads, a mean difference over the mean count and ``BASE``
+MAX_RULE_SPREAD = 0.7  # largest difference of the means that rules read, over their own mean and ``BASE``
+TIE_RATIO, TIE_SLACK = 1.1, 0.02  # by which factor, and how many objects, errors that are as good may exceed the least
+MIN_LARGE_SHARE = 0.7  # of a class's objects must be in the scope of large ones for this to be read
+MIN_CORRELATION = 0.8  # least correlation with the true counts of renders
 BASE = 0.3  # objects
-RENDERS = 1.0  # how many labelled images the error on renders is worth
-ENOUGH = 5  # labelled images from which on rules are chosen by them
+RENDER_WEIGHT = 1.0  # how many labelled images the error on renders is worth
+MIN_LABELS = 5  # labelled images from which on rules are chosen by them
 ERROR_RATIO, ERROR_SLACK = 1.25, 0.1  # by which factor, and how many objects, errors on so few labels must differ
-BIASED = 2  # standard errors by which the mean of a reading may differ from that of labels which bear it out
-GOES_WITH = 0.4  # least correlation of labels with a reading that is believed without them
-APART = 0.25  # relative difference of means from which on labels and such a reading are of different things
+MAX_BIAS = 2  # standard errors by which the mean of a reading may differ from that of labels which bear it out
+MIN_LABEL_CORRELATION = 0.4  # of labels with a reading that is believed without them
+MAX_MEAN_DIFFERENCE = (
+    0.25  # relative difference of means from which on labels and such a reading are of different things
+)
 Array = NDArray[np.float64]
 
 
@@ -70,7 +72,7 @@ class Reading(NamedTuple):
         rules: of ``RULES``, whose median is read.
         scope: of ``SCOPES``.
         mean: of the counts that are read.
-        disagreement, spread, skill: see ``AGREE``, ``CLOSE`` and ``SKILL``.
+        disagreement, spread, skill: see ``MAX_DISAGREEMENT``, ``MAX_RULE_SPREAD`` and ``MIN_CORRELATION``.
         error: mean absolute leave-one-out error on the labelled images; NaN without labels.
         steps: counts are how many of these values the reading reaches, where the labels' histogram is learnt.
         because: one sentence.
@@ -95,7 +97,7 @@ def scopes_without_labels(true: Tensor) -> Tensor:
     Args:
         true: ``(V, S, C)`` counts of renders.
     """
-    large = true[:, LARGE].sum(0) >= MOSTLY * true[:, SMALL].sum(0)
+    large = true[:, LARGE].sum(0) >= MIN_LARGE_SHARE * true[:, SMALL].sum(0)
     return torch.where(large, LARGE, SMALL)
 
 
@@ -131,13 +133,13 @@ def without_labels(read: Read, c: int) -> Reading:
     s = int(scopes_without_labels(read.true)[c])
     true = read.true[:, s, c]
     error = (read.renders[:, s, :, c] - true[:, None]).abs().mean(0)
-    rules = (error <= AS_WELL * error.min() + TIE_SLACK).nonzero().flatten()
+    rules = (error <= TIE_RATIO * error.min() + TIE_SLACK).nonzero().flatten()
     counts = read.photographs[:, s, rules, c].double().quantile(0.5, 1)
     mean, means = float(counts.mean()), read.photographs[:, s, rules, c].double().mean(0)
     apart = float(read.apart[s, rules, c].mean())
     spread = float((means.max() - means.min()) / (means.mean() + BASE))
     skill = _correlation(read.renders[:, s, rules, c].quantile(0.5, 1), true)
-    good = s == LARGE and apart <= AGREE and spread <= CLOSE and skill >= SKILL
+    good = s == LARGE and apart <= MAX_DISAGREEMENT and spread <= MAX_RULE_SPREAD and skill >= MIN_CORRELATION
     because = f"{'readable' if good else 'not readable'}, {mean:.1f} an image by {_by(tuple(rules.tolist()))}"
     if s == LARGE and true.sum() < read.true[:, SMALL, c].sum():
         because += f", of objects from {SCOPES[s].pixels:g} pixels"
@@ -159,7 +161,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     """
     free = without_labels(read, c)
     y = labels.double().numpy()
-    if len(y) < ENOUGH or not y.any():
+    if len(y) < MIN_LABELS or not y.any():
         why = "no labelled image shows one" if not y.any() else f"{len(y)} labelled images choose no rule"
         return free._replace(because=f"{free.because}; {why}")
     seen = read.labelled[..., c].double().numpy()  # (K, S, R)
@@ -178,7 +180,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     of_histogram = f"of the labels' histogram {histogram:.2f}"
     figures = f"leave-one-out error {error:.2f} an image, {of_histogram}"
     off = (of_free - labels).double().numpy()
-    without, surely = float(np.abs(off).mean()), BIASED * float(off.std(ddof=1)) / math.sqrt(len(y))
+    without, surely = float(np.abs(off).mean()), MAX_BIAS * float(off.std(ddof=1)) / math.sqrt(len(y))
     as_by_labels = without <= ERROR_RATIO * error + ERROR_SLACK and abs(off.mean()) <= surely + ERROR_SLACK
     if free.readable and as_by_labels and _no_worse(without, scores(all_of_free, y).mean(), histogram):
         because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image, {of_histogram})"
@@ -199,7 +201,11 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
             error=error,
             because=because,
         )
-    if free.readable and with_free < GOES_WITH and abs(seen_mean - mean) > APART * max(seen_mean, mean):
+    if (
+        free.readable
+        and with_free < MIN_LABEL_CORRELATION
+        and abs(seen_mean - mean) > MAX_MEAN_DIFFERENCE * max(seen_mean, mean)
+    ):
         because = (
             f"{free.because}; the labels do not go with what is seen (r = {with_free:.2f}, {mean:.1f} labelled for "
             f"{seen_mean:.1f} read) and are not used; see whether all objects of this class are labelled"
@@ -236,13 +242,13 @@ def _unlike(labelled: Array, photographs: Array) -> tuple[float, float] | None:
     mean = (photographs.sum() - labelled.sum()) / number
     square = ((photographs**2).sum() - (labelled**2).sum()) / number
     error = math.sqrt(labelled.var(ddof=1) / len(labelled) + max(0.0, square - mean**2) / number)
-    return (labelled.mean(), mean) if abs(labelled.mean() - mean) > BIASED * error else None
+    return (labelled.mean(), mean) if abs(labelled.mean() - mean) > MAX_BIAS * error else None
 
 
 def _choose(seen: Array, labels: Array, drawn: Array, first: int) -> tuple[int, int]:
     """The scope, from the ``first`` on, and the rule with the least error on labelled images ``(K, S, R)`` and on
     renders ``(S, R)``; of scopes that do about as well the earliest, which asks least of where objects stand."""
-    cost = (_errors(seen, labels[:, None, None]) + RENDERS / len(labels) * drawn)[first:]
+    cost = (_errors(seen, labels[:, None, None]) + RENDER_WEIGHT / len(labels) * drawn)[first:]
     scope = int(np.argmax(cost.min(1) <= ERROR_RATIO * cost.min() + ERROR_SLACK))
     return first + scope, int(np.argmin(cost[scope]))
 

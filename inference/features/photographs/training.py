@@ -24,13 +24,12 @@ from torch import Tensor, nn
 
 from probscene.sampling import seed_everything
 
-from ...training import Report, batch_seed, check_finite, restore_training, training_state
+from ...training import Callback, TrainingLoop, batch_seed
 from ..base import Draw, Examples
 from ..counting.batches import STRIDE, cells
 from ..counting.training import relative_count_loss
-from .head import KINDS, Kind, Maps
-from .heads import PretrainedCountNet
-from .looks import photographed
+from .augmentation import augment
+from .net import KINDS, Kind, Maps, PretrainedCountNet
 from .readability import disagreement
 from .reading import SCOPES, SMALL
 
@@ -39,8 +38,8 @@ PHOTOGRAPHS = 12  # a step
 SLOWER = 0.4  # rate of the epoch with photographs, of the others'
 
 
-class PretrainedCountTraining:
-    """Resumable training; after an interruption the renders are drawn and looked at again.
+class PretrainedCountTraining(TrainingLoop):
+    """AdamW on the loss of ``relative_count_loss``; after an interruption the maps are computed again.
 
     Args:
         net: trained in place.
@@ -58,6 +57,9 @@ class PretrainedCountTraining:
     """
 
     unit = "epochs"
+    subject = "the count heads"
+    remedy = "begin again with features=count"
+    seed_path = (1,)
 
     def __init__(
         self,
@@ -70,71 +72,55 @@ class PretrainedCountTraining:
         photographs: Tensor | None = None,
         seed: int = 0,
     ):
-        self.net, self.draw_twice, self.pairs, self.epochs = net, draw_twice, pairs, epochs
         some = () if photographs is None else photographs.split(2 * DRAWN_AT_ONCE)
         self.photographs = [part for part in some if len(part)]
-        self.total = epochs + (len(self.photographs) > 0)
-        self.batch_size, self.learning_rate, self.seed, self.done = batch_size, learning_rate, seed, 0
-        self.correlation: Tensor | None = None
         self.optimiser = torch.optim.AdamW(net.heads.parameters(), lr=learning_rate, weight_decay=5e-2)
+        super().__init__(net, {"adam": self.optimiser}, epochs + (len(self.photographs) > 0), seed)
+        self.net, self.draw_twice, self.pairs, self.epochs = net, draw_twice, pairs, epochs
+        self.batch_size, self.learning_rate = batch_size, learning_rate
+        self.correlation: Tensor | None = None
+        self.maps: Maps = []
+        self.targets: list[Tensor] = []
+        self.photograph_maps: Maps | None = None
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the epochs that are left.
-
-        Args:
-            each: hears how many images have been looked at, ``images``, ``of`` how many; then the mean loss after every
-                epoch.
-
-        Raises:
-            ProbsceneError: the loss is no longer finite.
-        """
-        maps, targets, true, sizes = self._look(each)
-        photographs = self._look_at_photographs(each) if self.photographs and self.done < self.total else None
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``; the callback is first given how many ``images`` are embedded, and ``of`` how many."""
+        maps, targets, true_counts, sizes = self._embed_renders(callback)
         n = 2 * self.pairs
+        self.maps, self.targets = ([part[:n] for part in some] for some in (maps, targets))
+        if self.photographs and not self.finished:
+            self.photograph_maps = self._embed_photographs(callback)
         if self.done == 0:
             some = slice(0, n, max(1, n // 512))
-            self.net.begin([part[some] for part in maps], [target[some] for target in targets])
-        while self.done < self.total:
-            seed_everything(batch_seed(self.seed, 1, self.done))
-            own = None
-            if self.done == self.epochs and photographs is not None:
-                self.net.eval()
-                self.net.apart.copy_(disagreement(self.net.readings(photographs)[1]))
-                own = photographs, [part.half() for part in self._believed(photographs)]
-            self.net.train()
-            batches = torch.randperm(n).split(self.batch_size)
-            losses = [
-                self._step([part[rows] for part in maps], [target[rows] for target in targets], i / len(batches), own)
-                for i, rows in enumerate(batches)
-            ]
-            self.done += 1
-            loss = sum(losses) / len(losses)
-            where = f"in epoch {self.done}"
-            check_finite(loss, self.net.parameters(), "the count heads", where, "begin again with features=count")
-            if each is not None:
-                each(self, {"loss": loss})
+            self.net.initialise([part[some] for part in maps], [target[some] for target in targets])
+        super().run(callback)
+        self.maps, self.targets, self.photograph_maps = [], [], None
         self.net.eval()
-        held = [part[n:] for part in maps]
+        held_out = [part[n:] for part in maps]
         median = torch.stack([some.median() if len(some) else torch.tensor(math.inf) for some in sizes])
-        self.net.finish(self.net.readings(held)[0], true[n:], median)
+        self.net.calibrate(self.net.readings(held_out)[0], true_counts[n:], median)
         scope, rule, classes = self.net.scope, self.net.rules[0].int().argmax(1), torch.arange(len(self.net.scope))
-        seen, known = self.net.held_read[:, scope, rule, classes], self.net.held_true[:, scope, classes]
-        each_class = zip(seen.T, known.T, strict=True)
+        predicted, known = self.net.held_read[:, scope, rule, classes], self.net.held_true[:, scope, classes]
+        each_class = zip(predicted.T, known.T, strict=True)
         self.correlation = torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in each_class])
+
+    def step(self) -> float:
+        """An epoch; the last one with photographs, where there are some."""
+        photographs = None
+        if self.done == self.epochs and self.photograph_maps is not None:
+            self.net.eval()
+            self.net.apart.copy_(disagreement(self.net.readings(self.photograph_maps)[1]))
+            photographs = self.photograph_maps, [part.half() for part in self._pseudo_labels(self.photograph_maps)]
+        self.net.train()
+        batches = torch.randperm(2 * self.pairs).split(self.batch_size)
+        losses = [self._update(rows, i / len(batches), photographs) for i, rows in enumerate(batches)]
+        return sum(losses) / len(losses)
 
     def summary(self) -> dict[str, Any]:
         """For the log: how well objects are counted in renders."""
         if self.correlation is None:
             return {}
         return {"stage": "counts", "correlation": [x if x == x else None for x in self.correlation.tolist()]}
-
-    def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
-        return training_state(self.net, {"adam": self.optimiser}, done=self.done)
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        self.done = int(restore_training(self.net, {"adam": self.optimiser}, tensors)["done"])
 
     @property
     def _structures(self) -> int:
@@ -143,10 +129,10 @@ class PretrainedCountTraining:
 
     @property
     def _images(self) -> int:
-        """That are looked at."""
+        """That are embedded."""
         return 2 * self._structures + sum(map(len, self.photographs))
 
-    def _look(self, each: Report | None) -> tuple[Maps, list[Tensor], Tensor, list[Tensor]]:
+    def _embed_renders(self, callback: Callback | None) -> tuple[Maps, list[Tensor], Tensor, list[Tensor]]:
         """Of renders: maps, float16, what the places of each of ``KINDS`` should hold ``(N, its scopes, 1 + C, h, w)``
         float16 and the true counts ``(N, S, C)``, of what is trained on and then of what is held out. Of each class the
         sizes of its objects, pixels of what enters."""
@@ -157,15 +143,15 @@ class PretrainedCountTraining:
         while done < total:
             number = min(DRAWN_AT_ONCE, total - done, self.pairs - done if done < self.pairs else total)
             drawn = self.draw_twice(number)
-            maps = self.net.look(photographed(drawn.image, rng))
+            maps = self.net.compute_maps(augment(drawn.image, rng))
             targets = [self._target(drawn, kind).half() for kind in KINDS]
             parts.append([*(some.half() for some in maps), *targets, self.net.true_counts(drawn)])
             shown = drawn.label.masked_fill(drawn.visible < SCOPES[SMALL].visible, -1)
             for c, of_class in enumerate(sizes):
                 of_class.append((drawn.size * self.net.scale()).amax(-1)[shown == c])
             done += number
-            if each is not None:
-                each(self, {"images": 2 * done, "of": self._images})
+            if callback is not None:
+                callback(self, {"images": 2 * done, "of": self._images})
         last = 2 * self.pairs + len(self.net.held_true)
         *both, true = (torch.cat(column)[:last] for column in zip(*parts, strict=True))
         return both[: -len(KINDS)], both[-len(KINDS) :], true, [torch.cat(of_class) for of_class in sizes]
@@ -175,46 +161,49 @@ class PretrainedCountTraining:
         places = drawn.centre * self.net.scale() / kind.stride
         size, number = self.net.places(kind.stride), len(self.net.classes)
         return torch.stack(
-            [cells(places * STRIDE, self.net.seen(drawn, SCOPES[s]), number, *size) for s in kind.scopes], 1
+            [cells(places * STRIDE, self.net.counted_labels(drawn, SCOPES[s]), number, *size) for s in kind.scopes], 1
         )
 
-    def _look_at_photographs(self, each: Report | None) -> Maps:
+    def _embed_photographs(self, callback: Callback | None) -> Maps:
         """Maps, float16."""
         parts, done = [], 2 * self._structures
         for some in self.photographs:
-            parts.append([part.half() for part in self.net.look(some)])
+            parts.append([part.half() for part in self.net.compute_maps(some)])
             done += len(some)
-            if each is not None:
-                each(self, {"images": done, "of": self._images})
+            if callback is not None:
+                callback(self, {"images": done, "of": self._images})
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
-    def _believed(self, photographs: Maps) -> list[Tensor]:
-        """What their places hold as the heads read them, see ``PretrainedCountNet.believed``."""
-        parts = [self.net.believed(list(some)) for some in zip(*(part.split(64) for part in photographs), strict=True)]
+    def _pseudo_labels(self, photographs: Maps) -> list[Tensor]:
+        """What their places hold as the heads read them, see ``PretrainedCountNet.pseudo_labels``."""
+        parts = [
+            self.net.pseudo_labels(list(some)) for some in zip(*(part.split(64) for part in photographs), strict=True)
+        ]
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
-    def _step(self, maps: Maps, targets: list[Tensor], part: float, own: tuple[Maps, list[Tensor]] | None) -> float:
-        over, rate = (self.done + part) / self.epochs, self.learning_rate
-        if own is not None:
-            over, rate = part, SLOWER * rate
+    def _update(self, rows: Tensor, part: float, photographs: tuple[Maps, list[Tensor]] | None) -> float:
+        """A step of the optimiser on some renders, after a part of the epoch; returns its loss."""
+        progress, rate = (self.done + part) / self.epochs, self.learning_rate
+        if photographs is not None:
+            progress, rate = part, SLOWER * rate
         for group in self.optimiser.param_groups:
-            group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * over))
-        loss = self._loss(maps, targets)
-        if own is not None:
-            rows = torch.randint(len(own[0][0]), (PHOTOGRAPHS,))
-            loss = loss + self._loss(*([each[rows] for each in part] for part in own), taught=True)
+            group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * progress))
+        loss = self._loss([some[rows] for some in self.maps], [target[rows] for target in self.targets])
+        if photographs is not None:
+            rows = torch.randint(len(photographs[0][0]), (PHOTOGRAPHS,))
+            loss = loss + self._loss(*([some[rows] for some in part] for part in photographs), self_training=True)
         self.optimiser.zero_grad()
         loss.backward()
         self.optimiser.step()
         return loss.item()
 
-    def _loss(self, maps: Maps, targets: list[Tensor], taught: bool = False) -> Tensor:
+    def _loss(self, maps: Maps, targets: list[Tensor], self_training: bool = False) -> Tensor:
         """Of all heads, or of those alone that teach themselves."""
         flipped = torch.rand(len(maps[0])) < 0.5
-        seen = [torch.where(flipped[:, None, None, None], some.flip(3), some) for some in self.net.normal(maps)]
+        seen = [torch.where(flipped[:, None, None, None], some.flip(3), some) for some in self.net.normalise(maps)]
         loss = torch.zeros(())
         for kind, heads, target in zip(KINDS, self.net.heads, targets, strict=True):
-            if taught and not kind.teaches:
+            if self_training and not kind.self_training:
                 continue
             target = torch.where(flipped[:, None, None, None, None], target.flip(4), target).float()
             shifted = [some + kind.shift * torch.randn(*some.shape[:2], 1, 1) for some in seen]

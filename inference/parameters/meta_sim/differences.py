@@ -28,8 +28,8 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import Scenes, run_program
 
-from ..graph import Graph, Seen
-from ..sites import NEAR, Site, of_scenes, quantiles_of, within
+from ..graph import ClassNodes, SceneGraph
+from ..sites import U_EPS, Site, of_scenes, quantiles_of, with_handlers
 
 AT_ONCE = 256  # scenes that a program is run on
 
@@ -37,46 +37,47 @@ Embed = Callable[[Scenes], Tensor]
 """Renders scenes and gives their features ``(N, D)``."""
 
 
-class Drawn(NamedTuple):
+class SampledScenes(NamedTuple):
     """Scenes with the prior's parameters, and the u of their sites.
 
     Attributes:
         derivation: N of them.
         parameters: values of all sites.
-        seen, graph: of the nodes that have a class.
+        class_nodes, graph: of the nodes that have a class.
         of_scene, of_nodes: ``(N, G)`` and ``(N, M, S)`` u; NaN where there are none.
     """
 
     derivation: Derivation
     parameters: dict[str, Tensor]
-    seen: Seen
-    graph: Graph
+    class_nodes: ClassNodes
+    graph: SceneGraph
     of_scene: Tensor
     of_nodes: Tensor
 
     @staticmethod
-    def of(model: SceneModel, structure: Policy, sites: tuple[Site, ...], num: int) -> "Drawn":
+    def sample(model: SceneModel, structure: Policy, sites: tuple[Site, ...], num: int) -> "SampledScenes":
         """``num`` scenes of a policy."""
         derivation = derive_complete(model.grammar, structure, num, model.max_steps)[0]
         scenes = run_program(model, derivation)
-        found, seen = quantiles_of(model, scenes), Seen.of(model.grammar, model.classes, derivation)
-        there = (seen.kind >= 0).unsqueeze(-1)
-        nodes = [seen.taken(found[site.name]) for site in sites if not site.of_scene]
+        found = quantiles_of(model, scenes)
+        class_nodes = ClassNodes.from_derivation(model.grammar, model.classes, derivation)
+        there = (class_nodes.kind >= 0).unsqueeze(-1)
+        nodes = [class_nodes.gather(found[site.name]) for site in sites if not site.of_scene]
         scene = [of_scenes(found[site.name]) for site in sites if site.of_scene]
-        return Drawn(
+        return SampledScenes(
             derivation,
             scenes.parameters,
-            seen,
-            Graph.of(seen.kind, seen.parent),
+            class_nodes,
+            SceneGraph.from_nodes(class_nodes.kind, class_nodes.parent),
             torch.cat(scene, 1) if scene else torch.zeros(num, 0),
-            torch.stack(nodes, -1).where(there, torch.nan) if nodes else torch.zeros(*seen.kind.shape, 0),
+            torch.stack(nodes, -1).where(there, torch.nan) if nodes else torch.zeros(*class_nodes.kind.shape, 0),
         )
 
 
 def with_values(
     model: SceneModel,
     sites: tuple[Site, ...],
-    drawn: Drawn,
+    drawn: SampledScenes,
     scene: Tensor,
     nodes: Tensor,
     rows: Tensor | slice = slice(None),
@@ -89,15 +90,15 @@ def with_values(
         scene, nodes: their u, ``(R, G)`` and ``(R, M, S)``; not looked at where there are none.
         rows: which scenes of ``drawn``, ``(R,)``; all where left out.
     """
-    seen = Seen(*(part[rows] for part in drawn.seen))
+    class_nodes = ClassNodes(*(part[rows] for part in drawn.class_nodes))
     scene = scene.where(~drawn.of_scene[rows].isnan(), torch.nan)
     nodes = nodes.where(~drawn.of_nodes[rows].isnan(), torch.nan)
-    u, none = {}, torch.full(seen.place.shape, torch.nan)
+    u, none = {}, torch.full(class_nodes.place.shape, torch.nan)
     for site in sites:
         column = sum(other.of_scene == site.of_scene for other in sites[: sites.index(site)])
-        u[site.name] = scene[:, column : column + 1] if site.of_scene else seen.put(nodes[..., column], none)
+        u[site.name] = scene[:, column : column + 1] if site.of_scene else class_nodes.scatter(nodes[..., column], none)
     values = {name: value[rows] for name, value in drawn.parameters.items()}
-    return run_program(within(model, At(u, values)), drawn.derivation[rows])
+    return run_program(with_handlers(model, At(u, values)), drawn.derivation[rows])
 
 
 class Differences:
@@ -117,12 +118,12 @@ class Differences:
         self.model, self.sites, self.embed, self.difference, self.most = model, sites, embed, difference, most
 
     @torch.no_grad()
-    def features(self, drawn: Drawn, scene: Tensor, nodes: Tensor) -> Tensor:
+    def features(self, drawn: SampledScenes, scene: Tensor, nodes: Tensor) -> Tensor:
         """``(N, D)`` of all scenes of ``drawn`` with other values, see ``with_values``."""
         return self.embed(with_values(self.model, self.sites, drawn, scene, nodes))
 
     @torch.no_grad()
-    def gradient(self, drawn: Drawn, scene: Tensor, nodes: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+    def gradient(self, drawn: SampledScenes, scene: Tensor, nodes: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
         """The cost's derivative by u, ``(N, G)`` and ``(N, M, S)``; 0 where there are none.
 
         Args:
@@ -130,7 +131,7 @@ class Differences:
             slope: ``(N, D)`` the cost's derivative by the features there.
         """
         (N, G), (_, M, S) = scene.shape, nodes.shape
-        u = torch.cat([scene, nodes.flatten(1)], 1).clamp(NEAR, 1 - NEAR)  # (N, G + M S)
+        u = torch.cat([scene, nodes.flatten(1)], 1).clamp(U_EPS, 1 - U_EPS)  # (N, G + M S)
         there = ~torch.cat([drawn.of_scene, drawn.of_nodes.flatten(1)], 1).isnan()
         found, chosen = torch.zeros_like(u), there.nonzero()
         share = 1.0
@@ -142,7 +143,7 @@ class Differences:
             index = torch.arange(len(rows))
             sides = u[rows].expand(2, -1, -1).clone()  # (2, R, G + M S)
             for side, sign in zip(sides, (1, -1), strict=True):
-                side[index, columns] = (side[index, columns] + sign * self.difference).clamp(NEAR, 1 - NEAR)
+                side[index, columns] = (side[index, columns] + sign * self.difference).clamp(U_EPS, 1 - U_EPS)
             both = sides.flatten(0, 1)
             values = both[:, :G], both[:, G:].view(len(both), M, S)
             up, down = self.embed(with_values(self.model, self.sites, drawn, *values, rows.repeat(2))).chunk(2)
@@ -172,5 +173,5 @@ class At(Messenger):
         value = self.values[name][:, :width]
         if name in self.u:
             u = self.u[name][:, :width]
-            value = value.where(u.isnan(), fn.icdf(u.nan_to_num(0.5).clamp(NEAR, 1 - NEAR)))
+            value = value.where(u.isnan(), fn.icdf(u.nan_to_num(0.5).clamp(U_EPS, 1 - U_EPS)))
         msg["value"] = value

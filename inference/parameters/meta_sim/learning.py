@@ -10,26 +10,25 @@ References:
 """
 
 import math
-from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
-from ...training import Report, batch_seed, check_finite, restore_training, training_state
+from ...training import TrainingLoop, batch_seed
 from ..sites import Site, find_sites
-from .differences import Differences, Drawn, Embed
+from .differences import Differences, Embed, SampledScenes
 from .discrepancy import Discrepancy
 from .schedule import MetaSimSchedule
 from .transform import ParameterTransform
 
-LARGEST = 1.0  # norm of a step's gradient
+MAX_GRAD_NORM = 1.0
 
 
-class MetaSimLearning:
+class MetaSimLearning(TrainingLoop):
     """A ``Training`` of a ``ParameterTransform``.
 
     Args:
@@ -47,7 +46,8 @@ class MetaSimLearning:
         guide: what is learnt; None where there is no site to move.
     """
 
-    unit = "steps"
+    subject = "the parameters"
+    seed_path = (1,)
 
     def __init__(
         self,
@@ -58,40 +58,27 @@ class MetaSimLearning:
         schedule: MetaSimSchedule,
         seed: int = 0,
     ):
-        self.model, self.structure, self.schedule, self.seed = model, structure, schedule, seed
+        self.model, self.structure, self.schedule = model, structure, schedule
         seed_everything(batch_seed(seed, 0))
         self.sites = find_sites(model)
         self.learnt: tuple[Site, ...] = tuple(site for site in self.sites if not site.keeps)
         self.differences = Differences(model, self.learnt, embed, schedule.difference, schedule.values)
         self.discrepancy = Discrepancy(real)
         self.guide: ParameterTransform | None = None
-        self.total, self.done = 0, 0
-        if self.learnt:
-            self.guide = ParameterTransform(model, self.learnt, structure, schedule.hidden, schedule.rounds)
-            self.optimiser = torch.optim.Adam(self.guide.net.parameters(), lr=schedule.rate)
-            self.total = schedule.steps
+        if not self.learnt:
+            super().__init__(nn.Module(), {}, 0, seed)
+            return
+        self.guide = ParameterTransform(model, self.learnt, structure, schedule.hidden, schedule.rounds)
+        self.optimiser = torch.optim.Adam(self.guide.net.parameters(), lr=schedule.rate)
+        super().__init__(self.guide.net, {"adam": self.optimiser}, schedule.steps, seed)
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the steps that are left; ``each`` hears the loss after every one.
-
-        Raises:
-            ProbsceneError: the loss is no longer finite.
-        """
-        while self.done < self.total:
-            assert self.guide is not None
-            seed_everything(batch_seed(self.seed, 1, self.done))
-            rate = self.schedule.rate * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
-            for group in self.optimiser.param_groups:
-                group["lr"] = rate
-            loss = self._step(self.guide)
-            self.done += 1
-            where = f"at step {self.done}"
-            check_finite(loss, self.guide.net.parameters(), "the parameters", where, "begin again with a lower rate")
-            if each is not None:
-                each(self, {"loss": loss})
-
-    def _step(self, guide: ParameterTransform) -> float:
-        drawn = Drawn.of(self.model, self.structure, self.learnt, self.schedule.scenes)
+    def step(self) -> float:
+        """See ``TrainingLoop``."""
+        guide = self.guide
+        assert guide is not None
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.schedule.rate * 0.5 * (1 + math.cos(math.pi * self.done / self.total))
+        drawn = SampledScenes.sample(self.model, self.structure, self.learnt, self.schedule.scenes)
         scene, nodes = (logit.sigmoid() for logit in guide.net(drawn.graph, drawn.of_scene, drawn.of_nodes))
         features = self.differences.features(drawn, scene.detach(), nodes.detach()).requires_grad_()
         loss = self.discrepancy(features)
@@ -99,21 +86,6 @@ class MetaSimLearning:
         of_scene, of_nodes = self.differences.gradient(drawn, scene.detach(), nodes.detach(), slope)
         self.optimiser.zero_grad()
         ((scene * of_scene).sum() + (nodes * of_nodes).sum()).backward()
-        torch.nn.utils.clip_grad_norm_(guide.net.parameters(), LARGEST)
+        torch.nn.utils.clip_grad_norm_(guide.net.parameters(), MAX_GRAD_NORM)
         self.optimiser.step()
         return loss.item()
-
-    def summary(self) -> dict[str, Any]:
-        """Nothing more for the log."""
-        return {}
-
-    def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
-        if self.guide is None:
-            return {}
-        return training_state(self.guide.net, {"adam": self.optimiser}, done=self.done)
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        if self.guide is not None:
-            self.done = int(restore_training(self.guide.net, {"adam": self.optimiser}, tensors)["done"])

@@ -20,9 +20,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..graph import Graph
-from ..net import MOST, code
-from ..sites import NEAR
+from ..graph import SceneGraph
+from ..net import MAX_SIBLINGS, encode_u
+from ..sites import U_EPS
 
 SCALE, SHIFT = 3.0, 6.0  # largest change of the scale, and of the logit
 
@@ -54,7 +54,7 @@ class GraphNetwork(nn.Module):
             nn.init.zeros_(layer.get_parameter("weight"))
             nn.init.zeros_(layer.get_parameter("bias"))
 
-    def forward(self, graph: Graph, scene: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, graph: SceneGraph, scene: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of all moved u, ``(N, G)`` and ``(N, M, S)``; finite, and of no meaning where there are none.
 
         Args:
@@ -69,7 +69,7 @@ class GraphNetwork(nn.Module):
             torch.stack(moved[0], -1) if moved[0] else nodes.new_zeros(N, M, 0),
         )
 
-    def site(self, graph: Graph, scene: Tensor, nodes: Tensor, site: int) -> Tensor:
+    def site(self, graph: SceneGraph, scene: Tensor, nodes: Tensor, site: int) -> Tensor:
         """Logits of the moved u of site number ``site`` of the program, ``(N,)`` or ``(N, M)``.
 
         Args:
@@ -84,23 +84,23 @@ class GraphNetwork(nn.Module):
         for message in self.messages:
             state = state + message(F.silu(torch.cat([state, *_neighbours(graph, state)], -1)))
         scale, shift = self.out[site](F.silu(state[:, 0] if self.order[site] else state[:, 1:])).unbind(-1)
-        logit = own.nan_to_num(0.5).clamp(NEAR, 1 - NEAR).logit()  # a gradient of 0 times NaN would be NaN
+        logit = own.nan_to_num(0.5).clamp(U_EPS, 1 - U_EPS).logit()  # a gradient of 0 times NaN would be NaN
         return (1 + SCALE * torch.tanh(scale / SCALE)) * logit + SHIFT * torch.tanh(shift / SHIFT)
 
-    def _entering(self, graph: Graph, scene: Tensor, nodes: Tensor) -> Tensor:
+    def _entering(self, graph: SceneGraph, scene: Tensor, nodes: Tensor) -> Tensor:
         """``(N, 1 + M, H)``: the root, then the nodes."""
         kind = graph.kind.remainder(self.kinds + 1)
         counts = F.one_hot(kind, self.kinds + 1).sum(1)[:, : self.kinds].to(nodes.dtype).log1p()
         number = graph.number.clamp(min=1)
-        place = [(graph.rank + 0.5) / number, 1 / number, graph.number.clamp(max=MOST) / MOST]
+        place = [(graph.rank + 0.5) / number, 1 / number, graph.number.clamp(max=MAX_SIBLINGS) / MAX_SIBLINGS]
         place += [1.0 * (graph.rank == 0), 1.0 * (graph.rank == graph.number - 1)]
         of_nodes = self.of_kind(kind) + self.of_place(torch.stack(place, -1).to(nodes.dtype))
-        of_nodes = of_nodes + self.of_values(code(_at_least_one(nodes)))
-        root = self.of_scene(torch.cat([code(_at_least_one(scene)), counts], -1))
+        of_nodes = of_nodes + self.of_values(encode_u(_at_least_one(nodes)))
+        root = self.of_scene(torch.cat([encode_u(_at_least_one(scene)), counts], -1))
         return torch.cat([root.unsqueeze(1), of_nodes * (graph.kind >= 0).unsqueeze(-1)], 1)
 
 
-def _neighbours(graph: Graph, state: Tensor) -> list[Tensor]:
+def _neighbours(graph: SceneGraph, state: Tensor) -> list[Tensor]:
     """Of the root and each node, ``(N, 1 + M, H)``: its parent, the mean of its children, and the siblings before and
     after it; 0 where there are none."""
     there = (graph.kind >= 0).unsqueeze(-1).to(state.dtype)

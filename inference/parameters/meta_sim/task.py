@@ -19,19 +19,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from probscene.sampling import Scenes, seed_everything
+from probscene.sampling import Scenes
 
-from ...training import Report, batch_seed, check_finite, restore_training, training_state
-from .differences import Drawn, with_values
+from ...training import TrainingLoop
+from .differences import SampledScenes, with_values
 from .transform import ParameterTransform
 
-KEPT = 0.8  # of the baseline, from one score to the next
+BASELINE_DECAY = 0.8
 
 Score = Callable[[Scenes], float]
 """Trains a task network on scenes and says how well it does on the target, more being better."""
 
 
-class TaskLearning:
+class TaskLearning(TrainingLoop):
     """A ``Training`` of a ``ParameterTransform`` by a score.
 
     Args:
@@ -48,7 +48,8 @@ class TaskLearning:
         baseline: the moving average of the scores; None before the first.
     """
 
-    unit = "steps"
+    subject = "the parameters"
+    remedy = "look at the task's score"
 
     def __init__(
         self,
@@ -60,51 +61,41 @@ class TaskLearning:
         rate: float = 1e-3,
         seed: int = 0,
     ):
-        self.guide, self.score, self.total, self.done = guide, score, steps, 0
-        self.scenes, self.spread, self.seed = scenes, spread, seed
-        self.baseline: float | None = None
         self.optimiser = torch.optim.Adam(guide.net.parameters(), lr=rate)
+        super().__init__(guide.net, {"adam": self.optimiser}, steps, seed)
+        self.guide, self.score, self.scenes, self.spread = guide, score, scenes, spread
+        self.baseline: float | None = None
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the steps that are left; ``each`` hears the score after every one.
-
-        Raises:
-            ProbsceneError: the score is not finite.
-        """
+    def step(self) -> float:
+        """See ``TrainingLoop``; the loss is minus the score."""
         guide = self.guide
-        while self.done < self.total:
-            seed_everything(batch_seed(self.seed, self.done))
-            drawn = Drawn.of(guide.model, guide.structure, guide.sites, self.scenes)
-            means = guide.net(drawn.graph, drawn.of_scene, drawn.of_nodes)
-            logits = [mean.detach() + self.spread * torch.randn_like(mean) for mean in means]
-            with torch.no_grad():
-                scenes = with_values(guide.model, guide.sites, drawn, *(logit.sigmoid() for logit in logits))
-            score = float(self.score(scenes))
-            baseline = score if self.baseline is None else self.baseline
-            log_q = drawn.of_scene.new_zeros(())
-            for x, mean, u in zip(logits, means, (drawn.of_scene, drawn.of_nodes), strict=True):
-                log_q = log_q - 0.5 * ((x - mean) / self.spread).square().where(~u.isnan(), 0.0).sum()  # and a constant
-            self.optimiser.zero_grad()
-            (-(score - baseline) * log_q / self.scenes).backward()
-            self.optimiser.step()
-            self.baseline = KEPT * baseline + (1 - KEPT) * score
-            self.done += 1
-            where = f"at step {self.done}"
-            check_finite(-score, guide.net.parameters(), "the parameters", where, "look at the task's score")
-            if each is not None:
-                each(self, {"loss": -score})
+        drawn = SampledScenes.sample(guide.model, guide.structure, guide.sites, self.scenes)
+        means = guide.net(drawn.graph, drawn.of_scene, drawn.of_nodes)
+        logits = [mean.detach() + self.spread * torch.randn_like(mean) for mean in means]
+        with torch.no_grad():
+            scenes = with_values(guide.model, guide.sites, drawn, *(logit.sigmoid() for logit in logits))
+        score = float(self.score(scenes))
+        baseline = score if self.baseline is None else self.baseline
+        log_q = drawn.of_scene.new_zeros(())
+        for x, mean, u in zip(logits, means, (drawn.of_scene, drawn.of_nodes), strict=True):
+            log_q = log_q - 0.5 * ((x - mean) / self.spread).square().where(~u.isnan(), 0.0).sum()  # and a constant
+        self.optimiser.zero_grad()
+        (-(score - baseline) * log_q / self.scenes).backward()
+        self.optimiser.step()
+        self.baseline = BASELINE_DECAY * baseline + (1 - BASELINE_DECAY) * score
+        return -score
 
     def summary(self) -> dict[str, Any]:
         """The moving average of the scores."""
         return {} if self.baseline is None else {"score": self.baseline}
 
     def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
+        """See ``Training``."""
         baseline = torch.nan if self.baseline is None else self.baseline
-        return training_state(self.guide.net, {"adam": self.optimiser}, done=self.done, baseline=baseline)
+        return super().state() | {"number.baseline": torch.tensor(baseline, dtype=torch.float64)}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        numbers = restore_training(self.guide.net, {"adam": self.optimiser}, tensors)
-        self.done, baseline = int(numbers["done"]), numbers["baseline"]
+        """See ``Training``."""
+        super().restore(tensors)
+        baseline = tensors["number.baseline"].item()
         self.baseline = None if baseline != baseline else baseline

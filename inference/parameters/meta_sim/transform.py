@@ -20,8 +20,8 @@ from probscene.policy import Policy
 from probscene.request import Renderable
 
 from ...guides.base import GuideModule
-from ..graph import Graph, Seen
-from ..sites import NEAR, Site, of_scenes
+from ..graph import ClassNodes, SceneGraph
+from ..sites import U_EPS, Site, of_scenes
 from .network import GraphNetwork
 
 
@@ -58,7 +58,7 @@ class ParameterTransform(GuideModule):
         pyro.module("parameters", self.net)
         return self.program(num_scenes, self.structure)
 
-    def suited(self, model: SceneModel) -> SceneModel:
+    def with_parameters(self, model: SceneModel) -> SceneModel:
         """The model with moved parameters."""
         return replace(model, program=self.program)
 
@@ -75,42 +75,44 @@ class Moved(Messenger):
         transform: what moves them.
 
     Attributes:
-        scene, nodes: u of the scene's and of the seen nodes' sites so far, before they are moved, ``(N, G)`` and ``(N,
+        scene, nodes: u of the scene's and of the class nodes' sites so far, before they are moved, ``(N, G)`` and ``(N,
             M', S)``; NaN where there are none.
     """
 
     def __init__(self, transform: ParameterTransform):
         super().__init__()
         self.transform = transform
-        self.seen: Seen | None = None
-        self.graph = Graph.of(*torch.full((2, 0, 1), -1))
+        self.class_nodes: ClassNodes | None = None
+        self.graph = SceneGraph.from_nodes(*torch.full((2, 0, 1), -1))
         self.scene, self.nodes = torch.zeros(0), torch.zeros(0)
 
     def _pyro_post_derive(self, msg: Any) -> None:
         model = self.transform.model
-        self.seen = Seen.of(model.grammar, model.classes, msg["value"])
-        self.graph = Graph.of(self.seen.kind, self.seen.parent)
-        N, M = self.seen.kind.shape
+        self.class_nodes = ClassNodes.from_derivation(model.grammar, model.classes, msg["value"])
+        self.graph = SceneGraph.from_nodes(self.class_nodes.kind, self.class_nodes.parent)
+        N, M = self.class_nodes.kind.shape
         self.scene = torch.full((N, len(self.transform.scene_sites)), torch.nan)
         self.nodes = torch.full((N, M, len(self.transform.node_sites)), torch.nan)
 
     def _pyro_sample(self, msg: Any) -> None:
-        transform, seen = self.transform, self.seen
+        transform, class_nodes = self.transform, self.class_nodes
         number = next((i for i, site in enumerate(transform.sites) if site.name == msg["name"]), None)
-        if seen is None or number is None or msg["value"] is not None:
+        if class_nodes is None or number is None or msg["value"] is not None:
             return
         site, fn = transform.sites[number], msg["fn"]
         drawn = fn.sample()
         has = torch.as_tensor(True if msg["mask"] is None else msg["mask"]).expand(drawn.shape)
-        u = fn.cdf(drawn).clamp(NEAR, 1 - NEAR)
+        u = fn.cdf(drawn).clamp(U_EPS, 1 - U_EPS)
         if site.of_scene:
             column = transform.scene_sites.index(site)
             self.scene = _put(self.scene, column, of_scenes(u.where(has, torch.nan)).squeeze(1))
         else:
             column = transform.node_sites.index(site)
-            self.nodes = _put(self.nodes, column, seen.taken(u.where(has, torch.nan)).where(seen.kind >= 0, torch.nan))
-        moved = transform.net.site(self.graph, self.scene, self.nodes, number).sigmoid().clamp(NEAR, 1 - NEAR)
-        moved = moved.unsqueeze(1) if site.of_scene else seen.put(moved, torch.full_like(u, torch.nan))
+            self.nodes = _put(
+                self.nodes, column, class_nodes.gather(u.where(has, torch.nan)).where(class_nodes.kind >= 0, torch.nan)
+            )
+        moved = transform.net.site(self.graph, self.scene, self.nodes, number).sigmoid().clamp(U_EPS, 1 - U_EPS)
+        moved = moved.unsqueeze(1) if site.of_scene else class_nodes.scatter(moved, torch.full_like(u, torch.nan))
         msg["value"] = torch.where(has & ~moved.isnan(), fn.icdf(moved.nan_to_num(0.5)), drawn)
 
 

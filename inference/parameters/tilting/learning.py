@@ -30,38 +30,37 @@ References:
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import root_scalar
 from scipy.spatial.distance import cdist
 from scipy.stats import chi2, false_discovery_control
-from torch import Tensor
+from torch import Tensor, nn
 
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
-from ...judging.two_sample import Features
-from ...training import Report, batch_seed, check_finite, of_prefix
+from ...statistics.energy import Features
+from ...training import Callback, TrainingLoop, batch_seed, of_prefix
 from ..guide import ParameterGuide
 from ..likelihood import MaximumLikelihood, Values, log_density
 from ..net import ParameterNet
-from ..reading.valued import Label, ValuedRenders, joined
-from ..sites import NEAR, Site, find_sites
+from ..sites import U_EPS, Site, find_sites
+from ..supervised_renders import Label, SupervisedRenders, concatenate
 from .schedule import TiltingSchedule
 
-AT_ONCE = 100  # scenes that are drawn and rendered together
-CHANCE = 0.05  # of the sites that are moved, at most, say nothing of images in the mean [5]
-STRONGEST = 1e3  # eta, in standard deviations of w
-SMALL = 0.1  # share of w's standard deviation
-LEAST = 1e-5  # standard deviation of a number that tells scenes apart
-EXACT = 1e-6  # standard deviation of u that is known
+RENDERS_PER_CALL = 100  # scenes that are drawn and rendered together
+FALSE_DISCOVERY_RATE = 0.05  # of the sites that are moved, at most, say nothing of images in the mean [5]
+MAX_ETA = 1e3  # eta, in standard deviations of w
+MIN_UNIT = 0.1  # share of w's standard deviation
+MIN_SD = 1e-5  # standard deviation of a number that tells scenes apart
+EXACT_SD = 1e-6  # standard deviation of u that is known
 Look = Callable[[Tensor], Tensor]
 
 
-class TiltingLearning:
+class TiltingLearning(TrainingLoop):
     """A ``Training`` of a ``ParameterGuide``.
 
     Args:
@@ -83,6 +82,8 @@ class TiltingLearning:
     """
 
     unit = "rounds"
+    subject = "the parameters"
+    seed_path = (1,)
 
     def __init__(
         self,
@@ -94,88 +95,75 @@ class TiltingLearning:
         schedule: TiltingSchedule,
         seed: int = 0,
     ):
-        self.model, self.structure, self.looks, self.schedule, self.seed = model, structure, looks, schedule, seed
+        self.model, self.structure, self.looks, self.schedule = model, structure, looks, schedule
         self.real = [features.double().numpy() for features in real]
         seed_everything(batch_seed(seed, 0))
         self.sites = find_sites(model)
         self.open_to = tuple(site for site in self.sites if site.of_scene and not site.keeps)
-        self.renders = ValuedRenders(model, label, (), self.open_to)
+        self.renders = SupervisedRenders(model, label, (), self.open_to)
         self.guide = ParameterGuide(model, self.open_to, structure) if self.open_to else None
         self.dependence = torch.zeros(len(self.open_to), 2)
         self.chosen = torch.zeros(len(self.open_to), dtype=torch.bool)
-        self.total, self.done = schedule.rounds if self.open_to else 0, 0
+        net = nn.Module() if self.guide is None else self.guide.net
+        super().__init__(net, {}, schedule.rounds if self.open_to else 0, seed)
 
     @property
     def learnt(self) -> tuple[Site, ...]:
         """The sites that are chosen, in the order of the program."""
         return tuple(site for site, chosen in zip(self.open_to, self.chosen.tolist(), strict=True) if chosen)
 
-    def run(self, each: Report | None = None) -> None:
-        """Take the rounds that are left; ``each`` hears the energy distance after every one.
-
-        Raises:
-            ProbsceneError: the loss is no longer finite.
-        """
-        self._pass()
-        while self.done < self.total:
-            assert self.guide is not None
-            seed_everything(batch_seed(self.seed, 1, self.done))
-            apart = self._round(self.guide)
-            self.done += 1
-            where = f"in round {self.done}"
-            check_finite(apart, self.guide.net.parameters(), "the parameters", where, "begin again with a lower rate")
-            if each is not None:
-                each(self, {"loss": apart})
-
-    def summary(self) -> dict[str, Any]:
-        """Nothing more for the log."""
-        return {}
+    def run(self, callback: Callback | None = None) -> None:
+        """See ``Training``."""
+        self._set_prior_sites()
+        super().run(callback)
 
     def state(self) -> dict[str, Tensor]:
-        """All that ``restore`` needs, as named tensors."""
-        net = {} if self.guide is None else self.guide.net.state_dict()
+        """See ``Training``."""
         own = {"done": torch.tensor(self.done), "chosen": self.chosen, "dependence": self.dependence}
-        return {key: value.clone() for key, value in (own | {f"guide.{key}": net[key] for key in net}).items()}
+        net = {f"guide.{key}": value for key, value in self.module.state_dict().items()}
+        return {key: value.clone() for key, value in (own | net).items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
+        """See ``Training``."""
         self.done, self.chosen = int(tensors["done"]), tensors["chosen"].clone()
         self.dependence = tensors["dependence"].clone()
-        if self.guide is not None:
-            self.guide.net.load_state_dict(of_prefix(tensors, "guide."))
+        self.module.load_state_dict(of_prefix(tensors, "guide."))
 
-    def _round(self, guide: ParameterGuide) -> float:
-        """The sum of the squared energy distances of the renders that were drawn, in units of the target's spread."""
+    def step(self) -> float:
+        """A round. Its loss is the sum of the squared energy distances of the renders that were drawn, in units of the
+        target's spread."""
+        guide = self.guide
+        assert guide is not None
         features, values = self._drawn(guide, self.schedule.scenes if self.done else self.schedule.first)
         each = [witness(own, real) for own, real in zip(features, self.real, strict=True)]
-        freed = [beside_structure(values.kind, w) for w, _ in each]
-        w = together(values.scene, freed)
+        freed = [without_structure(values.kind, w) for w, _ in each]
+        w = normalised_sum(values.scene, freed)
         self.dependence += dependence(values.scene, w).where(~self.chosen.unsqueeze(1), 0.0)
         p = chi2.sf(self.dependence[:, 0].numpy(), self.dependence[:, 1].numpy().clip(min=1))
-        self.chosen |= torch.from_numpy(false_discovery_control(p) < CHANCE)
-        self._pass()
+        self.chosen |= torch.from_numpy(false_discovery_control(p) < FALSE_DISCOVERY_RATE)
+        self._set_prior_sites()
         if self.chosen.any():
             of = values.scene[:, self.chosen]
-            v, sure = explained(of, together(of, freed))
-            weight = tilted(v, 1 - sure * (1 - self.schedule.kept))
+            v, sure = explained_part(of, normalised_sum(of, freed))
+            weight = tilted_weights(v, 1 - sure * (1 - self.schedule.ess_fraction))
             _Weighted(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
         return sum(apart for _, apart in each)
 
-    def _pass(self) -> None:
+    def _set_prior_sites(self) -> None:
         if self.guide is not None:
-            self.guide.passed = frozenset(site.name for site in self.open_to if site not in self.learnt)
+            self.guide.prior_sites = frozenset(site.name for site in self.open_to if site not in self.learnt)
 
     @torch.no_grad()
     def _drawn(self, guide: ParameterGuide, num: int) -> tuple[list[Features], Values]:
         """Features ``(N, D)`` of the guide's renders by each look, and their scenes' values of all sites."""
-        model, features, parts = guide.suited(self.model), [], []
-        for first in range(0, num, AT_ONCE):
-            some = self.renders.draw(min(AT_ONCE, num - first), self.structure, model)
+        model, features, parts = guide.with_parameters(self.model), [], []
+        for first in range(0, num, RENDERS_PER_CALL):
+            some = self.renders.draw(min(RENDERS_PER_CALL, num - first), self.structure, model)
             features.append([look(some.drawn.image) for look in self.looks])
             parts.append(some._replace(drawn=some.drawn._replace(image=some.drawn.image[..., :0])))  # to save memory
-        of, turns = joined(parts), torch.zeros(len(self.chosen), dtype=torch.bool)
-        scene, none = of.overall.clamp(NEAR, 1 - NEAR), of.u
-        values = Values(of.kind, of.parent, none, none, scene, torch.full_like(scene, EXACT), turns)
+        of, turns = concatenate(parts), torch.zeros(len(self.chosen), dtype=torch.bool)
+        scene, none = of.overall.clamp(U_EPS, 1 - U_EPS), of.u
+        values = Values(of.kind, of.parent, none, none, scene, torch.full_like(scene, EXACT_SD), turns)
         return [torch.cat(part).double().numpy() for part in zip(*features, strict=True)], values
 
 
@@ -189,9 +177,9 @@ class _Weighted(MaximumLikelihood):
         self.weight, self.chosen = torch.from_numpy(weight), chosen
 
     def loss(self) -> Tensor:
-        """See ``StepTraining``."""
+        """See ``AdamTraining``."""
         rows = torch.multinomial(self.weight, self._number(), replacement=True)
-        return -log_density(self.net, self.values.of(rows))[:, self.chosen].sum(1).mean()
+        return -log_density(self.net, self.values.select(rows))[:, self.chosen].sum(1).mean()
 
 
 def witness(own: Features, real: Features) -> tuple[Features, float]:
@@ -199,11 +187,11 @@ def witness(own: Features, real: Features) -> tuple[Features, float]:
     distance, without bias. Both in units of how far the target's images are apart."""
     toward, among, within = cdist(own, real), cdist(own, own), cdist(real, real)
     among, within = (each.sum(1) / max(1, len(each) - 1) for each in (among, within))
-    spread = max(float(within.mean()), LEAST)
+    spread = max(float(within.mean()), MIN_SD)
     return (toward.mean(1) - among) / spread, float(2 * toward.mean() - among.mean() - within.mean()) / spread
 
 
-def beside_structure(kind: Tensor, w: Features) -> Features:
+def without_structure(kind: Tensor, w: Features) -> Features:
     """w without what a linear regression on the number and the presence of each kind of node ``(N, M)`` explains: it is
     structure's, which is not moved here."""
     number = np.stack([(kind == k).sum(1).numpy() for k in kind.unique()], 1)
@@ -211,7 +199,7 @@ def beside_structure(kind: Tensor, w: Features) -> Features:
     return w - x @ np.linalg.lstsq(x, w, rcond=None)[0]
 
 
-def together(u: Tensor, each: list[Features]) -> Features:
+def normalised_sum(u: Tensor, each: list[Features]) -> Features:
     """The sum of several w, each in its ``unit``."""
     return np.stack([w / unit(u, w) for w in each]).sum(0)
 
@@ -219,26 +207,26 @@ def together(u: Tensor, each: list[Features]) -> Features:
 def unit(u: Tensor, w: Features) -> float:
     """The standard deviation of what sites' u ``(N, G)`` explain of w: the norm of the gradient that a guide of these
     sites can follow. A tenth of w's own, if that is more."""
-    return max(float(explained(u, w)[0].std()), SMALL * float(w.std()), LEAST)
+    return max(float(explained_part(u, w)[0].std()), MIN_UNIT * float(w.std()), MIN_SD)
 
 
-def explained(u: Tensor, w: Features) -> tuple[Features, float]:
+def explained_part(u: Tensor, w: Features) -> tuple[Features, float]:
     """What a linear regression on numbers of sites' u ``(N, G)`` says of w, less its mean, ``(N,)``; and the share of
     its standard deviation that is more than chance would give, 0 to 1."""
-    x, y = np.concatenate([numbers(one) for one in u.unbind(1)], 1), w - w.mean()
+    x, y = np.concatenate([basis(one) for one in u.unbind(1)], 1), w - w.mean()
     slope, _, rank, _ = np.linalg.lstsq(x, y, rcond=None)
     v = x @ slope
     found, left, freedom = np.square(v).sum(), np.square(y - v).sum(), len(y) - 1 - int(rank)
     return v, max(0.0, 1 - float(rank * left / freedom / found)) ** 0.5 if found and freedom > 0 else 0.0
 
 
-def numbers(u: Tensor) -> Features:
+def basis(u: Tensor) -> Features:
     """``(N, 4)`` of a site's u ``(N,)``, by which anything may depend on it: smooth on a line or on a circle."""
     x = torch.stack([u, u.square(), (2 * torch.pi * u).cos(), (2 * torch.pi * u).sin()], 1).double().numpy()
     return x - x.mean(0)
 
 
-def tilted(w: Features, kept: float) -> Features:
+def tilted_weights(w: Features, ess_fraction: float) -> Features:
     """Weights ``(N,)`` in proportion to exp(-eta w), of which so many are effective as ``kept`` says, a share."""
     z = -(w - w.mean()) / max(float(w.std()), 1e-12)
 
@@ -247,11 +235,11 @@ def tilted(w: Features, kept: float) -> Features:
         return found / found.sum()
 
     def more(eta: float) -> float:
-        return 1 / np.square(weight(eta)).sum() / len(w) - kept
+        return 1 / np.square(weight(eta)).sum() / len(w) - ess_fraction
 
-    if kept >= 1:
+    if ess_fraction >= 1:
         return weight(0.0)
-    return weight(root_scalar(more, bracket=(0.0, STRONGEST)).root if more(STRONGEST) < 0 else STRONGEST)
+    return weight(root_scalar(more, bracket=(0.0, MAX_ETA)).root if more(MAX_ETA) < 0 else MAX_ETA)
 
 
 def dependence(u: Tensor, w: Features) -> Tensor:
@@ -259,8 +247,8 @@ def dependence(u: Tensor, w: Features) -> Tensor:
     explains, and the degrees of freedom; if w does not depend on the site, a draw of their chi-squared distribution."""
     rows, y = [], w - w.mean()
     for one in u.unbind(1):
-        left, singular, _ = np.linalg.svd(numbers(one), full_matrices=False)
-        left = left[:, singular > LEAST * len(y) ** 0.5]
+        left, singular, _ = np.linalg.svd(basis(one), full_matrices=False)
+        left = left[:, singular > MIN_SD * len(y) ** 0.5]
         found, whole = np.square(left.T @ y).sum(), np.square(y).sum()
         rows.append((len(y) * float(found / whole) if whole else 0.0, float(left.shape[1])))
     return torch.tensor(rows).reshape(-1, 2)

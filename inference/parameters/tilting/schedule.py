@@ -11,8 +11,8 @@ class TiltingSchedule:
         rounds: of drawing, tilting and fitting.
         first: scenes of the first round, in which it is seen which sites tell; each is rendered.
         scenes: of each other round.
-        kept: effective share of a round's scenes that is left when they are weighted, 0 to 1; more where what is
-            explained of them could be chance.
+        ess_fraction: effective share of a round's scenes that is left when they are weighted, 0 to 1; more where what
+            is explained of them could be chance.
         steps: of maximum likelihood on them.
         rate: its largest learning rate.
         images: of the target, at most.
@@ -22,7 +22,7 @@ class TiltingSchedule:
     rounds: int = 10
     first: int = 2000
     scenes: int = 400
-    kept: float = 0.4
+    ess_fraction: float = 0.4
     steps: int = 60
     rate: float = 5e-3
     images: int = 1000

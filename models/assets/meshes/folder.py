@@ -22,7 +22,7 @@ import numpy as np
 from probscene.errors import DataError
 from probscene.mesh import Mesh
 
-from ..catalogue import DECORATION, KINDS, street
+from ..things.catalogue import DECORATION, KINDS, street
 from .reader import SUFFIXES, Fields, read
 
 
@@ -69,27 +69,25 @@ def folder(path: str | Path) -> dict[str, tuple[Mesh, ...]]:
     """
     root = Path(path)
     if not root.is_dir():
-        raise DataError(f"Expected a folder of meshes, actual {root}, which is none; put it there, or name another.")
+        raise DataError(f"expected a folder of meshes, got {root}, which is none; put it there, or name another.")
     found = {}
     for sub in sorted(p for p in root.iterdir() if not p.name.startswith((".", "__"))):
         if not sub.is_dir():
             if sub.suffix.lower() in SUFFIXES:
-                raise DataError(f"Expected meshes in a subfolder for their kind, actual {sub}; put it into {root}/car.")
+                raise DataError(f"expected meshes in a subfolder for their kind, got {sub}; put it into {root}/car.")
             continue
         if sub.name not in SIZES:
             kinds = ", ".join((*KINDS, *DECORATION))
-            raise DataError(f"Expected subfolders among {kinds}, actual {sub}; rename or remove it.")
+            raise DataError(f"expected subfolders among {kinds}, got {sub}; rename or remove it.")
         there = sorted(p for p in sub.iterdir() if not p.name.startswith("."))
         files = [p for p in there if p.suffix.lower() in SUFFIXES]
         for other in (p for p in there if p.suffix.lower() in _OTHER):
-            raise DataError(
-                f"Expected meshes as {', '.join(SUFFIXES)}, actual {other}; export it as .glb or remove it."
-            )
+            raise DataError(f"expected meshes as {', '.join(SUFFIXES)}, got {other}; export it as .glb or remove it.")
         if not files:
-            raise DataError(f"Expected mesh files ({', '.join(SUFFIXES)}) in {sub}, actual none; add one or remove it.")
+            raise DataError(f"expected mesh files ({', '.join(SUFFIXES)}) in {sub}, got none; add one or remove it.")
         found[sub.name] = tuple(_checked(file, sub.name) for file in files)
     if not found:
-        raise DataError(f"Expected subfolders such as car with mesh files in {root}, actual none; add one.")
+        raise DataError(f"expected subfolders such as car with mesh files in {root}, got none; add one.")
     return {**street(), **found}
 
 
@@ -119,16 +117,16 @@ def _checked(file: Path, kind: str) -> Mesh:
     measured = float(extent[size.axis])
     if not size.low <= measured <= size.high:
         raise DataError(
-            f"Expected a {kind} {size.low:g} to {size.high:g} m {size.what}, actual {measured:.3g} m in {file}; "
+            f"expected a {kind} {size.low:g} to {size.high:g} m {size.what}, got {measured:.3g} m in {file}; "
             f"{_remedy(file, measured, size)}."
         )
     if kind in LENGTHWAYS and extent[1] > 1.2 * extent[0]:
         raise DataError(
-            f"Expected a {kind} longer than wide, actual {extent[0]:.3g} m long and {extent[1]:.3g} m wide in {file}; "
+            f"expected a {kind} longer than wide, got {extent[0]:.3g} m long and {extent[1]:.3g} m wide in {file}; "
             "turn it until it faces +z where y is up (glTF, OBJ), or +x where z is (PLY, STL)."
         )
     if extent.max() > 200:
-        raise DataError(f"Expected a mesh of at most 200 m, actual {extent.max():.4g} m in {file}; scale it.")
+        raise DataError(f"expected a mesh of at most 200 m, got {extent.max():.4g} m in {file}; scale it.")
     parts["positions"] = parts["positions"] - [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
     return Mesh(**parts)
 
@@ -139,7 +137,7 @@ def _scale(parts: Fields, file: Path, metres: list[float], axis: int) -> None:
     wanted = np.array(metres) if len(metres) == 3 else metres[0] * np.ones(3)
     actual = extent if len(metres) == 3 else extent[axis] * np.ones(3)
     if min(metres) <= 0 or actual.min() <= 0:
-        raise DataError(f"Expected sizes to scale by above 0 m, actual {actual.min():g} m in {file}; rename it.")
+        raise DataError(f"expected sizes to scale by above 0 m, got {actual.min():g} m in {file}; rename it.")
     by = wanted / actual
     normals = parts["normals"] / by
     parts["normals"] = normals / np.linalg.norm(normals, axis=-1, keepdims=True)

@@ -50,7 +50,7 @@ def parts(file: Path) -> list[Part]:
         with np.errstate(all="ignore"):  # what is not finite is found afterwards
             return _Gltf(file, tree, binary).parts()
     except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError):
-        raise DataError(f"Expected a glTF whose parts fit together, actual {file}; export it again.") from None
+        raise DataError(f"expected a glTF whose parts fit together, got {file}; export it again.") from None
 
 
 def _chunks(file: Path) -> tuple[dict[str, Any], bytes]:
@@ -67,7 +67,7 @@ def _chunks(file: Path) -> tuple[dict[str, Any], bytes]:
             raise ValueError("no object")
         return tree, binary
     except (OSError, ValueError) as error:
-        raise DataError(f"Expected a glTF file, actual {file} ({error}); export it again.") from None
+        raise DataError(f"expected a glTF file, got {file} ({error}); export it again.") from None
 
 
 class _PlacedNode(NamedTuple):
@@ -83,7 +83,7 @@ class _Gltf:
     def __init__(self, file: Path, tree: dict[str, Any], binary: bytes):
         self.file, self.tree = file, tree
         if (version := str(tree.get("asset", {}).get("version", "2.0"))).startswith("1"):
-            raise DataError(f"Expected glTF 2.0, actual {version} in {file}; export it again.")
+            raise DataError(f"expected glTF 2.0, got {version} in {file}; export it again.")
         if beyond := sorted(set(tree.get("extensionsRequired", [])) - DRAWN):
             raise self._needs(beyond[0])
         self.buffers = [
@@ -107,7 +107,7 @@ class _Gltf:
         return [part for part in found if part is not None]
 
     def _needs(self, extension: str) -> DataError:
-        return DataError(f"Expected a plain glTF, actual one that needs {extension} in {self.file}; export it without.")
+        return DataError(f"expected a plain glTF, got one that needs {extension} in {self.file}; export it without.")
 
     # Nodes
 
@@ -122,7 +122,7 @@ class _Gltf:
             index, above = todo.pop()
             if index in found:
                 raise DataError(
-                    f"Expected each node once in a glTF's scene, actual node {index} twice in {self.file}; export it "
+                    f"expected each node once in a glTF's scene, got node {index} twice in {self.file}; export it "
                     "again."
                 )
             node = nodes[index]
@@ -255,7 +255,7 @@ class _Gltf:
         source = texture.get("source", extensions.get("EXT_texture_webp", {}).get("source"))
         if source is None:
             actual = " and ".join(extensions) or "another format"
-            raise DataError(f"Expected textures as PNG or JPEG, actual {actual} in {self.file}; export it again.")
+            raise DataError(f"expected textures as PNG or JPEG, got {actual} in {self.file}; export it again.")
         if source not in self.pictures:
             image = self.tree["images"][source]
             if "bufferView" in image:
@@ -306,7 +306,7 @@ class _Gltf:
             return self._path(uri).read_bytes()
         except OSError:
             raise DataError(
-                f"Expected the {what} {unquote(uri)} of {self.file} beside it, actual no such file; put it there."
+                f"expected the {what} {unquote(uri)} of {self.file} beside it, got no such file; put it there."
             ) from None
 
     def _path(self, uri: str) -> Path:

@@ -33,7 +33,7 @@ def check_number(file: Path, triangles: int) -> None:
         DataError: it has.
     """
     if triangles > MOST_TRIANGLES:
-        raise DataError(f"Expected at most {MOST_TRIANGLES} triangles, actual {triangles} in {file}; simplify it.")
+        raise DataError(f"expected at most {MOST_TRIANGLES} triangles, got {triangles} in {file}; simplify it.")
 
 
 def check_geometry(file: Path, positions: np.ndarray, triangles: np.ndarray) -> None:
@@ -43,13 +43,11 @@ def check_geometry(file: Path, positions: np.ndarray, triangles: np.ndarray) -> 
         DataError: they are not.
     """
     if triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise DataError(f"Expected triangles, actual faces of {triangles.shape[1:]} in {file}; triangulate it.")
+        raise DataError(f"expected triangles, got faces of {triangles.shape[1:]} in {file}; triangulate it.")
     if triangles.min() < 0 or triangles.max() >= len(positions):
-        raise DataError(
-            f"Expected vertices 0..{len(positions) - 1}, actual {triangles.max()} in {file}; export it again."
-        )
+        raise DataError(f"expected vertices 0..{len(positions) - 1}, got {triangles.max()} in {file}; export it again.")
     if not np.isfinite(positions[triangles]).all():
-        raise DataError(f"Expected finite vertices, actual NaN or infinity in {file}; export it again.")
+        raise DataError(f"expected finite vertices, got NaN or infinity in {file}; export it again.")
 
 
 def is_tinted(material: str) -> bool:
@@ -69,9 +67,7 @@ def opened(file: Path, name: str, source: str | io.BytesIO) -> Image.Image:
             data = pixel_file(data).data  # Pillow stumbles over what lies beside the pixels
         return Image.open(io.BytesIO(data))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        raise DataError(
-            f"Expected a picture, actual {name}, which {file} names; replace it by a PNG or JPEG."
-        ) from None
+        raise DataError(f"expected a picture, got {name}, which {file} names; replace it by a PNG or JPEG.") from None
 
 
 def decoded(file: Path, name: str, image: Image.Image) -> np.ndarray:
@@ -86,5 +82,5 @@ def decoded(file: Path, name: str, image: Image.Image) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(
-            f"Expected a picture that decodes, actual {name}, which {file} names ({error}); replace it."
+            f"expected a picture that decodes, got {name}, which {file} names ({error}); replace it."
         ) from None

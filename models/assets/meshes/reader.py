@@ -48,9 +48,9 @@ def read(file: Path) -> Fields:
     """
     parts = gltf.parts(file) if file.suffix.lower() in (".glb", ".gltf") else _through_trimesh(file)
     if not parts:
-        raise DataError(f"Expected a mesh with triangles, actual none in {file}; export it again, triangulated.")
+        raise DataError(f"expected a mesh with triangles, got none in {file}; export it again, triangulated.")
     if not all(part.uv is None or np.isfinite(part.uv).all() for part in parts):
-        raise DataError(f"Expected finite texture coordinates, actual NaN or infinity in {file}; export it again.")
+        raise DataError(f"expected finite texture coordinates, got NaN or infinity in {file}; export it again.")
     before = np.cumsum([0, *(len(p.positions) for p in parts)])
     positions = np.concatenate([p.positions for p in parts])
     if file.suffix.lower() not in (".ply", ".stl"):
@@ -62,7 +62,7 @@ def read(file: Path) -> Fields:
     colour = colour * flat
     positions, triangles, kept = _welded(positions, triangles)
     if not kept.any():
-        raise DataError(f"Expected triangles with an area, actual none in {file}; export it again.")
+        raise DataError(f"expected triangles with an area, got none in {file}; export it again.")
     check_number(file, len(triangles))
     colour, tinted, uv = colour[kept], tinted[kept], None if uv is None else uv[kept]
     if volume(positions - positions.mean(0), triangles) < -0.02 * np.prod(np.ptp(positions, 0)):
@@ -102,7 +102,7 @@ def _through_trimesh(file: Path) -> list[Part]:
         except Exception as error:  # whatever it stumbles on, the file is at fault
             fault = f"{type(error).__name__}: {error}"
             raise DataError(
-                f"Expected a mesh that trimesh can read, actual {file} ({fault}); export it again, triangulated."
+                f"expected a mesh that trimesh can read, got {file} ({fault}); export it again, triangulated."
             ) from None
         return _parts(file, scene, textures, trimesh.Trimesh)
 
@@ -119,7 +119,7 @@ def _parts(file: Path, scene, textures: dict[str, Texture], triangular: type) ->
             continue
         if (at := unfillable(positions, _ply_faces(file, piece))) is not None:
             raise DataError(
-                f"Expected triangles or convex polygons, actual one with a dent, face {at} of {file}; triangulate it."
+                f"expected triangles or convex polygons, got one with a dent, face {at} of {file}; triangulate it."
             )
         check_geometry(file, positions, triangles)
         positions = positions @ transform[:3, :3].T + transform[:3, 3]
@@ -139,7 +139,7 @@ def _ply_faces(file: Path, piece) -> Polygons:
         return () if name is None else data[name]
     corners = data[name]["f1"]
     if (data[name]["f0"] != corners.shape[1]).any():
-        raise DataError(f"Expected triangles, actual faces of several lengths in {file}; triangulate it.")
+        raise DataError(f"expected triangles, got faces of several lengths in {file}; triangulate it.")
     return corners
 
 

@@ -40,7 +40,7 @@ def _text(file: Path) -> str:
     try:
         return file.read_bytes().decode("utf-8", errors="replace").replace("\t", " ")
     except OSError as error:
-        raise DataError(f"Expected a readable file, actual {file} ({error.strerror}).") from None
+        raise DataError(f"expected a readable file, got {file} ({error.strerror}).") from None
 
 
 def _obj(file: Path) -> dict[str, Texture]:
@@ -49,7 +49,7 @@ def _obj(file: Path) -> dict[str, Texture]:
     used, textures = {rest for word, rest in lines if word == "usemtl"}, {}
     for library in (rest for word, rest in lines if word == "mtllib"):
         if not (mtl := file.parent / library).is_file():
-            raise DataError(f"Expected the materials of {file} in {mtl}, actual no such file; put it there.")
+            raise DataError(f"expected the materials of {file} in {mtl}, got no such file; put it there.")
         material = ""
         for word, rest in _lines(mtl):
             if word == "newmtl":
@@ -69,7 +69,7 @@ def _check_polygons(file: Path, lines: list[tuple[str, str]]) -> None:
             numbers.append(number)
     if polygons and (at := unfillable(np.array(positions).reshape(-1, 3), polygons)) is not None:
         raise DataError(
-            f"Expected triangles or convex polygons, actual one with a dent in line {numbers[at]} of {file}; "
+            f"expected triangles or convex polygons, got one with a dent in line {numbers[at]} of {file}; "
             "triangulate it."
         )
 
@@ -96,7 +96,7 @@ def _texture(file: Path, folder: Path, text: str) -> Texture:
         name, options[option[1]] = name[option.end() :], option[2].split()
     path = folder / name.replace("\\", "/")
     if not path.is_file():
-        raise DataError(f"Expected the texture {name} of {file} in {folder}, actual no such file; put it there.")
+        raise DataError(f"expected the texture {name} of {file} in {folder}, got no such file; put it there.")
     try:
         scale, offset = (
             tuple(float(number) for number in (*options.get(key, ()), rest, rest)[:2])
@@ -104,6 +104,6 @@ def _texture(file: Path, folder: Path, text: str) -> Texture:
         )
     except ValueError:
         raise DataError(
-            f"Expected numbers after -s and -o of the texture {name} of {file}, actual {text}; mend them."
+            f"expected numbers after -s and -o of the texture {name} of {file}, got {text}; fix them."
         ) from None
     return Texture(str(path), scale, offset)

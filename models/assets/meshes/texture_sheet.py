@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-LARGEST = 1024  # texels, a side of each
+MAX_TEXTURE_SIZE = 1024  # texels, a side of each
 _PAD = 4  # texels about each, so that neighbours do not shine through
 _REPEATS = 4  # of a texture within one face, at most; beyond, its mean colour is used
 
@@ -67,7 +67,7 @@ def _prepared(uv, texture, number):
     white = np.ones(3)
     if texture is None:
         return None, None, number, white
-    by = LARGEST / max(texture.shape[:2])
+    by = MAX_TEXTURE_SIZE / max(texture.shape[:2])
     if by < 1:
         size = [max(1, round(side * by)) for side in texture.shape[1::-1]]
         texture = cv2.resize(texture, size, interpolation=cv2.INTER_AREA)

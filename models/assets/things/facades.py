@@ -51,7 +51,7 @@ def facade(
             elif lowest and ground == "door" and bay == bays // 2:
                 _door(rng, picture, x, y, wide, high)
             else:
-                _window(rng, picture, x, y, wide, high, *window, shutters)
+                _window(rng, picture, (x, y, wide, high), window, shutters)
         if storey:
             _fill(picture, 0, y - 2, WIDE, y + 1, 0.88 * picture[int(y), :, :].mean(0))
     return np.rint(np.clip(picture, 0, 255)).astype(np.uint8)
@@ -82,8 +82,10 @@ def _roof(rng, kind: str, height: int) -> np.ndarray:
     return painted((196, 196, 196), shade + 46 * (bow - 0.4) + 5 * noise(rng, height, WIDE, 1.0))
 
 
-def _window(rng, picture, x, y, wide, high, width, height, shutters) -> None:
-    w, h = wide * width / 2, high * height / 2
+def _window(rng, picture, bay, share, shutters) -> None:
+    """A window in the middle of a ``bay`` (x, y, width, height), of such a share of its width and height."""
+    x, y, wide, high = bay
+    w, h = wide * share[0] / 2, high * share[1] / 2
     cx, cy = x + wide / 2, y + high * 0.50
     if shutters is not None:
         for side in (-1, 1):

@@ -12,7 +12,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import Scenes
 
-from ..datasets.generate import Dataset, generate_scenes
+from ..datasets.generate import Dataset, DatasetOptions, generate_scenes, workers_or_cluster
 from ..datasets.generate import generate as generate_run
 from ..evaluation import compare as comparing
 from ..evaluation import evaluate as evaluating
@@ -20,7 +20,7 @@ from ..evaluation.compare import Comparison
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.labels import Labels, read_labels
 from ..evaluation.visible import Visible
-from ..fitting.fit import open_target
+from ..fitting.pipeline import open_target
 from ..fitting.run import RunFolder, is_run
 from ..loading import load_model, renderer_for
 from ..progress import Display
@@ -85,18 +85,19 @@ def generate(
     end_if_starting()
     with display(progress) as show:
         said = show.stage("generating")
+        options = DatasetOptions(
+            min_visible=min_visible, flat=flat, box_margin=box_margin, amodal=amodal, values=values, shard=shard
+        )
         if not isinstance(source, RunFolder | SceneModel) and not is_run(str(source)):
             source = load_model(str(source))
         if isinstance(source, SceneModel):
             if workers != 1 or cluster is not None:
-                raise ProbsceneError("Expected one worker for a model in memory, actual several; fit or name its file.")
+                raise ProbsceneError("expected one worker for a model in memory, got several; fit or name its file.")
             policy = policy or source.prior
-            more = min_visible, shard, flat, box_margin, amodal, values
-            return generate_scenes(source, policy, num, out, seed, format, said, *more)
+            return generate_scenes(source, policy, num, out, seed, format, said, options)
         run = source if isinstance(source, RunFolder) else RunFolder.at(Path(source))
         with connected(cluster, show.say) as nodes:
-            given = min_visible, shard, nodes, flat, box_margin, amodal, values
-            return generate_run(run, num, out, seed, workers, format, said, *given)
+            return generate_run(run, num, out, seed, workers_or_cluster(workers, nodes), format, said, options)
 
 
 def evaluate(
@@ -163,7 +164,7 @@ def compare(
     """
     opened = comparing.open_runs(runs)
     if out is not None:
-        comparison_picture.make_place(Path(out))
+        comparison_picture.make_folder_of(Path(out))
     first = next(iter(opened.values()))
     with display(progress) as show:
         images = None if target is None and labels is None else _images(first, target, show)
@@ -262,11 +263,7 @@ def trial(
         opened = run if isinstance(run, RunFolder) else RunFolder.at(Path(run))
         made = trying.Generated(opened, tuple(sources), generated, min_visible, box_margin)
     with display(progress) as show:
-        return trying.trial(
-            Path(test),
-            Path(out),
-            sets or {},
-            show,
+        options = trying.TrialOptions(
             hold_out=hold_out,
             real=None if real is None else Path(real),
             numbers=numbers,
@@ -279,10 +276,9 @@ def trial(
             seed=seed,
             baselines=baselines,
             resamples=resamples,
-            workers=workers,
             value_range=value_range,
-            say=show.say,
         )
+        return trying.trial(Path(test), Path(out), sets or {}, options, workers=workers, show=show, callback=show.say)
 
 
 def display(progress: bool) -> Display:

@@ -14,9 +14,9 @@ from probscene.model import SceneModel
 from ..arguments import checked_seed, positive
 from ..evaluation.estimate import class_counts
 from ..fitting.run import RunFolder, is_run
-from ..labelling.choosing import propose
-from ..labelling.few import FewLabels, read_few
-from ..labelling.sheet import Sheet, check_empty, write_sheet
+from ..labels.partial_labels import PartialLabels, read_partial_labels
+from ..labels.selection import propose
+from ..labels.sheet import Sheet, check_empty, write_sheet
 from ..loading import load_model
 from ..progress import Display, Progress
 from ..targets import Target, open_images
@@ -38,22 +38,22 @@ def label(
     progress: bool = True,
     value_range: Sequence[float] | None = None,
 ) -> Sheet:
-    """Propose which images to label next, see ``labelling.choosing``, and write the sheet to count in.
+    """Propose which images to label next, see ``labels.selection``, and write the sheet to count in.
 
     Args:
         source: a run, whose network's counts say which images to take, as far as it has some; or a model.
         target: the images.
         out: the folder to write, new or empty.
         number: images to propose; fewer where fewer are left.
-        labels: of images that are labelled already, see ``read_few``; they are not proposed, and the sheet asks for
-            the same classes and has their counts, too.
+        labels: of images that are labelled already, see ``read_partial_labels``; they are not proposed, and the sheet
+            asks for the same classes and has their counts, too.
         seed: of the first image.
         skip_bad: leave out files that do not decode.
         assets: a folder that a model is drawn with.
         value_range: of images of 16 bits, see ``ImageFolder``; the run's, if it has one, where None.
 
     Raises:
-        ProbsceneError: the folder holds files already, or all images are labelled; see ``read_few`` and
+        ProbsceneError: the folder holds files already, or all images are labelled; see ``read_partial_labels`` and
             ``open_images``.
     """
     out = Path(out)
@@ -65,10 +65,10 @@ def label(
         if value_range is None and run is not None:
             value_range = run.record.get("value_range")
         images = open_images(target, model, skip_bad, show, value_range)
-        few = None if labels is None else read_few(Path(labels), model, images, least=1)
+        few = None if labels is None else read_partial_labels(Path(labels), model, images, min_images=1)
         rows = _proposed(run, model, images, number, few, seed, show)
     if not rows:
-        raise DataError(f"Expected images without labels in {images.path}, actual all {len(images)} labelled.")
+        raise DataError(f"expected images without labels in {images.path}, got all {len(images)} labelled.")
     classes = model.classes if few is None else few.classes
     return write_sheet(out, images, rows, classes, model.name, _cells(images, few))
 
@@ -84,7 +84,7 @@ def _proposed(
     model: SceneModel,
     images: Images,
     number: int,
-    few: FewLabels | None,
+    few: PartialLabels | None,
     seed: int,
     show: Display,
 ) -> list[int]:
@@ -122,7 +122,7 @@ def _seen(images: Images, considered: list[int], nets: list[FeatureNet], progres
     return [torch.cat(part) for part in parts]
 
 
-def _cells(images: Images, few: FewLabels | None) -> dict[str, list[str]]:
+def _cells(images: Images, few: PartialLabels | None) -> dict[str, list[str]]:
     if few is None:
         return {}
     names = [images.paths[row].name for row in few.rows.tolist()]

@@ -18,9 +18,9 @@ from ..datasets.generate import Dataset
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.labels import Labels
 from ..files import make_folder
-from ..fitting.parts import GuideMaker, Parts, as_divergence, as_features, as_guide_maker
+from ..fitting.plugins import GuideMaker, Plugins, as_divergence, as_features, as_guide_maker
 from ..fitting.run import RunFolder
-from ..fitting.storage import check_free
+from ..fitting.store import check_free
 from ..targets import Target
 from . import calls
 
@@ -53,7 +53,15 @@ class Run(RunFolder):
             RunError: there is none, it is damaged, or another version wrote it; its model or its guide were in memory
                 and are not given. Features and a divergence are asked for where they are used.
         """
-        run = cls.at(Path(path), model, parts_of(features, divergence, guide))
+        run = cls.at(
+            Path(path),
+            model,
+            Plugins(
+                None if features is None else as_features(features),
+                None if divergence is None else as_divergence(divergence),
+                None if guide is None else as_guide_maker(guide),
+            ),
+        )
         run.check_objects("model", "guide")
         return run
 
@@ -111,17 +119,4 @@ class Run(RunFolder):
                 shutil.copytree(Path(aside) / "run", path, dirs_exist_ok=True)
             else:
                 (Path(aside) / "run").rename(path)
-        return type(self)(path, self.record, self._model, self.parts)
-
-
-def parts_of(features: Any, divergence: Any, guide: Any) -> Parts:
-    """The parts of a fit that are objects; None for what is not.
-
-    Raises:
-        ModelError: one that is no such part.
-    """
-    return Parts(
-        None if features is None else as_features(features),
-        None if divergence is None else as_divergence(divergence),
-        None if guide is None else as_guide_maker(guide),
-    )
+        return type(self)(path, self.record, self._model, self.plugins)

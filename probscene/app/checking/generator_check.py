@@ -2,7 +2,7 @@
 image cost?"""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,14 +12,12 @@ from probscene.batch import RenderBatch
 from probscene.errors import ModelError
 from probscene.generator import Command, Generator
 from probscene.model import SceneModel
-from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import close_pools
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.sampling import sample
 from probscene.threads import cores
 
 from ..chunks import chunk_randomness
-from ..fitting.preset import Preset
-from ..fitting.presets import PRESETS
 
 SCENES = 3
 SLOW = 600.0  # seconds of drawing of which a fit says beforehand
@@ -35,6 +33,7 @@ class GeneratorReport(NamedTuple):
         seconds: an image takes, drawn by one worker.
         workers: that draw at once.
         reproducible: what its ``Command`` says.
+        images: that a fit has drawn, by preset.
     """
 
     command: str
@@ -42,15 +41,16 @@ class GeneratorReport(NamedTuple):
     seconds: float
     workers: int
     reproducible: bool
+    images: Mapping[str, int]
 
     @property
     def fault(self) -> str:
-        """What to mend; empty for nothing."""
+        """What to fix; empty for nothing."""
         if not self.differs or not self.reproducible:
             return ""
         return (
-            f"Expected the generator {self.command} to draw a scene with the same bytes by fresh processes and in "
-            f"another order, actual another {' and another '.join(self.differs)}; let all that is random in it come "
+            f"expected the generator {self.command} to draw a scene with the same bytes by fresh processes and in "
+            f"another order, got another {' and another '.join(self.differs)}; let all that is random in it come "
             "from scene.seed and keep nothing from scene to scene, or say so: Command(..., reproducible=False)."
         )
 
@@ -58,7 +58,7 @@ class GeneratorReport(NamedTuple):
         bytes_ = "the same bytes" if not self.differs else f"another {' and another '.join(self.differs)}"
         if self.differs and not self.reproducible:
             bytes_ += ", as its Command says; no image can be made again"
-        each = [f"{name} {_told(self.seconds * preset.images / self.workers)}" for name, preset in _presets().items()]
+        each = [f"{name} {_told(self.seconds * images / self.workers)}" for name, images in self.images.items()]
         return (
             f"Generator {self.command}: {SCENES} scenes drawn twice, by fresh processes and in another order: "
             f"{bytes_}.\n"
@@ -67,8 +67,11 @@ class GeneratorReport(NamedTuple):
         )
 
 
-def check_generator(model: SceneModel) -> GeneratorReport:
+def check_generator(model: SceneModel, images: Mapping[str, int]) -> GeneratorReport:
     """Draw a few scenes of the prior twice. Running workers of the generator are ended.
+
+    Args:
+        images: that a fit has drawn, by preset, for which the time is estimated.
 
     Raises:
         ModelError: the model has no generator.
@@ -77,8 +80,7 @@ def check_generator(model: SceneModel) -> GeneratorReport:
     """
     if model.generator is None:
         raise ModelError(
-            f"Expected a model with a generator, actual {model.name!r}, which probscene draws itself; leave --render "
-            "out."
+            f"expected a model with a generator, got {model.name!r}, which probscene draws itself; leave --render out."
         )
     generator = _unkept(model.generator)
     if isinstance(generator, Command):
@@ -94,11 +96,13 @@ def check_generator(model: SceneModel) -> GeneratorReport:
         (spent + more) / 2,
         _workers(generator),
         not isinstance(generator, Command) or generator.reproducible,
+        images,
     )
 
 
-def cost(model: SceneModel, preset: Preset) -> str:
-    """How long a fit draws, in a sentence, where that is long; else empty. The workers that it starts go on.
+def cost(model: SceneModel, images: int) -> str:
+    """How long a fit draws so many images, in a sentence, where that is long; else empty. The workers that it starts go
+    on.
 
     Raises:
         GeneratorError: the generator cannot draw a few scenes of the prior.
@@ -109,13 +113,14 @@ def cost(model: SceneModel, preset: Preset) -> str:
     workers, each = _workers(generator), _drawn(generator, model, range(SCENES))[0]
     if generator != model.generator:
         _end(generator)
-    seconds = each * preset.images / workers
+    seconds = each * images / workers
     if seconds < SLOW:
         return ""
     return (
-        f"Note: this fit has about {preset.images:,} images drawn, for which the generator {_name(generator)} "
+        f"Note: this fit has about {images:,} images drawn, for which the generator {_name(generator)} "
         f"needs {_told(seconds)} ({1000 * each:.3g} ms an image, {workers} at once); fewer with "
-        "--features count=efficientnet, and with --set reuse=4, which takes renders of equal counts again."
+        "--features count=efficientnet, and with --set structure.render_cache=4, which takes renders of equal "
+        "counts again."
     )
 
 
@@ -158,10 +163,6 @@ def _differs(first: list[RenderBatch], again: list[RenderBatch]) -> tuple[str, .
         for key in names
         if not all(torch.equal(getattr(a, key), getattr(b, key)) for a, b in zip(first, again, strict=True))
     )
-
-
-def _presets() -> dict[str, Preset]:
-    return PRESETS | {"quick with count=efficientnet": PRESETS["quick"].with_features("count=efficientnet")}
 
 
 def _told(seconds: float) -> str:

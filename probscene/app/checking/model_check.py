@@ -1,4 +1,4 @@
-"""What only running a model shows: does its program run, is everything that is derived drawn, and can it be seen.
+"""Checks that run a model: does its program run, is everything that is derived drawn, and can it be seen.
 
 ``checks.check`` looks at grammar and prior alone; ``check_model`` also runs the program under the prior and under the
 policy of pretraining, and renders some of the scenes. Axis letters: N scenes, M nodes.
@@ -16,24 +16,24 @@ from probscene.checks import Report, check
 from probscene.errors import MachineError, ProbsceneError
 from probscene.inference.features.counting.net import CountNet
 from probscene.model import SceneModel
-from probscene.program_errors import told
+from probscene.program_errors import user_errors
 from probscene.sampling import Scenes, run_program, sample
 
 from ..chunks import chunk_randomness
 from ..loading import renderer_for
 from . import randomness
-from .watch import Watch, longer, lookups, shorter, watched
+from .program_calls import CallRecorder, long_max_steps, missing_parents, recorded, short_max_steps
 
 SCENES, RENDERED = 256, 32  # how many scenes the program is run on, and how many of them are rendered
 QUICK = 64, 16  # the same before a fit
-FEW = 5  # objects of a class: from fewer nothing is concluded
-SELDOM = 0.05  # share of a class's objects that can be seen
-LEAST_SIZE = 6.0  # pixels that an object needs in what the count network reads, see CountNet.fit_to
+MIN_CLASS_OBJECTS = 5  # below, nothing is concluded of a class
+MIN_VISIBLE_SHARE = 0.05  # share of a class's objects that can be seen
+MIN_OBJECT_SIZE = 6.0  # pixels that an object needs in what the count network reads, see CountNet.fit_to
 
 
 class Findings(NamedTuple):
-    """What running a model has shown: faults, each with what to do, warnings, and of each class the sizes ``(n,)`` of
-    objects that can be seen, pixels."""
+    """What running a model shows: faults, each with a remedy, warnings, and by class the sizes ``(n,)`` of visible
+    objects, pixels."""
 
     faults: list[str]
     warnings: list[str]
@@ -45,12 +45,12 @@ def check_model(
 ) -> Report:
     """``check``, and where that finds no faults, what running the program and rendering its scenes shows.
 
-    The state of all generators of random numbers and Pyro's parameters are left as they were.
+    The state of all random number generators and Pyro's parameters stay as they were.
 
     Args:
         scenes: how many the program is run on, shared out between scenarios, and between the prior and the policy of
             pretraining where the model has one.
-        rendered: how many of them are rendered, those first that hold each class.
+        rendered: how many of them are rendered, first those that hold each class.
         again: the model of the same file, imported a second time, where that is to be the same.
     """
     report = check(model)
@@ -68,34 +68,38 @@ def check_model(
         warnings += [before + text for text in found.warnings]
         for kind, size in found.sizes.items():
             sizes[kind].append(size)
-    warnings += _small(model, {kind: torch.cat(some) for kind, some in sizes.items() if some})
+    warnings += _small_classes(model, {kind: torch.cat(some) for kind, some in sizes.items() if some})
     return replace(report, faults=tuple(faults), warnings=tuple(warnings))
 
 
 def check_program(model: SceneModel, scenes: int, rendered: int, again: SceneModel | None = None) -> Findings:
     """Run a model's program and render some of its scenes; arguments as of ``check_model``."""
-    watch, store = Watch(model.grammar), pyro.get_param_store()
+    recorder, store = CallRecorder(model.grammar), pyro.get_param_store()
     with store.scope(store.get_state()), chunk_randomness(0, 0):
         known = set(store.keys())
         try:
             policies = [model.prior] if model.pretraining is None else [model.prior, model.pretraining]
             number = -(-scenes // len(policies))
-            drawn = [sample(watched(model, watch), policy, number) for policy in policies]
-            wrong = [*_not_finite(drawn), *_parameters(set(store.keys()) - known)]
+            drawn = [sample(recorded(model, recorder), policy, number) for policy in policies]
+            wrong = [*_not_finite(drawn), *_pyro_params(set(store.keys()) - known)]
             if wrong:
                 return Findings(wrong, [], {})
-            with told(f"the renderer of model {model.name!r}", model.renderer):
+            with user_errors(f"the renderer of model {model.name!r}", model.renderer):
                 render = renderer_for(model)
                 batches = _rendered(model, render, drawn, rendered)
-                few = drawn[0].derivation[_telling(model, drawn[0], randomness.SCENES)]
-                random = randomness.beside_sites(model, few, render, again)
+                few = drawn[0].derivation[_scenes_to_render(model, drawn[0], randomness.SCENES)]
+                random = randomness.hidden_randomness(model, few, render, again)
         except MachineError:
             raise
         except ProbsceneError as error:
-            return Findings(shorter(model, watch) or [str(error)], [], {})
-    faults, warnings = _seen(model, batches)
-    faults += [*shorter(model, watch), *random]
-    warnings += [*longer(model, watch), *lookups(model, watch, drawn[0]), *_colours(model, drawn[0])]
+            return Findings(short_max_steps(model, recorder) or [str(error)], [], {})
+    faults, warnings = _visibility(model, batches)
+    faults += [*short_max_steps(model, recorder), *random]
+    warnings += [
+        *long_max_steps(model, recorder),
+        *missing_parents(model, recorder, drawn[0]),
+        *_colours(model, drawn[0]),
+    ]
     return Findings(faults, warnings, {name: _sizes(model.grammar.kind(name), batches) for name in model.classes})
 
 
@@ -114,7 +118,7 @@ def _not_finite(drawn: list[Scenes]) -> list[str]:
     return list(wrong.values())
 
 
-def _parameters(names: set[str]) -> list[str]:
+def _pyro_params(names: set[str]) -> list[str]:
     return [
         f"The program has pyro.param({name!r}), which no fit learns; make it a number, or a site that parameters are "
         f"learnt of, such as pyro.sample({name!r}, dist.Uniform(low, high))."
@@ -125,15 +129,15 @@ def _parameters(names: set[str]) -> list[str]:
 def _rendered(
     model: SceneModel, render: Renderer, drawn: list[Scenes], rendered: int
 ) -> list[tuple[Tensor, RenderBatch]]:
-    """The kinds ``(N, M)`` that were derived and what is seen of them, for a part of each policy's scenes."""
+    """The kinds ``(N, M)`` that were derived and the renders of them, for some of each policy's scenes."""
     found = []
     for scenes in drawn:
-        some = scenes.derivation[_telling(model, scenes, -(-rendered // len(drawn)))].trimmed()
+        some = scenes.derivation[_scenes_to_render(model, scenes, -(-rendered // len(drawn)))].trimmed()
         found.append((some.kind, render(run_program(model, some).drawing)))
     return found
 
 
-def _telling(model: SceneModel, scenes: Scenes, number: int) -> Tensor:
+def _scenes_to_render(model: SceneModel, scenes: Scenes, number: int) -> Tensor:
     """The scenes to render: of each class in turn one that holds it, and then the first ones."""
     counts = scenes.derivation.counts(len(model.grammar.kinds))
     holding = [counts[:, model.grammar.kind(name)].nonzero().flatten().tolist() for name in model.classes]
@@ -151,7 +155,7 @@ class _Class(NamedTuple):
     box: Tensor
 
 
-def _seen(model: SceneModel, batches: list[tuple[Tensor, RenderBatch]]) -> tuple[list[str], list[str]]:
+def _visibility(model: SceneModel, batches: list[tuple[Tensor, RenderBatch]]) -> tuple[list[str], list[str]]:
     each = {name: _class(model.grammar.kind(name), batches) for name in model.classes}
     each = {name: found for name, found in each.items() if found.derived}
     faults, warnings = [], []
@@ -164,18 +168,18 @@ def _seen(model: SceneModel, batches: list[tuple[Tensor, RenderBatch]]) -> tuple
             )
     hidden = {name: found for name, found in each.items() if found.drawn and not found.seen}
     boxes = [found.box for found in hidden.values()]
-    if hidden and len(hidden) == len(each) and sum(found.drawn for found in hidden.values()) >= FEW:
+    if hidden and len(hidden) == len(each) and sum(found.drawn for found in hidden.values()) >= MIN_CLASS_OBJECTS:
         objects = ", ".join(map(repr, hidden))
         return [f"Nothing that is drawn can be seen ({objects}): {_why_hidden(model, torch.cat(boxes))}."], []
     for name, found in each.items():
         share = found.seen / found.derived
-        if name in hidden and found.drawn >= FEW:
+        if name in hidden and found.drawn >= MIN_CLASS_OBJECTS:
             faults.append(f"Class {name!r} can never be seen: {_why_hidden(model, found.box)}.")
-        elif found.drawn and share < SELDOM:
+        elif found.drawn and share < MIN_VISIBLE_SHARE:
             warnings.append(
                 f"Class {name!r} can be seen in {found.seen} of the {found.derived} cases in which it is derived, "
-                f"fewer than {100 * SELDOM:g} %, so that counts of it cannot be learnt; place it on the canvas and "
-                "where nothing covers it."
+                f"fewer than {100 * MIN_VISIBLE_SHARE:g} %, so that counts of it cannot be learnt; place it on the "
+                "canvas and where nothing covers it."
             )
     return faults, warnings
 
@@ -222,20 +226,20 @@ def _colours(model: SceneModel, drawn: Scenes) -> list[str]:
     ]
 
 
-def _small(model: SceneModel, sizes: dict[str, Tensor]) -> list[str]:
+def _small_classes(model: SceneModel, sizes: dict[str, Tensor]) -> list[str]:
     """Classes of which half are too small for the count network, as it would reduce the images."""
-    sizes = {name: size for name, size in sizes.items() if len(size) >= FEW}
+    sizes = {name: size for name, size in sizes.items() if len(size) >= MIN_CLASS_OBJECTS}
     if not sizes:
         return []
     with torch.random.fork_rng(devices=[]):
         net = CountNet(model.classes, model.channels, model.canvas, groups=model.groups)
     net.fit_to(float(torch.cat(list(sizes.values())).quantile(0.1)))
     middle = {name: float(size.median()) for name, size in sizes.items()}
-    small = [f"{name!r} {size:.2g}" for name, size in middle.items() if size / net.reduce < LEAST_SIZE]
+    small = [f"{name!r} {size:.2g}" for name, size in middle.items() if size / net.reduce < MIN_OBJECT_SIZE]
     if not small:
         return []
     reduced = f", which the count network reduces by {net.reduce}" if net.reduce > 1 else ""
     return [
-        f"Objects are small, in pixels: {', '.join(small)}{reduced}; below {LEAST_SIZE:g} there they can hardly be "
-        "counted; draw them larger."
+        f"Objects are small, in pixels: {', '.join(small)}{reduced}; below {MIN_OBJECT_SIZE:g} there they can hardly "
+        "be counted; draw them larger."
     ]

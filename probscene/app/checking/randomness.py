@@ -1,5 +1,5 @@
-"""Is all that is random in a program a site? Only then one seed gives one dataset, and an image can be made again from
-its line of ``provenance.jsonl``."""
+"""Is everything random in a program a site? Only then one seed gives one dataset, and an image can be remade from its
+line of ``provenance.jsonl``."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -18,10 +18,10 @@ from ..chunks import chunk_randomness
 SCENES = 4
 
 
-def beside_sites(
+def hidden_randomness(
     model: SceneModel, derivation: Derivation, render: Renderer, again: SceneModel | None = None
 ) -> list[str]:
-    """A fault where a few scenes are drawn otherwise a second time: by the same seed, also from the model's file
+    """A fault where a few scenes differ when they are drawn again: by the same seed, also from the model's file
     imported ``again``, or from the values of their sites by another seed. Each scene is rendered three or four times;
     of a generator's, what it is asked for is compared."""
 
@@ -44,7 +44,7 @@ def beside_sites(
     if not differs:
         return []
     return [
-        f"Expected the program to draw the same scenes again, actual other ones {', and '.join(differs)}: something "
+        f"expected the program to draw the same scenes again, got other ones {', and '.join(differs)}: something "
         "random is no site (torch.rand, random, numpy's generators), or is kept from call to call. Draw it with "
         "pyro.sample, such as shift = pyro.sample('shift', dist.Uniform(0.0, 1.0))."
     ]

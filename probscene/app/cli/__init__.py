@@ -9,7 +9,7 @@ import signal
 import sys
 from types import FrameType
 
-from ..memory import keep_freed_memory
+from ..memory import tune_malloc
 from . import fit_commands, model_commands, run_commands, trial_command
 from .application import app, explained
 
@@ -22,7 +22,7 @@ def main() -> None:
         sys.stdout.reconfigure(errors="replace")  # a grammar's ε on a terminal that has none
     # Torch's threads wait for one another spinning, which on a machine that has other work takes six times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    keep_freed_memory()
+    tune_malloc()
     _end_when_asked()
     try:
         app(prog_name="probscene")

@@ -21,8 +21,8 @@ def fit(
     model: Annotated[str | None, typer.Argument(metavar="MODEL", help="A built-in model or a .py file.")] = None,
     target: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of PNG, JPEG or TIFF images.")] = None,
     preset: Annotated[PresetName | None, typer.Option(help="How long to learn; 'default' if not given.")] = None,
-    objective: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The divergence: kde, js, witness, mmd, or FILE.py:NAME.")
+    divergence: Annotated[
+        str | None, typer.Option(metavar="NAME", help="What is descended: kde, js, witness, mmd, or FILE.py:NAME.")
     ] = None,
     guide: Annotated[
         str | None, typer.Option(metavar="NAME", help="What learns: lstm, pcfg, grammar-vae, or FILE.py:NAME.")
@@ -47,7 +47,8 @@ def fit(
         ),
     ] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a preset's field.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Another value of it, such as structure.batches=40."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same result; 0 if not given.")] = None,
     skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = None,
@@ -73,67 +74,31 @@ def fit(
     """Learn which structures occur in a folder of unlabelled images, and say how near that came."""
     from rich.console import Console
 
-    from ..api.fit import chosen_preset, preset_for_photographs, with_learn
-    from ..evaluation.judge import judge
-    from ..fitting import session
-    from ..fitting.fit import open_target
-    from ..loading import split_reference
-    from ..progress import Display
+    from ..api.fit import DEFAULT, fit_and_diagnose, fit_request
+    from ..fitting.begin import ModelFile, TargetImages
+    from ..fitting.config import configuration, parameter_choice
+    from ..fitting.pipeline import Execution
+    from ..fitting.presets import preset as named
+    from ..loading import with_scenarios
     from ..views.verdict_text import show_parts
-    from ..walls.warn import tell
-    from ..workers.cluster import connected
 
-    if seed is not None:
-        checked_seed(seed)
-    chosen_range = range_given(value_range)
-    name = str(preset or PresetName.default)
-    settings = with_learn(settings or [], learn, parameters)
-    chosen, parts = chosen_preset(name, features, objective, guide, settings)
-    other = preset_for_photographs(name, features, objective, guide, settings)
-    if scenarios is not None:
-        if model is None:
-            raise ProbsceneError("Expected MODEL with --scenarios, actual none; a run knows its own.")
-        if split_reference(model)[1]:
-            raise ProbsceneError(f"Expected scenarios once, actual {model} and {scenarios}; leave out --scenarios.")
-        model = f"{model}:{scenarios}"
-    judged = None
-    with Display() as show:
-        with connected(cluster, show.say) as nodes:  # first, so that a wrong address leaves no run behind
-            if resume:
-                given = chosen if preset or objective or guide or features or settings else None
-                begun = {"seed": seed, "skip_bad": skip_bad, "threads": threads, "labels": labels}
-                begun["value_range"] = chosen_range
-                run, images = session.resume(out, show, model, target, given, assets, parts, photographs=other, **begun)
-            elif model is None or target is None:
-                raise ProbsceneError(
-                    "Expected MODEL and --target DIR, actual one missing; only --resume goes without them."
-                )
-            else:
-                run, images = session.begin(
-                    model,
-                    target,
-                    out,
-                    chosen,
-                    seed or 0,
-                    bool(skip_bad),
-                    threads,
-                    show,
-                    assets,
-                    parts,
-                    labels=labels,
-                    photographs=other,
-                    value_range=chosen_range,
-                )
-                ctx.obj.words.append("--resume")
-            unfinished = not run.is_finished
-            if unfinished:
-                session.carry_out(run, images, show, cache, not no_cache, nodes)
-        if unfinished:
-            tell(run, show)
-            if not no_verdict:
-                judged = judge(run, images or open_target(run, show), show)
-    if judged is not None:
-        show_parts(judged.record(), Console(highlight=False))
+    config, method = None, parameter_choice(learn, parameters)
+    if not resume or preset is not None or any((features, divergence, guide, method, settings)):
+        config = configuration(named(str(preset or DEFAULT)), features, divergence, guide, method, settings or [])
+    if model is None and scenarios is not None:
+        raise ProbsceneError("expected MODEL with --scenarios, got none; a run knows its own.")
+    source = None if model is None else with_scenarios(model, scenarios)
+    images = TargetImages(target, skip_bad, range_given(value_range))
+    request = fit_request(ModelFile(source, assets), images, config, seed, labels, threads)
+    execution = Execution(threads, cluster, False if no_cache else cache or True)
+    try:
+        done = fit_and_diagnose(request, out, resume, execution, not no_verdict)
+    except BaseException:
+        if not resume and (out / "run.json").exists():
+            ctx.obj.words.append("--resume")  # what the message says to run again
+        raise
+    if done.diagnostics is not None:
+        show_parts(done.diagnostics.record(), Console(highlight=False))
     print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")
 
 
@@ -145,9 +110,10 @@ def demo(
     no_cache: NoCache = False,
 ) -> None:
     """The whole path on handwritten digits that come with the install; about a quarter of an hour on two cores."""
-    from ..demo import demo
+    from ..api.demo import demo
+    from ..fitting.pipeline import Execution
 
-    demo(out, checked_seed(seed), cache=cache, use_cache=not no_cache)
+    demo(out, checked_seed(seed), execution=Execution(cache=False if no_cache else cache or True))
 
 
 @app.command()

@@ -18,21 +18,22 @@ def check(
     assets: Assets = None,
     render: Annotated[bool, typer.Option("--render", help="Also see whether its generator can be relied on.")] = False,
 ) -> None:
-    """Say whether a model's grammar is sound and its program runs, what can be seen of it, and what to mend."""
+    """Say whether a model's grammar is sound and its program runs, what can be seen of it, and what to fix."""
     from ..checking.generator_check import check_generator
     from ..checking.model_check import check_model
+    from ..fitting.presets import images_drawn
     from ..loading import load_model
 
     loaded, again = load_model(model, assets), load_model(model, assets)
     report = check_model(loaded, again=again)
     print(report)
     if render and not report.faults:
-        found = check_generator(loaded)
+        found = check_generator(loaded, images_drawn())
         print(found)
         if found.fault:
             raise ModelError(found.fault)
     if report.faults:
-        raise ModelError(f"Expected a model without faults, actual {model} with {len(report.faults)}; mend them first.")
+        raise ModelError(f"expected a model without faults, got {model} with {len(report.faults)}; fix them first.")
 
 
 @app.command()

@@ -55,7 +55,7 @@ def generate(
     ] = None,
 ) -> None:
     """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
-    from ..datasets.generate import generate
+    from ..datasets.generate import DatasetOptions, generate, workers_or_cluster
     from ..fitting.run import RunFolder
     from ..progress import Display
     from ..workers.cluster import connected
@@ -63,8 +63,11 @@ def generate(
     with Display() as show, connected(cluster, show.say) as nodes:
         said = show.stage("generating")
         opened = RunFolder.at(run)
-        more = min_visible, shard, nodes, flat, box_margin, amodal, values or ()
-        dataset = generate(opened, num, out, seed, workers, format or "coco", said, *more)
+        options = DatasetOptions(
+            min_visible=min_visible, flat=flat, box_margin=box_margin, amodal=amodal, values=values or (), shard=shard
+        )
+        processes = workers_or_cluster(workers, nodes)
+        dataset = generate(opened, num, out, seed, processes, format or "coco", said, options)
     print(f"{dataset.num} images in {dataset.path}, {dataset.made} of them made now")
     if not dataset.finished:
         print("When all shards are done, the same command without --shard writes the files of labels.")
@@ -100,7 +103,7 @@ def evaluate(
     from rich.console import Console
 
     from ..arguments import number_or_all, range_given
-    from ..evaluation import judge as verdict
+    from ..evaluation import diagnose as verdict
     from ..evaluation.evaluate import evaluate
     from ..evaluation.labels import read_labels
     from ..files import make_folder, write_json
@@ -119,7 +122,7 @@ def evaluate(
         images = open_images(target, opened.model, opened.record["skip_bad"], show, chosen)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
         found = evaluate(opened, images, truth, show, num, features=features or (), images=most, visible=visible)
-        judged = verdict.judge(opened, images, show, scenes, found) if scenes != 0 else None
+        judged = verdict.diagnose(opened, images, show, scenes, found) if scenes != 0 else None
     console = Console(highlight=False)
     if judged is not None:
         verdict_text.show(judged, console)

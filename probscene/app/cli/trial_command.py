@@ -47,14 +47,16 @@ def trial(
         str | None, typer.Option(metavar="NAME,...", help="What it is about; all classes if not given.")
     ] = None,
     detector: Annotated[str, typer.Option(metavar="NET", help="efficientnet or maskrcnn=FILE.")] = "efficientnet",
-    presentations: Annotated[
-        int | None, typer.Option(metavar="N", help="Images shown in a training; 2400, of maskrcnn 10000.")
+    iterations: Annotated[
+        int | None, typer.Option(metavar="N", help="Steps of a training; 600, of maskrcnn 5000.")
     ] = None,
     batch: Annotated[int | None, typer.Option(metavar="N", help="Images a step; 4, of maskrcnn 2.")] = None,
     rate: Annotated[float | None, typer.Option(metavar="X", help="Of Adam; the detector's if not given.")] = None,
-    last: Annotated[float, typer.Option(metavar="SHARE", help="Of the presentations, for the last of A,B.")] = 0.5,
-    chain: Annotated[
-        bool, typer.Option("--chain", help="Each set goes on from the detector of the set before.")
+    finetune_fraction: Annotated[
+        float, typer.Option(metavar="FRACTION", help="Of the images of a training, for the last of A,B.")
+    ] = 0.5,
+    warm_start: Annotated[
+        bool, typer.Option("--warm-start", help="Each set starts from the detector of the set before.")
     ] = False,
     size: Annotated[
         str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Images come so large; about 256x192 if not given.")
@@ -80,9 +82,9 @@ def trial(
     for words in sets or []:
         name, equals, said = words.partition("=")
         if not equals or not said:
-            raise ProbsceneError(f"Expected --set NAME=SET, actual {words!r}.")
+            raise ProbsceneError(f"expected --set NAME=SET, got {words!r}.")
         if name.strip() in named:
-            raise ProbsceneError(f"Expected a name for each set of a trial, actual {name.strip()!r} twice; rename one.")
+            raise ProbsceneError(f"expected a name for each set of a trial, got {name.strip()!r} twice; rename one.")
         named[name.strip()] = said.strip()
     found = calls.trial(
         test,
@@ -98,7 +100,7 @@ def trial(
         box_margin=box_margin,
         classes=None if classes is None else _words(classes),
         detector=detector,
-        budget=Budget(presentations, batch, rate, last, chain),
+        budget=Budget(iterations, batch, rate, finetune_fraction, warm_start),
         size=None if size is None else _size(size),
         seeds=seeds,
         seed=seed,
@@ -118,7 +120,7 @@ def _words(text: str) -> list[str]:
 def _numbers(text: str) -> list[int | None]:
     words = [] if text == "none" else _words(text)
     if not all(word == "all" or (word.isdecimal() and int(word) > 0) for word in words):
-        raise ProbsceneError(f"Expected numbers of photographs such as 10,20,50,all, or none, actual {text!r}.")
+        raise ProbsceneError(f"expected numbers of photographs such as 10,20,50,all, or none, got {text!r}.")
     return [None if word == "all" else int(word) for word in words]
 
 
@@ -126,5 +128,5 @@ def _size(text: str) -> tuple[int, int]:
     """Height and width."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise ProbsceneError(f"Expected a size WIDTHxHEIGHT such as 256x192, actual {text!r}.")
+        raise ProbsceneError(f"expected a size WIDTHxHEIGHT such as 256x192, got {text!r}.")
     return int(height), int(width)

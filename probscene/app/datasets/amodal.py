@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from probscene.batch import RenderBatch, Renderer
+from probscene.camera_effects import CameraEffects
 from probscene.drawing import Drawing
 from probscene.errors import ProbsceneError
 from probscene.model import SceneModel
-from probscene.photo import Photo
 from probscene.request import Renderable, Request
 from probscene.world import World, resolve_scene
 
@@ -28,7 +28,7 @@ def drawable(model: SceneModel, drawing: Renderable) -> Drawing | World:
     """
     if isinstance(drawing, Request):
         raise ProbsceneError(
-            f"Expected a model of sprites or meshes for amodal masks, actual {model.name!r}, whose generator draws "
+            f"expected a model of sprites or meshes for amodal masks, got {model.name!r}, whose generator draws "
             "whole scenes; leave amodal out."
         )
     return drawing
@@ -65,5 +65,5 @@ def alone(drawing: Drawing | World, scene: Tensor, node: Tensor) -> Drawing | Wo
     chosen = torch.arange(drawing.kind.shape[1]) == node[:, None]
     layers = tuple(replace(layer, present=layer.present & chosen) for layer in some.layers)
     if isinstance(some, World):
-        return replace(some, layers=layers, ground=None, photo=resolve_scene(Photo(), len(some)))
+        return replace(some, layers=layers, ground=None, photo=resolve_scene(CameraEffects(), len(some)))
     return replace(some, layers=layers, photo=None)

@@ -29,8 +29,8 @@ def check(model: SceneModel, scenes: Scenes, names: tuple[str, ...]) -> None:
     for name in names:
         if name not in scenes.parameters:
             raise ProbsceneError(
-                f"Expected values among the sites of model {model.name!r} ({', '.join(scenes.parameters) or 'none'}), "
-                f"actual {name!r}; pyro.deterministic makes a site of any other value."
+                f"expected values among the sites of model {model.name!r} ({', '.join(scenes.parameters) or 'none'}), "
+                f"got {name!r}; pyro.deterministic makes a site of any other value."
             )
 
 

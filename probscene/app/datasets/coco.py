@@ -3,8 +3,8 @@
 Beyond the format's own keys an annotation has ``visible_fraction``, visible pixels over those of the whole silhouette,
 and ``amodal_bbox``, the box of the whole silhouette, which others may cover and the canvas may cut. Of a 3D scene it
 also has ``truncated``, the share of that box beyond the canvas, and ``box_3d``: height, width, length, x, y, z and
-rotation as in ``Space``; ``visible_fraction`` is then of the silhouette within the canvas. What a renderer does not
-know is left out, see ``RenderBatch.unknown``.
+rotation as in ``SceneGeometry``; ``visible_fraction`` is then of the silhouette within the canvas. What a renderer does
+not know is left out, see ``RenderBatch.unknown``.
 
 Where the program's sprites name keypoints, categories have ``keypoints``, their names, and an empty ``skeleton``, and
 annotations ``keypoints``, x, y and visibility of each, and ``num_keypoints``, see ``probscene.keypoints``; x and y are
@@ -54,7 +54,7 @@ def check_min_visible(min_visible: float) -> None:
         ProbsceneError: it is not in 0..1.
     """
     if not 0 <= min_visible <= 1:
-        raise ProbsceneError(f"Expected min_visible from 0 to 1, actual {min_visible}.")
+        raise ProbsceneError(f"expected min_visible from 0 to 1, got {min_visible}.")
 
 
 def check_box_margin(box_margin: int) -> None:
@@ -64,7 +64,7 @@ def check_box_margin(box_margin: int) -> None:
         ProbsceneError: it is not a whole number of pixels, 0 or more.
     """
     if not (box_margin >= 0 and box_margin % 1 == 0):
-        raise ProbsceneError(f"Expected box_margin as a whole number of pixels, 0 or more, actual {box_margin}.")
+        raise ProbsceneError(f"expected box_margin as a whole number of pixels, 0 or more, got {box_margin}.")
 
 
 def with_margin(batch: RenderBatch, box_margin: int) -> RenderBatch:
@@ -89,8 +89,8 @@ def labelled(model: SceneModel, batch: RenderBatch, min_visible: float = 0.0) ->
     category = torch.tensor([_category(model, name) for name in model.grammar.kinds])
     if min_visible and "visible" in batch.unknown:
         raise ProbsceneError(
-            f"Expected no min_visible with model {model.name!r}, whose generator does not say which share of an object "
-            f"is visible, actual {min_visible:g}; leave it out."
+            f"expected no min_visible with model {model.name!r}, whose generator does not say which share of an object "
+            f"is visible, got {min_visible:g}; leave it out."
         )
     shown = (batch.kind >= 0) & (batch.pixels > 0) & (batch.visible >= min_visible)
     return torch.where(shown, category[batch.kind.clamp(min=0)], 0)

@@ -23,7 +23,7 @@ def file_name(index: int, flat: bool = True) -> str:
     return f"depth/{stem(index, flat)}.png"
 
 
-def of(batch: RenderBatch) -> Tensor | None:
+def depth_of(batch: RenderBatch) -> Tensor | None:
     """``(N, H, W)`` float32, metres, infinity where there is sky; None where the renderer does not know it."""
     return batch.depth if batch.space is None else batch.space.depth
 
@@ -34,10 +34,10 @@ def files(model: SceneModel, batch: RenderBatch) -> list[bytes]:
     Raises:
         ProbsceneError: the renderer does not know depth.
     """
-    depth = of(batch)
+    depth = depth_of(batch)
     if depth is None:
         raise ProbsceneError(
-            f"Expected renders of model {model.name!r} to have depth, for format depth, actual none; choose other "
+            f"expected renders of model {model.name!r} to have depth, for format depth, got none; choose other "
             "formats, or let its generator return depth."
         )
     steps = np.rint(depth.double().numpy() * _METRE)

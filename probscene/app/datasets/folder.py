@@ -25,9 +25,9 @@ from .places import PARTS, place_at
 from .provenance import image_name
 
 LINES, SETTINGS = "provenance.jsonl", f"{PARTS}/settings.json"
-SEEN = 20  # seconds
-FLAT = 10_000  # images
-UNSAID = {"min_visible": 0.0, "box_margin": 0, "flat": True, "amodal": False, "values": ""}
+VISIBLE_TIMEOUT = 20  # seconds
+MAX_FLAT_IMAGES = 10_000  # images
+DEFAULT_SETTINGS = {"min_visible": 0.0, "box_margin": 0, "flat": True, "amodal": False, "values": ""}
 """Settings that are recorded only where they have another value than this."""
 
 
@@ -38,7 +38,7 @@ class Shard(NamedTuple):
     shards: int
 
     @staticmethod
-    def of(text: str) -> "Shard":
+    def from_text(text: str) -> "Shard":
         """Of ``"I/N"``.
 
         Raises:
@@ -46,7 +46,7 @@ class Shard(NamedTuple):
         """
         number, _, shards = text.partition("/")
         if not (number.isdecimal() and shards.isdecimal() and int(number) < int(shards)):
-            raise ProbsceneError(f"Expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8, actual {text!r}.")
+            raise ProbsceneError(f"expected a shard I/N with I from 0 to N - 1, such as 0/8 to 7/8, got {text!r}.")
         return Shard(int(number), int(shards))
 
 
@@ -61,7 +61,7 @@ class DatasetFolder:
         origin: the settings that every line of provenance names.
         num: how many images.
         formats: see ``formats.chosen``.
-        flat: all images in one folder; of more than ``FLAT``, a thousand share one otherwise.
+        flat: all images in one folder; of more than ``MAX_FLAT_IMAGES``, a thousand share one otherwise.
 
     Attributes:
         flat: whether they are.
@@ -69,7 +69,7 @@ class DatasetFolder:
 
     def __init__(self, out: Path | str, origin: dict[str, Any], num: int, formats: tuple[str, ...], flat: bool = False):
         self.place, self.num = place_at(out), num
-        self.flat = flat or num <= FLAT
+        self.flat = flat or num <= MAX_FLAT_IMAGES
         self.settings = {**origin, "num": num, "format": ",".join(formats), "flat": self.flat}
         self._kept = formats != ("webdataset",)
         self._origin = origin
@@ -88,7 +88,7 @@ class DatasetFolder:
         begun = self.place.exists(SETTINGS)  # in this order: what else is there may be what another process has begun
         if others and not begun:
             raise DataError(
-                f"Expected a new or empty folder for the dataset, actual {self.place} with {', '.join(others[:5])} in "
+                f"expected a new or empty folder for the dataset, got {self.place} with {', '.join(others[:5])} in "
                 "it; name another folder."
             )
         self.place.make()
@@ -97,9 +97,9 @@ class DatasetFolder:
             self._compare(json.loads(self.place.read(SETTINGS)))
         except FileNotFoundError:  # another process has finished the dataset
             return self.missing(shard)
-        return [chunk for chunk in self.of(shard) if not self._done(chunk)]
+        return [chunk for chunk in self.chunks_of(shard) if not self._done(chunk)]
 
-    def of(self, shard: Shard) -> range:
+    def chunks_of(self, shard: Shard) -> range:
         """The chunks of a shard."""
         return range(shard.number, len(self._chunks()), shard.shards)
 
@@ -177,22 +177,22 @@ class DatasetFolder:
             lines = self.place.lines(LINES)
             line = json.loads(next(lines))
             num = 1 + sum(1 for _ in lines)
-            settings = {key: line[key] for key in self._origin.keys() - UNSAID}
-            settings |= {key: line.get(key, usual) for key, usual in UNSAID.items()}
+            settings = {key: line[key] for key in self._origin.keys() - DEFAULT_SETTINGS}
+            settings |= {key: line.get(key, usual) for key, usual in DEFAULT_SETTINGS.items()}
         except (OSError, StopIteration, ValueError, KeyError, TypeError) as error:
             raise DataError(
-                f"Expected lines of provenance in {self.place}/{LINES}, actual something else; name another folder."
+                f"expected lines of provenance in {self.place}/{LINES}, got something else; name another folder."
             ) from error
         settings |= {"num": num, "format": ",".join(found(self.place.exists))}
         return settings | {"flat": line["image"] == image_name(line["index"], True)}
 
     def _compare(self, before: dict[str, Any]) -> None:
-        before, settings = UNSAID | before, UNSAID | self.settings
+        before, settings = DEFAULT_SETTINGS | before, DEFAULT_SETTINGS | self.settings
         differing = [key for key in settings if before.get(key) != settings[key]]
         if differing:
             was, now = (", ".join(f"{key} {s.get(key)}" for key in differing) for s in (before, settings))
             raise DataError(
-                f"Expected the settings that the dataset in {self.place} was begun with ({was}), actual {now}; "
+                f"expected the settings that the dataset in {self.place} was begun with ({was}), got {now}; "
                 "give the same, or name another folder; this one is left as it is."
             )
 
@@ -204,11 +204,11 @@ def check_begun(out: Path | str) -> None:
         DataError: it is not.
     """
     place = place_at(out)
-    for _ in range(SEEN):  # a network's file system may be some seconds behind
+    for _ in range(VISIBLE_TIMEOUT):  # a network's file system may be some seconds behind
         if place.exists(SETTINGS):
             return
         time.sleep(1)
     raise DataError(
-        f"Expected the folder {out} of the machine that runs the command, actual another or none; write to a folder "
+        f"expected the folder {out} of the machine that runs the command, got another or none; write to a folder "
         "that all nodes share, or to an address such as s3://."
     )

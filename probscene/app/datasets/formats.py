@@ -47,7 +47,7 @@ def chosen(format: str | Iterable[str]) -> tuple[str, ...]:
     unknown = [name for name in names if name not in FORMATS]
     if unknown or not names:
         actual = repr(unknown[0]) if unknown else "none"
-        raise ProbsceneError(f"Expected formats among {', '.join(FORMATS)}, actual {actual}.")
+        raise ProbsceneError(f"expected formats among {', '.join(FORMATS)}, got {actual}.")
     return _normal(names)
 
 

@@ -12,6 +12,7 @@ alone, not on the interruptions, the number of workers or what else the process 
 
 import json
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,12 +32,12 @@ from ..loading import renderer_for
 from ..workers.cluster import Cluster
 from ..workers.processes import spread
 from . import amodal, attributes, coco, depth, kitti, panoptic, shards, yolo
-from .folder import LINES, UNSAID, WHOLE, DatasetFolder, Shard, check_begun
+from .folder import DEFAULT_SETTINGS, LINES, WHOLE, DatasetFolder, Shard, check_begun
 from .formats import chosen
 from .places import place_at
 from .provenance import image_name, provenance
 
-Done = Callable[[int, int], None]
+ProgressCallback = Callable[[int, int], None]
 """Called with the number of images there are, and how many there are to be."""
 
 
@@ -56,35 +57,12 @@ class Dataset(NamedTuple):
     finished: bool
 
 
-def generate(
-    run: RunFolder,
-    num: int,
-    out: Path | str,
-    seed: int = 0,
-    workers: int = 1,
-    format: str | Iterable[str] = "coco",
-    progress: Done | None = None,
-    min_visible: float = 0.0,
-    shard: str | None = None,
-    cluster: Cluster | None = None,
-    flat: bool = False,
-    box_margin: int = 0,
-    amodal: bool = False,
-    values: str | Iterable[str] = (),
-) -> Dataset:
-    """Write ``num`` images of the learnt structures.
+@dataclass(frozen=True, kw_only=True)
+class DatasetOptions:
+    """What a dataset's labels hold, and where its files go.
 
     Args:
-        out: the folder to write, or an address of a file system that fsspec knows, such as ``s3://bucket/folder``.
-        workers: processes. More than one are spawned: a script calls this under ``if __name__ == "__main__":``.
-        format: names of ``formats.FORMATS``, such as ``"coco"``, ``"coco,yolo"`` or ``("coco", "yolo")``; ``"images"``
-            for no labels.
-        progress: called with the number of images there are and ``num``; first with what an interrupted call left.
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
-        shard: ``"I/N"``, I from 0: makes every N-th chunk alone, and no files of labels for the whole. Several shards
-            may write to one folder at once; the same call without ``shard`` makes what is missing and finishes.
-        cluster: of which all nodes make images, in place of ``workers``. They have to see the folders of the run and of
-            the dataset by the same paths.
         flat: all images in one folder; of more than 10,000, a thousand share one otherwise. KITTI's folders are flat.
         box_margin: pixels by which boxes of what is visible are wider than it on each side, within the image; masks and
             boxes of whole silhouettes stay.
@@ -92,39 +70,102 @@ def generate(
             that is not wholly visible is drawn once more, alone.
         values: names of the program's sites, such as ``"plate.x,mug.turn"``, whose values these annotations have as
             ``attributes``: those of the object, else of the nearest node above it, else of the scene.
+        shard: ``"I/N"``, I from 0: makes every N-th chunk alone, and no files of labels for the whole. Several shards
+            may write to one folder at once; the same call without ``shard`` makes what is missing and finishes.
 
     Raises:
-        ProbsceneError: a number that is not positive, a negative seed, a fraction that is not in 0..1, a margin that is
-            no whole number or of KITTI's boxes in 3D, an unknown format, more classes or objects than KITTI's masks can
-            number, no depth where it is asked for, another text for a shard, a value that is no site of the program,
-            amodal masks of a generator's objects, or either in formats that have no place for them.
+        ProbsceneError: a fraction that is not in 0..1, a margin that is no whole number, another text for a shard.
+    """
+
+    min_visible: float = 0.0
+    flat: bool = False
+    box_margin: int = 0
+    amodal: bool = False
+    values: str | Iterable[str] = ()
+    shard: str | None = None
+
+    def __post_init__(self):
+        coco.check_min_visible(self.min_visible)
+        coco.check_box_margin(self.box_margin)
+        object.__setattr__(self, "values", attributes.chosen(self.values))
+        self.part()
+
+    def part(self) -> Shard:
+        """The shard to make, or the whole."""
+        return WHOLE if self.shard is None else Shard.from_text(self.shard)
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """The names in ``values``."""
+        return tuple(self.values)
+
+    def record(self) -> dict[str, Any]:
+        """What the dataset's settings name: those that are not the default."""
+        names = ",".join(self.sites)
+        own = {"min_visible": float(self.min_visible), "box_margin": int(self.box_margin), "amodal": bool(self.amodal)}
+        return {key: value for key, value in {**own, "values": names}.items() if value != DEFAULT_SETTINGS[key]}
+
+
+def generate(
+    run: RunFolder,
+    num: int,
+    out: Path | str,
+    seed: int = 0,
+    workers: int | Cluster = 1,
+    format: str | Iterable[str] = "coco",
+    progress: ProgressCallback | None = None,
+    options: DatasetOptions = DatasetOptions(),
+) -> Dataset:
+    """Write ``num`` images of the learnt structures.
+
+    Args:
+        out: the folder to write, or an address of a file system that fsspec knows, such as ``s3://bucket/folder``.
+        workers: processes. More than one are spawned: a script calls this under ``if __name__ == "__main__":``. Or a
+            cluster, of which all nodes make images; they have to see the folders of the run and of the dataset by the
+            same paths.
+        format: names of ``formats.FORMATS``, such as ``"coco"``, ``"coco,yolo"`` or ``("coco", "yolo")``; ``"images"``
+            for no labels.
+        progress: called with the number of images there are and ``num``; first with what an interrupted call left.
+
+    Raises:
+        ProbsceneError: a number that is not positive, a negative seed, a margin of KITTI's boxes in 3D, an unknown
+            format, more classes or objects than KITTI's masks can number, no depth where it is asked for, a value that
+            is no site of the program, amodal masks of a generator's objects, or either in formats that have no place
+            for them.
         DataError: the folder holds other files, or a dataset of other settings.
         RunError: see ``RunFolder.guide`` and ``RunFolder.model``.
         MachineError: the disk is full, or a worker was killed; the same call goes on where it stopped. See also
-            ``Crew.run``.
+            ``ActorPool.run``.
     """
-    if workers < 1:
-        raise ProbsceneError(f"Expected a positive number of workers, actual {workers}.")
-    if cluster is not None and workers > 1:
-        raise ProbsceneError(f"Expected workers or a cluster, actual {workers} workers and a cluster; leave one out.")
-    part = WHOLE if shard is None else Shard.of(shard)
-    more = min_visible, flat, box_margin, amodal, attributes.chosen(values)
-    job = Job(run.model, run.guide, num, out, seed, chosen(format), run.guide_hash(), *more)
-    if workers == 1 and cluster is None:
-        return job.run(job.each, progress, part)
+    if isinstance(workers, int) and workers < 1:
+        raise ProbsceneError(f"expected a positive number of workers, got {workers}.")
+    job = Job(run.model, run.guide, num, out, seed, chosen(format), options, run.guide_hash())
+    if workers == 1:
+        return job.run(job.make_all, progress)
     if run.objects:
         raise ProbsceneError(
-            f"Expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), actual "
-            f"{workers if cluster is None else 'a cluster'}; fit a model and parts in files for more."
+            f"expected one worker for a run with parts in memory alone ({', '.join(run.objects)}), got "
+            f"{workers if isinstance(workers, int) else 'a cluster'}; fit a model and parts in files for more."
         )
-    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, *more)
-    if cluster is None:
-        return job.run(partial(spread, _worker, task, workers), progress, part)
-    crew = cluster.crew(_actor, task)
+    task = (run.path.resolve(), num, place_at(out).lasting, seed, job.formats, options)
+    if isinstance(workers, int):
+        return job.run(partial(spread, _worker, task, workers), progress)
+    actors = workers.actor_pool(_actor, task)
     try:
-        return job.run(crew.run, progress, part)
+        return job.run(actors.run, progress)
     finally:
-        crew.close()
+        actors.close()
+
+
+def workers_or_cluster(workers: int, cluster: Cluster | None) -> int | Cluster:
+    """The one that is given.
+
+    Raises:
+        ProbsceneError: several workers and a cluster.
+    """
+    if cluster is not None and workers > 1:
+        raise ProbsceneError(f"expected workers or a cluster, got {workers} workers and a cluster; leave one out.")
+    return workers if cluster is None else cluster
 
 
 def generate_scenes(
@@ -134,29 +175,23 @@ def generate_scenes(
     out: Path | str,
     seed: int = 0,
     format: str | Iterable[str] = "coco",
-    progress: Done | None = None,
-    min_visible: float = 0.0,
-    shard: str | None = None,
-    flat: bool = False,
-    box_margin: int = 0,
-    amodal: bool = False,
-    values: str | Iterable[str] = (),
+    progress: ProgressCallback | None = None,
+    options: DatasetOptions = DatasetOptions(),
 ) -> Dataset:
     """``generate`` from any model and structure policy, in this process.
 
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
-    more = min_visible, flat, box_margin, amodal, values
-    job = Job(model, policy, num, out, seed, format, None, *more)
-    return job.run(job.each, progress, WHOLE if shard is None else Shard.of(shard))
+    job = Job(model, policy, num, out, seed, chosen(format), options)
+    return job.run(job.make_all, progress)
 
 
 class Job:
-    """A dataset to be written.
+    """The writing of a dataset.
 
     Args:
-        guide: SHA-256 of the policy's checkpoint, where it is a learnt one.
-        min_visible, flat, box_margin, amodal, values: see ``generate``.
+        formats: see ``formats.chosen``.
+        guide_hash: SHA-256 of the policy's checkpoint, where it is a learnt one.
 
     Raises:
         ProbsceneError: see ``generate``.
@@ -168,50 +203,36 @@ class Job:
         policy: Policy,
         num: int,
         out: Path | str,
-        seed: int = 0,
-        format: str | Iterable[str] = "coco",
-        guide: str | None = None,
-        min_visible: float = 0.0,
-        flat: bool = False,
-        box_margin: int = 0,
-        amodal: bool = False,
-        values: str | Iterable[str] = (),
+        seed: int,
+        formats: tuple[str, ...],
+        options: DatasetOptions,
+        guide_hash: str | None = None,
     ):
         if num < 1:
-            raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
+            raise ProbsceneError(f"expected a positive number of images, got {num}.")
         if seed < 0:
-            raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
-        coco.check_min_visible(min_visible)
-        coco.check_box_margin(box_margin)
-        self.formats, self.box_margin = chosen(format), int(box_margin)
-        self.amodal, self.values = bool(amodal), attributes.chosen(values)
-        if (self.amodal or self.values) and not {"coco", "webdataset"} & {*self.formats}:
+            raise ProbsceneError(f"expected a seed of 0 or more, got {seed}.")
+        if (options.amodal or options.sites) and not {"coco", "webdataset"} & {*formats}:
             raise ProbsceneError(
-                f"Expected coco or webdataset among the formats for {'amodal masks' if amodal else 'values'}, actual "
-                f"{', '.join(self.formats)}; add one of them."
+                f"expected coco or webdataset among the formats for {'amodal masks' if options.amodal else 'values'}, "
+                f"got {', '.join(formats)}; add one of them."
             )
-        if "kitti" in self.formats:
+        if "kitti" in formats:
             kitti.check(model)
-        self.model, self.policy, self.min_visible = model, policy, float(min_visible)
-        self.origin = {"seed": seed, "model": model.name, "guide": guide, "version": probscene.__version__}
-        more = {
-            "min_visible": self.min_visible,
-            "box_margin": self.box_margin,
-            "amodal": self.amodal,
-            "values": ",".join(self.values),
-        }
-        self.origin |= {key: value for key, value in more.items() if value != UNSAID[key]}
-        self.folder = DatasetFolder(out, self.origin, num, self.formats, flat)
+        self.model, self.policy, self.formats, self.options = model, policy, formats, options
+        self.origin = {"seed": seed, "model": model.name, "guide": guide_hash, "version": probscene.__version__}
+        self.origin |= options.record()
+        self.folder = DatasetFolder(out, self.origin, num, formats, options.flat)
         self._renderer = renderer_for(model, threads=1)
 
     def run(
-        self, work: Callable[[list[int], Callable[[int], None]], None], progress: Done | None, shard: Shard = WHOLE
+        self, work: Callable[[list[int], Callable[[int], None]], None], progress: ProgressCallback | None
     ) -> Dataset:
-        """Do what is missing of a shard by ``work(chunks, done)``; of the whole, then write the labels."""
-        folder, made = self.folder, 0
+        """Do what is missing of the shard by ``work(chunks, done)``; of the whole, then write the labels."""
+        folder, shard, made = self.folder, self.options.part(), 0
         if not folder.finished:
             self._check()
-        chunks, num = folder.missing(shard), sum(map(folder.size, folder.of(shard)))
+        chunks, num = folder.missing(shard), sum(map(folder.size, folder.chunks_of(shard)))
         before = num - sum(map(folder.size, chunks))
 
         def done(chunk: int | None) -> None:
@@ -228,27 +249,27 @@ class Job:
 
     def _check(self) -> None:
         """See that the model's scenes have what is asked for, before anything is written."""
-        boxes = "kitti" in self.formats and self.box_margin > 0
+        boxes = "kitti" in self.formats and self.options.box_margin > 0
         posed = "yolo-pose" in self.formats
-        if not ("depth" in self.formats or boxes or posed or self.amodal or self.values):
+        if not ("depth" in self.formats or boxes or posed or self.options.amodal or self.options.sites):
             return
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], 0)
-        attributes.check(self.model, scenes, self.values)
-        if self.amodal:
+        attributes.check(self.model, scenes, self.options.sites)
+        if self.options.amodal:
             amodal.drawable(self.model, scenes.drawing)
         if posed and not self._named(keypoints(scenes.drawing[:1], self.model.canvas)):
             raise ProbsceneError(
-                f"Expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, actual none; "
+                f"expected sprites of model {self.model.name!r} with keypoints, for format yolo-pose, got none; "
                 "name some: Sprites(..., keypoints={'nose': (0.5, 0.2)}), or choose other formats."
             )
         if "depth" in self.formats or boxes:
             first = self._renderer(scenes.drawing[:1])
             if boxes:
-                kitti.check_box_margin(self.model, first, self.box_margin)
+                kitti.check_box_margin(self.model, first, self.options.box_margin)
             if "depth" in self.formats:
                 depth.files(self.model, first)
 
-    def each(self, chunks: list[int], done: Callable[[int], None]) -> None:
+    def make_all(self, chunks: list[int], done: Callable[[int], None]) -> None:
         """Make chunks one after the other."""
         for chunk in chunks:
             done(self.make(chunk))
@@ -262,14 +283,14 @@ class Job:
         first, size = chunk * CHUNK, self.folder.size(chunk)
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
         drawing = scenes.drawing[:size]
-        batch = coco.with_margin(self._renderer(drawing), self.box_margin)
+        batch = coco.with_margin(self._renderer(drawing), self.options.box_margin)
         record: dict[str, Any] = {"annotations": [], "keypoints": {}}
         if self.formats != ("images",):
             record |= self._annotated(scenes, drawing, batch, first)
         record["provenance"] = provenance(self.model, scenes, first, self.origin, self.folder.flat)[:size]
         files, links = self._files(drawing, batch, first, record)
         if "panoptic" in self.formats:
-            found = panoptic.segments(self.model, batch, record["annotations"], first, self.min_visible)
+            found = panoptic.segments(self.model, batch, record["annotations"], first, self.options.min_visible)
             record["panoptic"] = found[0]
             files |= {panoptic.file_name(first + i, self.folder.flat): file for i, file in enumerate(found[1])}
         self.folder.write(chunk, files, links, record)
@@ -280,14 +301,14 @@ class Job:
         more, points = [], keypoints(drawing, self.model.canvas)
         if points is not None:
             more.append(coco.with_keypoints(self.model, points))
-        if self.amodal:
-            category = coco.labelled(self.model, batch, self.min_visible)
+        if self.options.amodal:
+            category = coco.labelled(self.model, batch, self.options.min_visible)
             whole = amodal.masks(self._renderer, amodal.drawable(self.model, drawing), batch, category)
             more.append(coco.with_amodal(whole))
-        if self.values:
-            values = attributes.Attributes(scenes, self.values)
+        if self.options.sites:
+            values = attributes.Attributes(scenes, self.options.sites)
             more.append(lambda scene, node: {"attributes": values(scene, node)})
-        found = coco.annotations(self.model, batch, first, self.min_visible, more)
+        found = coco.annotations(self.model, batch, first, self.options.min_visible, more)
         return {"annotations": found, "keypoints": self._named(points)}
 
     def _named(self, points: Keypoints | None) -> dict[str, tuple[str, ...]]:
@@ -308,9 +329,11 @@ class Job:
             files |= {yolo.label_name(i, flat): yolo.label(self.model, of_image[i]).encode() for i in of_image}
         lines = {}
         if "yolo-seg" in self.formats:
-            lines["yolo-seg"] = yolo.polygons(self.model, batch, self.min_visible)
+            lines["yolo-seg"] = yolo.polygons(self.model, batch, self.options.min_visible)
         if "yolo-obb" in self.formats:
-            lines["yolo-obb"] = yolo.oriented(self.model, batch, drawing, self.min_visible, self.box_margin)
+            lines["yolo-obb"] = yolo.oriented(
+                self.model, batch, drawing, self.options.min_visible, self.options.box_margin
+            )
         if "yolo-pose" in self.formats:
             number = _most(record["keypoints"])
             lines["yolo-pose"] = [yolo.label(self.model, of_image[i], number) for i in of_image]
@@ -322,7 +345,7 @@ class Job:
             depths = depth.files(self.model, batch)
             files |= {depth.file_name(i, flat): each for i, each in zip(of_image, depths, strict=True)}
         if "kitti" in self.formats:
-            masks = kitti.instances(self.model, batch, first, self.min_visible)
+            masks = kitti.instances(self.model, batch, first, self.options.min_visible)
             files |= {kitti.file_name("label_2", i): kitti.label(self.model, of_image[i]).encode() for i in of_image}
             files |= {kitti.file_name("instance", i): mask for i, mask in zip(of_image, masks, strict=True)}
             if batch.space is not None:
@@ -375,7 +398,7 @@ class Job:
             names = record["keypoints"] if names is None else names
             if record["keypoints"] != names:
                 raise ModelError(
-                    f"Expected model {self.model.name!r} to name the same keypoints whatever it draws, actual {names} "
+                    f"expected model {self.model.name!r} to name the same keypoints whatever it draws, got {names} "
                     f"in some scenes and {record['keypoints']} in others; give scene.draw every layer always."
                 )
             yield record
@@ -396,15 +419,17 @@ def _most(keypoints: dict[str, Any]) -> int:
     return max(map(len, keypoints.values()), default=0)
 
 
-def _worker(run: Path, num: int, out: str, seed: int, format: tuple[str, ...], *settings: Any) -> Callable[[int], int]:
+def _worker(
+    run: Path, num: int, out: str, seed: int, formats: tuple[str, ...], options: DatasetOptions
+) -> Callable[[int], int]:
     """What a worker process does with a chunk's number."""
     opened = RunFolder.at(run)
-    return Job(opened.model, opened.guide, num, out, seed, format, opened.guide_hash(), *settings).make
+    return Job(opened.model, opened.guide, num, out, seed, formats, options, opened.guide_hash()).make
 
 
-def _actor(run: Path, num: int, out: str, *settings: Any) -> Callable[[int], int]:
+def _actor(run: Path, num: int, out: str, *arguments: Any) -> Callable[[int], int]:
     """The same on a node of a cluster."""
-    make = _worker(run, num, out, *settings)
+    make = _worker(run, num, out, *arguments)
     check_begun(out)
     return make
 

@@ -15,7 +15,7 @@ ends exclusive. ``occluded`` goes by the visible fraction over the share within 
 on, 2 below. Where the canvas cuts an object, that share is its box's, not its silhouette's: what only the canvas cuts
 may come out as 1, seldom as 2. Where a generator does not tell them, ``truncated`` is -1 and ``occluded`` 3, unknown.
 
-Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``labelling.kitti.TYPES``)
+Of 3D scenes, everything is as in the benchmark. A class that one of KITTI's types counts as (``labels.kitti.TYPES``)
 is written as that type. The 2D box is the whole silhouette's, what others cover included, within the image: KITTI's own
 boxes of hidden cars are as near to their projected 3D boxes as those of free ones, half a pixel. (So its boxes of cars
 are projections, a few pixels wider than a silhouette, which does not reach its 3D box's corners.) Its pixels are P2's,
@@ -38,10 +38,10 @@ from probscene.batch import RenderBatch
 from probscene.errors import ProbsceneError
 from probscene.model import SceneModel
 
-from ..labelling.kitti import TYPES
+from ..labels.kitti import TYPES
 from .coco import labelled
 
-MOST = 255  # classes, and instances of a class: 8 bits each
+MAX_INSTANCES = 255  # classes, and instances of a class: 8 bits each
 _UNSEEN = 3  # level of occlusion that is unknown
 _UNKNOWN = "-1 -1 -1 -1000 -1000 -1000 -10"
 _TYPE = {name: type for type, names in reversed(TYPES.items()) for name in names}
@@ -60,9 +60,9 @@ def check(model: SceneModel) -> None:
     Raises:
         ProbsceneError: more than 255 of them.
     """
-    if len(model.classes) > MOST:
+    if len(model.classes) > MAX_INSTANCES:
         raise ProbsceneError(
-            f"Expected at most {MOST} classes, for 8 bits of KITTI's masks, actual {len(model.classes)} in model "
+            f"expected at most {MAX_INSTANCES} classes, for 8 bits of KITTI's masks, got {len(model.classes)} in model "
             f"{model.name!r}; choose other formats."
         )
 
@@ -75,8 +75,8 @@ def check_box_margin(model: SceneModel, batch: RenderBatch, box_margin: int) -> 
     """
     if box_margin and batch.space is not None:
         raise ProbsceneError(
-            f"Expected no box_margin in KITTI's labels of the 3D model {model.name!r}, whose boxes there are of whole "
-            f"silhouettes, actual {box_margin}; leave it out, or choose other formats."
+            f"expected no box_margin in KITTI's labels of the 3D model {model.name!r}, whose boxes there are of whole "
+            f"silhouettes, got {box_margin}; leave it out, or choose other formats."
         )
 
 
@@ -120,11 +120,11 @@ def instances(model: SceneModel, batch: RenderBatch, first: int, min_visible: fl
         of_node = np.zeros(len(category) + 1, np.uint16)  # by the renderer's ids: 0, then node index + 1
         for number in np.unique(category[category > 0]):
             nodes = np.flatnonzero(category == number)
-            if len(nodes) > MOST:
+            if len(nodes) > MAX_INSTANCES:
                 raise ProbsceneError(
-                    f"Expected at most {MOST} objects of a class in an image, for 8 bits of KITTI's masks, actual "
-                    f"{len(nodes)} of class {model.classes[number - 1]!r} in image {first + i}; write other formats to "
-                    "another folder."
+                    f"expected at most {MAX_INSTANCES} objects of a class in an image, for 8 bits of KITTI's masks, "
+                    f"got {len(nodes)} of class {model.classes[number - 1]!r} in image {first + i}; write other "
+                    "formats to another folder."
                 )
             of_node[nodes + 1] = 256 * number + np.arange(1, len(nodes) + 1)
         files.append(cv2.imencode(".png", of_node[batch.instance[i].numpy()])[1].tobytes())

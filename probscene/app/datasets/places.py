@@ -32,7 +32,7 @@ def place_at(out: Path | str) -> "LocalPlace | RemotePlace":
     scheme, _, path = str(out).partition("://")
     if not path.strip("/"):
         raise ProbsceneError(
-            f"Expected an address with a place, such as {scheme}://bucket/folder, actual {out}; add the place."
+            f"expected an address with a place, such as {scheme}://bucket/folder, got {out}; add the place."
         )
     return LocalPlace(Path(path)) if scheme == "file" else RemotePlace(str(out))
 
@@ -162,12 +162,12 @@ class RemotePlace:
             self._files, self._root = url_to_fs(self.address, use_listings_cache=False)
         except ImportError as error:
             raise ProbsceneError(
-                f"Expected the package for addresses such as {address}, actual none ({error}); for S3, "
+                f"expected the package for addresses such as {address}, got none ({error}); for S3, "
                 "pip install 'probscene[s3]'."
             ) from error
         except ValueError as error:
             raise ProbsceneError(
-                f"Expected a folder, or an address of a file system that fsspec knows, actual {address} ({error})."
+                f"expected a folder, or an address of a file system that fsspec knows, got {address} ({error})."
             ) from error
 
     def __str__(self) -> str:
@@ -253,7 +253,7 @@ class RemotePlace:
             if isinstance(error, ProbsceneError) or (reading and isinstance(error, FileNotFoundError)):
                 raise
             raise MachineError(
-                f"Expected to read and write {self.address}, actual {type(error).__name__}: "
+                f"expected to read and write {self.address}, got {type(error).__name__}: "
                 f"{str(error).splitlines()[0] if str(error) else 'nothing more is known'}. See that the place exists, "
                 "and that this machine has the rights; docs/formats.md says where they are looked for."
             ) from error

@@ -73,18 +73,18 @@ def remake(model: SceneModel, line: dict[str, Any]) -> tuple[Tensor, RenderBatch
         rules, spelt, parameters = line["rules"], line["derivation"], dict(line["parameters"])
         known = all(0 <= rule < len(model.grammar.rules) for rule in rules) and _spelt(model, rules) == spelt
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"Expected a line of provenance.jsonl with rules and parameters, {_named(line)}.") from error
+        raise DataError(f"expected a line of provenance.jsonl with rules and parameters, {_named(line)}.") from error
     if not known:
         raise DataError(
-            f"Expected a line whose rules are those of model {model.name!r}, {_named(line)}; name its model."
+            f"expected a line whose rules are those of model {model.name!r}, {_named(line)}; name its model."
         )
     try:
-        derivation = Derivation.of(model.grammar, torch.tensor([rules], dtype=torch.int64))
+        derivation = Derivation.from_rules(model.grammar, torch.tensor([rules], dtype=torch.int64))
     except GrammarError as error:
-        raise DataError(f"Expected a derivation of model {model.name!r}, {_named(line)}: {error}") from error
+        raise DataError(f"expected a derivation of model {model.name!r}, {_named(line)}: {error}") from error
     if not derivation.complete.all():
         raise DataError(
-            f"Expected a whole derivation of model {model.name!r}, {_named(line)}, whose rules end too soon."
+            f"expected a whole derivation of model {model.name!r}, {_named(line)}, whose rules end too soon."
         )
     recorded = _Recorded(parameters)
     with chunk_randomness(0, 0):  # what does not count is drawn; that must change neither the image nor the caller
@@ -116,11 +116,11 @@ class _Recorded(Messenger):
     def check(self, sites: set[str], line: dict[str, Any]) -> None:
         wrong = sorted(self.wrong | (sites ^ set(self.values)))
         if wrong:
-            raise DataError(f"Expected values of the model's own sites, {_named(line)} with others of {wrong}.")
+            raise DataError(f"expected values of the model's own sites, {_named(line)} with others of {wrong}.")
 
 
 def _named(line: Any) -> str:
-    return f"actual that of {line['image']}" if isinstance(line, dict) and "image" in line else "actual something else"
+    return f"got that of {line['image']}" if isinstance(line, dict) and "image" in line else "got something else"
 
 
 def _spelt(model: SceneModel, rules: list[int]) -> str:

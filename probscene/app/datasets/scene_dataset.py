@@ -37,7 +37,7 @@ from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
 from . import amodal
 from .coco import check_box_margin, check_min_visible, labelled, with_margin
-from .depth import of as depth_of
+from .depth import depth_of
 
 Sample = tuple[Tensor, dict[str, Any]]
 _ENDLESS = 1 << 20  # chunks of an epoch that has no end
@@ -93,9 +93,9 @@ class SceneDataset(IterableDataset):
     ):
         for name, number in (("images", num), ("images of a batch", batch_size)):
             if number is not None and number < 1:
-                raise ProbsceneError(f"Expected a positive number of {name}, actual {number}.")
+                raise ProbsceneError(f"expected a positive number of {name}, got {number}.")
         if seed < 0:
-            raise ProbsceneError(f"Expected a seed of 0 or more, actual {seed}.")
+            raise ProbsceneError(f"expected a seed of 0 or more, got {seed}.")
         check_min_visible(min_visible)
         check_box_margin(box_margin)
         self.num, self.seed, self.batch_size = num, seed, batch_size
@@ -118,7 +118,7 @@ class SceneDataset(IterableDataset):
             ProbsceneError: a negative number.
         """
         if epoch < 0:
-            raise ProbsceneError(f"Expected an epoch of 0 or more, actual {epoch}.")
+            raise ProbsceneError(f"expected an epoch of 0 or more, got {epoch}.")
         self._epoch.fill_(epoch)
 
     def __iter__(self) -> Iterator[Sample]:
@@ -162,7 +162,7 @@ class SceneDataset(IterableDataset):
             TypeError: there is no end, as of a generator.
         """
         if self.num is None:
-            raise TypeError("Expected a dataset with an end, actual one without; give SceneDataset a num.")
+            raise TypeError("expected a dataset with an end, got one without; give SceneDataset a num.")
         return self.num
 
     def __bool__(self) -> bool:
@@ -228,7 +228,7 @@ class SceneDataset(IterableDataset):
         module = getattr(getattr(self._source, "program", None), "__module__", "")
         if module.startswith("probscene_model_"):  # of load_model
             raise ModelError(
-                "Expected a model that worker processes can load, actual one that load_model gave; name its file to "
+                "expected a model that worker processes can load, got one that load_model gave; name its file to "
                 "SceneDataset instead."
             )
         return {**self.__dict__, "_opened": None}

@@ -1,5 +1,5 @@
-"""How far the counts that a run reads in each real image are from that image's labels, as papers on counting report it:
-the mean absolute error, and Pearson's correlation. Axis letters: L images, C classes, R resamples.
+"""Errors of the counts that a run reads in each labelled image, as papers on counting report them: the mean absolute
+error, and Pearson's correlation. Axis letters: L images, C classes, R resamples.
 """
 
 from typing import NamedTuple
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.inference.judging.tally import Interval, around, resamples
+from probscene.inference.statistics.count_metrics import Interval, bootstrap_interval, resamples
 
 from .structure_counts import Counts
 
@@ -38,10 +38,10 @@ def count_errors(read: NDArray[np.float64], labelled: Counts, seed: int = 0) -> 
     every = np.full((1, len(one)), 1 / len(one))
     error = np.abs(one - other)
     whole, drawn = (_correlation(one, other, each) for each in (every, weight))
-    correlation = None if np.isnan(whole[0]) else around(float(whole[0]), drawn, least=-1.0)
+    correlation = None if np.isnan(whole[0]) else bootstrap_interval(float(whole[0]), drawn, minimum=-1.0)
     if correlation is not None:
         correlation = Interval(*(min(end, 1.0) for end in correlation))
-    return CountErrors(len(one), around(float(error.mean()), weight @ error, least=0.0), correlation)
+    return CountErrors(len(one), bootstrap_interval(float(error.mean()), weight @ error, minimum=0.0), correlation)
 
 
 def _correlation(one: NDArray[np.float64], other: NDArray[np.float64], weight: NDArray[np.float64]):

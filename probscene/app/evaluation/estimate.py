@@ -17,7 +17,7 @@ from probscene.relations import PerParent, relations
 from .structure_counts import Counts, Relation
 
 
-def estimated(
+def estimate_counts(
     model: SceneModel, names: tuple[str, ...], features: Tensor
 ) -> tuple[Counts, Counts, dict[Relation, PerParent]] | None:
     """Rounded counts ``(L, C)``, total ``(L,)``, and children of each group; None if the features are no counts.

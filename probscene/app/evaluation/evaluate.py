@@ -1,14 +1,14 @@
-"""``probscene evaluate``: which structures are learnt, beside the prior's, the truth's and what the network sees.
+"""``probscene evaluate``: learnt structures compared with the prior's, the truth's and the network's estimate.
 
-Sources of counts: ``prior``, ``start`` where fits set out from another policy, and ``learnt`` are sampled structures;
-``truth`` is a file of labels of the target's images; ``estimate`` is what the run's feature network counts in them,
-rounded. The last is no truth: the network learnt on prior renders alone and errs where objects crowd, but it is there
-without a single label. As it errs in renders, too, it is compared with what the same network reads in renders of the
-sampled structures, and never with the structures themselves. Where there are labels as well, what was read in each
-image is compared with them.
+Sources of counts: ``prior``, ``start`` where fits are initialised from another policy, and ``learnt`` are sampled
+structures; ``truth`` is a file of labels of the target's images; ``estimate`` is what the run's feature network counts
+in them, rounded. The last is no truth: the network learnt on prior renders alone and errs where objects crowd, but it
+needs no label. As it errs in renders, too, it is compared with what the same network reads in renders of the sampled
+structures, and never with the structures themselves. Where there are labels as well, what is read in each image is
+compared with them.
 
-Where kinds nest (cars on roads), children are counted by node and by the node's rank: which no context-free prior can
-weigh, and totals hide.
+Where kinds nest (cars on roads), children are counted by node and by the node's rank, which no context-free prior can
+weigh and totals hide.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,45 +23,40 @@ import torch
 import probscene
 from probscene.dataset import Images
 from probscene.errors import ProbsceneError
-from probscene.inference.judging.metrics import histogram, pooled_shares, total_variation, wasserstein
-from probscene.inference.judging.tally import Tally
+from probscene.inference.statistics.count_metrics import Tally, histogram, pooled_shares, total_variation, wasserstein
 from probscene.policy import Policy
 
-from ..fitting.fit import Progress
+from ..fitting.pipeline import Progress
 from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, features_of, kept_features, own_net
-from ..labelling.boxes import Boxes
-from ..walls.inexpressible import Inexpressible, inexpressible
-from ..walls.piled import Piled, piled, sentences
+from ..labels.boxes import Boxes
+from ..progress import Display
 from .count_errors import CountErrors, count_errors
-from .estimate import class_counts, counted_classes, estimated
-from .image_distances import IMAGES, Distances, image_distances
+from .estimate import class_counts, counted_classes, estimate_counts
+from .image_distances import MAX_IMAGES, Distances, image_distances
+from .image_distances import record as image_record
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
-from .sources import ESTIMATE, FITTED, LEARNT, READ, Source, before
+from .prior_limits import SaturatedList, UnreachableCounts, saturated_lists, saturation_warnings, unreachable_counts
+from .sources import ESTIMATE, LEARNT, READ, SAMPLED_SOURCES, Source, baseline_policies
 from .structure_counts import Relation
-from .visible import Visible, counted, number_of, seen_by, whole_note
+from .visible import Visible, count_scenes, hidden_note, num_counted, visibility
 
-IN_RENDERS = 1000  # renders of each source, at most, that the network reads
+MAX_RENDERS_READ = 1000  # of each source, by the network
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """Counts by source; see the module.
 
-    Attributes:
-        run: the run.
-        target: path of the target's images.
-        classes: the C names; only those that are labelled, where there are labels.
-        sources: ``FITTED``, then ``truth`` and ``estimate``, where they are known.
-        likelihoods: of the truth's structures under each of ``FITTED``, where they are known.
-        images: KID and FID by the features' name; see ``image_distances``.
-        notes: of the labels.
-        piled: the lists that are too short for what was learnt.
-        inexpressible: the images that the model cannot have, by the labels, else by the estimate.
-        errors: with labels, by class those of the counts that are read in each image; None where none are.
-        read: what the network that makes the estimate reads in renders of ``FITTED``; empty without an estimate.
-        boxes: of the labels.
+    Attributes: run: the run. target: path of the target's images. classes: the C names; only those that are labelled,
+        where there are labels. sources: ``SAMPLED_SOURCES``, then ``truth`` and ``estimate``, where they are known.
+        likelihoods: of the truth's structures under each of ``SAMPLED_SOURCES``, where they are known. images: KID and
+        FID by the features' name; see ``image_distances``. notes: of the labels. saturated_lists: the lists that are
+        too short for what was learnt. unreachable_counts: the images that the model cannot generate, by the labels,
+        else by the estimate. errors: with labels, by class those of the counts that are read in each image; None where
+        none are. read: what the network that makes the estimate reads in renders of ``SAMPLED_SOURCES``; empty without
+        an estimate. boxes: of the labels.
     """
 
     run: RunFolder
@@ -71,21 +66,21 @@ class Evaluation:
     likelihoods: dict[str, Likelihood] = field(default_factory=dict)
     images: dict[str, Distances] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    piled: tuple[Piled, ...] = ()
-    inexpressible: tuple[Inexpressible, ...] = ()
+    saturated_lists: tuple[SaturatedList, ...] = ()
+    unreachable_counts: tuple[UnreachableCounts, ...] = ()
     errors: dict[str, CountErrors | None] = field(default_factory=dict)
     read: dict[str, Source] = field(default_factory=dict)
     boxes: Boxes | None = None
 
-    def beside(self, b: str) -> dict[str, Source]:
-        """Source ``b``, and the others as they are compared with it: with the estimate, as the same network reads them
-        in renders."""
-        return self.sources | (self.read if b == ESTIMATE else {})
+    def compared_with(self, reference: str) -> dict[str, Source]:
+        """All sources as they are compared with one of them: with the estimate, as the same network reads them in
+        renders."""
+        return self.sources | (self.read if reference == ESTIMATE else {})
 
     @property
     def shown(self) -> dict[str, Source]:
-        """The sources whose histograms stand beside one another: before the estimate, which counts all classes or is
-        left out, what the network reads in learnt renders."""
+        """The sources whose histograms are shown: before the estimate, which counts all classes or is left out, what
+        the network reads in learnt renders."""
         found = {name: source for name, source in self.sources.items() if name != ESTIMATE}
         if ESTIMATE in self.sources and not self.unread:
             found |= {READ: self.read[LEARNT], ESTIMATE: self.sources[ESTIMATE]}
@@ -112,29 +107,29 @@ class Evaluation:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the model is too narrow for, with what to change."""
-        return (*sentences(self.piled), *(f"Warning: {found}" for found in self.inexpressible))
+        return (*saturation_warnings(self.saturated_lists), *(f"Warning: {found}" for found in self.unreachable_counts))
 
     @property
-    def walls(self) -> str:
+    def prior_warning(self) -> str:
         """The same in one sentence; empty where there is nothing."""
-        short = ", ".join(dict.fromkeys(found.name for found in self.piled if not found.past))
-        images = len({row for found in self.inexpressible for row in found.rows})
-        said = [f"lists pile up at their longest ({short})"] if short else []
-        said += [f"{images} images have numbers of objects that the model cannot have"] if images else []
-        return f"Mind the prior: {' and '.join(said)}; the warnings say what to change." if said else ""
+        short = ", ".join(dict.fromkeys(found.name for found in self.saturated_lists if not found.beyond_prior))
+        images = len({row for found in self.unreachable_counts for row in found.rows})
+        parts = [f"lists pile up at their longest ({short})"] if short else []
+        parts += [f"{images} images have numbers of objects that the model cannot have"] if images else []
+        return f"Mind the prior: {' and '.join(parts)}; the warnings say what to change." if parts else ""
 
     def distance(self, a: str, b: str) -> dict[str, Any]:
-        """How far source ``a`` is from ``b``: total variation of the number of objects and of the pooled class shares,
-        Wasserstein-1 of the number in objects an image, and the total variation of each class's own counts. Shares of
-        a source without objects are not compared: None.
+        """Distances of source ``a`` from ``b``: total variation of the number of objects and of the pooled class
+        shares, Wasserstein-1 of the number in objects an image, and the total variation of each class's own counts.
+        Shares of a source without objects are not compared: None.
 
         ``kinds`` and ``children`` have both distances with their intervals, of each class's counts and, where kinds
         nest, of the children by ``structure_counts.GROUPS``; None where a source has no such node."""
-        one, other = self.beside(b)[a], self.sources[b]
+        one, other = self.compared_with(b)[a], self.sources[b]
         unread = self.unread if b == ESTIMATE else ()
         number = histogram(one.total), histogram(other.total)
         shares = pooled_shares(one.counts), pooled_shares(other.counts)
-        each = {
+        each_class = {
             name: total_variation(histogram(one.counts[:, c]), histogram(other.counts[:, c]))
             for c, name in enumerate(self.classes)
             if name not in unread
@@ -144,19 +139,21 @@ class Evaluation:
             "number": None if unread else total_variation(*number),
             "number_wasserstein": None if unread else wasserstein(*number),
             "classes": total_variation(*shares) if shares[0].any() and shares[1].any() and not unread else None,
-            "each_class": each,
-            "kinds": {name: None if name in unread else _apart(x, y) for name, x, y in kinds},
+            "each_class": each_class,
+            "kinds": {name: None if name in unread else _distance(x, y) for name, x, y in kinds},
             "children": {
-                _key(relation): {group: _apart(found, other.nested[relation][group]) for group, found in each.items()}
-                for relation, each in one.nested.items()
+                _key(relation): {
+                    group: _distance(found, other.nested[relation][group]) for group, found in tallies.items()
+                }
+                for relation, tallies in one.nested.items()
                 if relation in other.nested
             },
         }
 
     def distances(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """From prior, start and learnt to the truth and to the estimate, where there are such."""
+        """Of prior, initialisation and learnt from the truth and from the estimate, where there are such."""
         known = [name for name in ("truth", ESTIMATE) if name in self.sources]
-        return {b: {a: self.distance(a, b) for a in FITTED if a in self.sources} for b in known}
+        return {b: {a: self.distance(a, b) for a in SAMPLED_SOURCES if a in self.sources} for b in known}
 
     def record(self) -> dict[str, Any]:
         """Everything, for JSON."""
@@ -173,15 +170,15 @@ class Evaluation:
             "distances": self.distances(),
             "count_errors": {name: _plain(found) for name, found in self.errors.items()},
             "walls": {
-                "lists": [found.record() for found in self.piled],
-                "images": [found.record() for found in self.inexpressible],
+                "lists": [found.record() for found in self.saturated_lists],
+                "images": [found.record() for found in self.unreachable_counts],
             },
             "sources": {name: self._source(source) for name, source in self.sources.items()},
             "read_in_renders": {name: self._source(source) for name, source in self.read.items()},
             "log_prob": {name: _plain(found) for name, found in self.likelihoods.items()},
             "images": {
-                name: {source: {figure.name: _plain(figure) for figure in found} for source, found in each.items()}
-                for name, each in self.images.items()
+                name: {source: {one.name: image_record(one) for one in found} for source, found in distances.items()}
+                for name, distances in self.images.items()
             },
         }
 
@@ -210,35 +207,35 @@ def evaluate(
     num: int = 10000,
     seed: int = 0,
     features: Sequence[str] = (),
-    images: int | None = IMAGES,
+    images: int | None = MAX_IMAGES,
     visible: Visible | None = None,
 ) -> Evaluation:
-    """Sample structures of the prior and of the guide and count, beside the truth and the network's estimate.
+    """Count sampled structures of the prior and of the guide, the truth's and the network's estimate.
 
     Args:
         target: its images; without them there is only the run's own record of what the network saw.
         truth: the labels of the target's images.
-        num: structures a source; see ``visible.SHOWN`` where they are rendered for it, and ``IN_RENDERS``.
-        features: networks to compare images by, see ``seen.network``; none, as it renders.
+        num: structures a source; see ``visible.MAX_RENDERED`` where they are rendered for it, and ``MAX_RENDERS_READ``.
+        features: networks to compare images by, see ``scene_features.network``; none by default, as it renders.
         images: how many are compared at most, where they are; all where None.
         visible: least visible shares of what is counted in rendered scenes; those of the run where this is None.
 
     Raises:
-        ProbsceneError: a number that is not positive; see ``image_distances`` and ``seen_by``.
+        ProbsceneError: a number that is not positive; see ``image_distances`` and ``visibility``.
         RunError: the fit is not finished.
     """
     if num < 1:
-        raise ProbsceneError(f"Expected a positive number of scenes, actual {num}.")
+        raise ProbsceneError(f"expected a positive number of scenes, got {num}.")
     if features and target is None:
-        raise ProbsceneError("Expected the target's images to compare features with, actual none.")
-    policies = {**before(run.model), LEARNT: run.guide}
-    seen, notes = seen_by(run.model, run, truth, visible)
+        raise ProbsceneError("expected the target's images to compare features with, got none.")
+    policies = {**baseline_policies(run.model), LEARNT: run.guide}
+    criterion, notes = visibility(run.model, run, truth, visible)
     done = 0
 
-    def each(scenes):
+    def advance(scenes: int) -> None:
         nonlocal done
         done += scenes
-        progress("counting", done, len(policies) * number_of(seen, num), "")
+        progress("counting", done, len(policies) * num_counted(criterion, num), "")
 
     columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
     compared = {}
@@ -246,36 +243,35 @@ def evaluate(
         compared = image_distances(run, target, features, progress, images, seed)
     sources, likelihoods = {}, {}
     for name, policy in policies.items():
-        found = counted(run.model, policy, num, seed, seen, each)
-        sources[name] = Source.of(found.counts, found.children).only(columns)
+        found = count_scenes(run.model, policy, num, seed, criterion, advance)
+        sources[name] = Source.from_counts(found.counts, found.children).select(columns)
         if truth is not None and truth.derivation is not None:
             likelihoods[name] = likelihood(policy, truth.derivation)
     if truth is not None:
-        sources["truth"] = Source.of(truth.structures.counts, truth.structures.children, seed=1)
+        sources["truth"] = Source.from_counts(truth.structures.counts, truth.structures.children, seed=1)
     reading = features_read(run, target, progress)
     estimate, read = None if reading is None else _estimate(run, reading), dict[str, Source]()
     if estimate is not None:
-        sources[ESTIMATE] = estimate.only(columns)
+        sources[ESTIMATE] = estimate.select(columns)
         in_renders = renders_read(run, policies, progress, num, seed)
-        read = {name: found.only(columns) for name, found in in_renders.items()}
+        read = {name: found.select(columns) for name, found in in_renders.items()}
     path = run.target if target is None else target.path
     classes = tuple(run.model.classes[c] for c in columns)
-    notes += whole_note(run.model, run.guide, truth, seen) + (() if truth is None else truth.notes)
-    short = piled(run.model, run.guide, None if run.unread else estimate, seed)
-    beyond = _inexpressible(run, classes, sources, truth, target, seen is not None)
+    notes += hidden_note(run.model, run.guide, truth, criterion) + (() if truth is None else truth.notes)
+    short = saturated_lists(run.model, run.guide, None if run.unread else estimate, seed)
+    beyond = _unreachable_counts(run, classes, sources, target, criterion is not None)
     errors = {} if truth is None else _errors(run, classes, truth, reading)
     boxes = None if truth is None else truth.boxes
     return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, errors, read, boxes)
 
 
-def _inexpressible(
+def _unreachable_counts(
     run: RunFolder,
     classes: tuple[str, ...],
     sources: dict[str, Source],
-    truth: Labels | None,
     target: Images | None,
     visible: bool,
-) -> tuple[Inexpressible, ...]:
+) -> tuple[UnreachableCounts, ...]:
     """By the labels, else by the estimate of the classes whose instances can be counted."""
     by = next((name for name in ("truth", ESTIMATE) if name in sources), None)
     if by is None:
@@ -283,19 +279,25 @@ def _inexpressible(
     source = sources[by]
     if by == ESTIMATE:
         columns = [c for c, name in enumerate(classes) if name not in (*run.model.stuff, *run.unread)]
-        classes, source = tuple(classes[c] for c in columns), source.only(columns)
+        classes, source = tuple(classes[c] for c in columns), source.select(columns)
     names = [] if target is None else [file.name for file in target.paths]
     names = names if len(names) == len(source.counts) else []
-    return inexpressible(run.model, source, classes, by == "truth", names, visible)
+    return unreachable_counts(run.model, source, classes, by == "truth", names, visible)
+
+
+def warn_of_saturated_lists(run: RunFolder, show: Display) -> None:
+    """Warn of each list of a finished run that is too short for its own target, by its guide and its network."""
+    for text in saturation_warnings(saturated_lists(run.model, run.guide, network_counts(run, None, show))):
+        show.say(text)
 
 
 def network_counts(run: RunFolder, target: Images | None, progress: Progress) -> Source | None:
     """What the run's feature network counts in the target's images, rounded; None where it does not count all classes.
 
-    The features that the fit kept are taken where the images are the fit's, else the images are embedded anew.
+    The features that the fit kept are taken where the images are the fit's, else the images are embedded.
     """
     names = run.feature_names
-    if estimated(run.model, names, torch.zeros(0, len(names))) is None:
+    if estimate_counts(run.model, names, torch.zeros(0, len(names))) is None:
         return None
     read = features_read(run, target, progress)
     return None if read is None else _estimate(run, read)
@@ -308,7 +310,7 @@ def features_read(run: RunFolder, target: Images | None, progress: Progress) -> 
         return None
     features, done, total = kept_features(run, target), 0, 0 if target is None else len(target)
 
-    def each(images):
+    def advance(images: int) -> None:
         nonlocal done
         done += images
         progress("target", done, total, "")
@@ -317,12 +319,12 @@ def features_read(run: RunFolder, target: Images | None, progress: Progress) -> 
         return None
     net = own_net(run)
     if features is None and target is not None:
-        features = features_in(run, target, net, each)
+        features = features_in(run, target, net, advance)
     return None if features is None else features * getattr(net, "unit", 1.0)
 
 
 def _estimate(run: RunFolder, read: torch.Tensor) -> Source | None:
-    found = estimated(run.model, run.feature_names, read)
+    found = estimate_counts(run.model, run.feature_names, read)
     return None if found is None else Source(*found, seed=1)
 
 
@@ -349,25 +351,25 @@ def renders_read(
     structures of each policy, rounded.
 
     Args:
-        num: images of each, of which ``IN_RENDERS`` are read at most.
+        num: images of each, of which ``MAX_RENDERS_READ`` are read at most.
     """
-    net, num, done = own_net(run), min(num, IN_RENDERS), 0
+    net, num, done = own_net(run), min(num, MAX_RENDERS_READ), 0
 
-    def each(images):
+    def advance(images: int) -> None:
         nonlocal done
         done += images
         progress("comparing", done, len(policies) * num, "")
 
     found = {}
     for name, policy in policies.items():
-        features = features_of(run, policy, num, net, seed, each)
-        read = estimated(run.model, run.feature_names, features * getattr(net, "unit", 1.0))
+        features = features_of(run, policy, num, net, seed, advance)
+        read = estimate_counts(run.model, run.feature_names, features * getattr(net, "unit", 1.0))
         assert read is not None
         found[name] = Source(*read)
     return found
 
 
-def _apart(one: Tally, other: Tally) -> dict[str, Any] | None:
+def _distance(one: Tally, other: Tally) -> dict[str, Any] | None:
     return _plain(one.distance(other))
 
 

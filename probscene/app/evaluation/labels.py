@@ -1,11 +1,11 @@
 """The truth that learnt structures are judged by. Three kinds:
 
-``counts.csv``, how many objects of each class an image shows, see ``labelling.counts``.
+``counts.csv``, how many objects of each class an image shows, see ``labels.counts``.
 
 ``provenance.jsonl`` as ``generate`` writes it: one line an image with the rules of its structure, which says also what
 hangs below what, and how likely a policy would have derived it.
 
-Labels with boxes of COCO, KITTI and YOLO, see ``labelling.reading``.
+Labels with boxes of COCO, KITTI and YOLO, see ``labels.reading``.
 """
 
 import json
@@ -21,14 +21,14 @@ from probscene.derivation import Derivation
 from probscene.errors import DataError, GrammarError
 from probscene.model import SceneModel
 
-from ..labelling.boxes import Boxes, read_boxes
-from ..labelling.counts import read_table
-from ..labelling.naming import Entry, match_target
-from ..labelling.reading import has_boxes
-from ..labelling.text import text_of
-from .structure_counts import Counts, StructureCounts, count
+from ..labels.boxes import Boxes, read_boxes
+from ..labels.counts import read_table
+from ..labels.naming import Entry, match_target
+from ..labels.reading import has_boxes
+from ..labels.text import text_of
+from .structure_counts import Counts, StructureCounts, count_structures
 
-SEEN = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
+VISIBLE_NOTE = "Prior and learnt scenes are rendered, and counted as labels count: by what can be seen."
 
 
 class Labels(NamedTuple):
@@ -77,12 +77,12 @@ def read_labels(path: Path, model: SceneModel, target: Images, some: bool = Fals
     if has_boxes(path):
         boxes = read_boxes(path, model, target, some, min_height)
         low = min_height * float(np.median(target.scales))
-        counts, notes = StructureCounts(boxes.counts, {}), (SEEN, *boxes.notes)
+        counts, notes = StructureCounts(boxes.counts, {}), (VISIBLE_NOTE, *boxes.notes)
         whole = None if min_height else boxes
         return Labels(counts, None, boxes.classes, notes, low, boxes.rows, whole)
     if min_height:
         raise DataError(
-            "Expected labels with boxes (COCO's, KITTI's or YOLO's) for a least height of objects, actual the file "
+            "expected labels with boxes (COCO's, KITTI's or YOLO's) for a least height of objects, got the file "
             f"{path}."
         )
     if path.suffix != ".jsonl":
@@ -98,7 +98,7 @@ def counts_of_dataset(model: SceneModel, folder: Path) -> tuple[list[str], Count
         for line in map(json.loads, file):
             names.append(Path(line["image"]).name)
             rules.append(line["rules"])
-    return names, count(model, Derivation.of(model.grammar, _padded(rules))).counts
+    return names, count_structures(model, Derivation.from_rules(model.grammar, _padded(rules))).counts
 
 
 def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool) -> Labels:
@@ -113,20 +113,18 @@ def _read_derivations(path: Path, model: SceneModel, target: Images, some: bool)
             of_line.append((list(line["rules"]), line["derivation"]))
         except (ValueError, KeyError, TypeError) as error:
             about = f"{type(error).__name__}: {error}"
-            raise DataError(
-                f"Expected image, rules and derivation {where}, actual something else ({about})."
-            ) from error
+            raise DataError(f"expected image, rules and derivation {where}, got something else ({about}).") from error
     found = match_target(path, entries, target, some)
     rules = [_rules(model, *of_line[k], entries[k].where) for k in found.entries.values()]
     try:
-        derivation = Derivation.of(model.grammar, _padded(rules))
+        derivation = Derivation.from_rules(model.grammar, _padded(rules))
         whole = derivation.complete.all()
     except GrammarError:
         whole = False
     if not whole:
         names = (target.paths[i].name for i, row in zip(found.entries, rules, strict=True) if not _is_whole(model, row))
-        raise DataError(f"Expected structures of model {model.name!r} in {path}, actual another of {next(names)}.")
-    return Labels(count(model, derivation), derivation, notes=found.notes, rows=list(found.entries))
+        raise DataError(f"expected structures of model {model.name!r} in {path}, got another of {next(names)}.")
+    return Labels(count_structures(model, derivation), derivation, notes=found.notes, rows=list(found.entries))
 
 
 def _rules(model: SceneModel, rules: list[Any], spelt: str, where: str) -> list[int]:
@@ -134,13 +132,13 @@ def _rules(model: SceneModel, rules: list[Any], spelt: str, where: str) -> list[
     known = model.grammar.rules
     own = rules and all(type(rule) is int and 0 <= rule < len(known) for rule in rules)
     if not own or "; ".join(str(known[rule]) for rule in rules) != spelt:
-        raise DataError(f"Expected rules of model {model.name!r} {where}, actual those of another grammar.")
+        raise DataError(f"expected rules of model {model.name!r} {where}, got those of another grammar.")
     return rules
 
 
 def _is_whole(model: SceneModel, rules: list[int]) -> bool:
     try:
-        return bool(Derivation.of(model.grammar, _padded([rules])).complete.all())
+        return bool(Derivation.from_rules(model.grammar, _padded([rules])).complete.all())
     except GrammarError:
         return False
 

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import torch
 
 from probscene.derivation import Derivation
-from probscene.inference.judging.tally import Interval, mean_interval, resamples
-from probscene.policy import MASKED, Policy
+from probscene.inference.statistics.count_metrics import Interval, mean_interval, resamples
+from probscene.policy import Policy
+from probscene.support import MASKED_LOGIT
 from probscene.threads import threads
 
 
@@ -27,7 +28,7 @@ def likelihood(policy: Policy, derivation: Derivation) -> Likelihood:
     """The likelihood of structures (L of them)."""
     with threads(1):  # the guide's tensors are tiny
         logp = policy.log_prob(derivation).double()
-    possible = logp > MASKED / 2
+    possible = logp > MASKED_LOGIT / 2
     known = logp[possible].numpy()
     nats = mean_interval(known, resamples(len(known))) if len(known) else None
     return Likelihood(nats, 1 - float(possible.double().mean()))

@@ -1,4 +1,4 @@
-"""One source of counts that an evaluation compares: sampled structures, labels, or what a network sees.
+"""One source of counts that an evaluation compares: sampled structures, labels, or what a network reads.
 
 Axis letters: N scenes, C classes.
 """
@@ -9,8 +9,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.inference.judging.metrics import Histogram, histogram_interval, pooled_shares_interval
-from probscene.inference.judging.tally import Tally, resamples, tally_images
+from probscene.inference.statistics.count_metrics import (
+    Histogram,
+    Tally,
+    histogram_interval,
+    pooled_shares_interval,
+    resamples,
+    tally_images,
+)
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import PerParent
@@ -19,12 +25,12 @@ from .structure_counts import Counts, Relation, tallies
 
 PRIOR, START, LEARNT = "prior", "start", "learnt"
 ESTIMATE, READ = "estimate", "read"  # what a network reads in the target's images, and in learnt renders
-FITTED = PRIOR, START, LEARNT  # sources that are sampled, in the order of a fit
+SAMPLED_SOURCES = PRIOR, START, LEARNT  # in the order of a fit; ``START`` is the initialisation
 
 
-def before(model: SceneModel) -> dict[str, Policy]:
-    """The policies that a fit is held against: the prior, and where it is another the one that guides are pretrained
-    on, from which fits set out."""
+def baseline_policies(model: SceneModel) -> dict[str, Policy]:
+    """The policies that a fit is compared with: the prior, and the initialisation, which guides are pretrained on,
+    where that is another policy."""
     start = {} if model.pretraining is None else {START: model.pretraining}
     return {PRIOR: model.prior, **start}
 
@@ -37,7 +43,7 @@ class Source:
         counts: ``(N, C)`` int64.
         total: ``(N,)`` int64 objects of all classes; an estimate's is rounded by itself.
         children: by relation, the children of each node, where kinds nest and structures are known.
-        seed: of its resamples; sources that are compared have different ones.
+        seed: of its resamples; different for sources that are compared.
     """
 
     counts: Counts
@@ -46,10 +52,10 @@ class Source:
     seed: int = 0
 
     @staticmethod
-    def of(counts: Counts, children: dict[Relation, PerParent] | None = None, seed: int = 0) -> "Source":
+    def from_counts(counts: Counts, children: dict[Relation, PerParent] | None = None, seed: int = 0) -> "Source":
         return Source(counts, counts.sum(1), children or {}, seed)
 
-    def only(self, columns: list[int]) -> "Source":
+    def select(self, columns: list[int]) -> "Source":
         """Of some of the classes, as if there were no others."""
         if columns == list(range(self.counts.shape[1])):
             return self

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
-from probscene.inference.judging.tally import Tally, tally, tally_images
+from probscene.inference.statistics.count_metrics import Tally, tally, tally_images
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.relations import PerParent, per_parent, relations
@@ -22,7 +22,7 @@ from probscene.threads import threads
 
 from ..chunks import chunk_randomness
 
-SAMPLED_AT_ONCE = 500
+BATCH_SIZE = 500
 
 Counts = NDArray[np.int64]
 Relation = tuple[str, str]
@@ -51,7 +51,7 @@ class StructureCounts:
         return len(self.counts)
 
 
-def count(model: SceneModel, derivation: Derivation) -> StructureCounts:
+def count_structures(model: SceneModel, derivation: Derivation) -> StructureCounts:
     """The counts of derivations of a model's grammar."""
     kind = model.grammar.kind
     every = derivation.counts(len(model.grammar.kinds))
@@ -59,33 +59,35 @@ def count(model: SceneModel, derivation: Derivation) -> StructureCounts:
     return StructureCounts(every[:, [kind(name) for name in model.classes]].numpy(), children)
 
 
-def sampled(
-    model: SceneModel, policy: Policy, num: int, seed: int, each: Callable[[int], None] | None = None
+def sample_counts(
+    model: SceneModel, policy: Policy, num: int, seed: int, callback: Callable[[int], None] | None = None
 ) -> StructureCounts:
     """The counts of ``num`` structures that a policy derives; nothing is rendered. The same for the same seed.
 
     Args:
-        each: told how many more are counted.
+        callback: called with the number of structures of each batch.
     """
     parts = []
-    for number, first in enumerate(range(0, num, SAMPLED_AT_ONCE)):
-        size = min(SAMPLED_AT_ONCE, num - first)
+    for number, first in enumerate(range(0, num, BATCH_SIZE)):
+        size = min(BATCH_SIZE, num - first)
         with threads(1), chunk_randomness(seed, number):
             derivation, _ = derive_complete(model.grammar, policy, size, model.max_steps)
-        parts.append(count(model, derivation))
-        if each is not None:
-            each(size)
-    return joined(parts)
+        parts.append(count_structures(model, derivation))
+        if callback is not None:
+            callback(size)
+    return concatenate(parts)
 
 
-def joined(parts: list[StructureCounts]) -> StructureCounts:
+def concatenate(parts: list[StructureCounts]) -> StructureCounts:
     """All scenes of several batches, one batch after the other."""
     first = np.cumsum([0, *(len(part) for part in parts)])
     children = {}
     for relation in parts[0].children:
-        each = [part.children[relation] for part in parts]
-        scene = torch.cat([found.scene + int(start) for found, start in zip(each, first, strict=False)])
-        children[relation] = PerParent(scene, *(torch.cat(x) for x in zip(*(found[1:] for found in each), strict=True)))
+        batches = [part.children[relation] for part in parts]
+        scene = torch.cat([found.scene + int(start) for found, start in zip(batches, first, strict=False)])
+        children[relation] = PerParent(
+            scene, *(torch.cat(x) for x in zip(*(found[1:] for found in batches), strict=True))
+        )
     return StructureCounts(np.concatenate([part.counts for part in parts]), children)
 
 
@@ -96,13 +98,13 @@ def tallies(found: PerParent, weight: NDArray[np.float32]) -> dict[str, Tally]:
         weight: ``(R, N)`` resamples of the scenes.
     """
     scene, rank, count = (x.numpy() for x in found)
-    chosen = {ALL: rank >= 0} | {name: rank == i for i, name in enumerate(RANKS)}
-    chosen |= {LATER: rank >= len(RANKS), OTHERS: rank >= 1}
+    masks = {ALL: rank >= 0} | {name: rank == i for i, name in enumerate(RANKS)}
+    masks |= {LATER: rank >= len(RANKS), OTHERS: rank >= 1}
     out = {PARENTS: tally_images(np.bincount(scene, minlength=weight.shape[1]), weight)}
-    return out | {name: tally(count[mask], scene[mask], weight) for name, mask in chosen.items()}
+    return out | {name: tally(count[mask], scene[mask], weight) for name, mask in masks.items()}
 
 
-def label(relation: Relation, group: str) -> str:
+def group_label(relation: Relation, group: str) -> str:
     """A group of a relation in words."""
     parent, child = relation
     words = {

@@ -19,24 +19,23 @@ from probscene.policy import Policy
 
 from ..chunks import CHUNK, draw_chunk
 from ..datasets.coco import labelled
-from ..fitting.storage import Storage
+from ..fitting.store import Storage
 from ..loading import renderer_for
 from .labels import Labels
-from .structure_counts import Counts, StructureCounts, sampled
+from .structure_counts import Counts, StructureCounts, sample_counts
 
-SHOWN = 2000  # scenes at most that are rendered to be counted
-LOOKED_AT = 128  # scenes that are rendered to see how much of them is hidden
-HARDLY, SOME = 0.25, 0.02  # visible share of an object that is hardly seen; share of such objects that matters
+MAX_RENDERED = 2000  # scenes, to be counted
+HIDDEN_SCENES = 128  # that are rendered to measure how many objects are hidden
+HARDLY_VISIBLE = 0.25  # visible share of an object
+MIN_HIDDEN_SHARE = 0.02  # of a class's objects that are hardly visible, from which on it is noted
 
-Each = Callable[[int], None]
-"""Told how many more are counted."""
-
+Callback = Callable[[int], None]  # called with the number of scenes of each batch
 Visible = float | Mapping[str, float] | Sequence[str]
 """Least visible shares, 0 to 1: of every class, by class, or in words such as ``"0.25"`` and ``"rbc=0.6"``."""
 
 
-class Seen(NamedTuple):
-    """What must be seen of an object for labels to count it; some pixel in any case.
+class Visibility(NamedTuple):
+    """What must be visible of an object for labels to count it; some pixel in any case.
 
     Attributes:
         min_height: of its box, pixels of the canvas.
@@ -47,13 +46,13 @@ class Seen(NamedTuple):
     shares: Mapping[str, float] = {}
 
 
-def seen_by(
+def visibility(
     model: SceneModel, run: Storage, truth: Labels | None, given: Visible | None
-) -> tuple[Seen | None, tuple[str, ...]]:
-    """What must be seen of an object to be counted, None where whole structures are, and notes for a person.
+) -> tuple[Visibility | None, tuple[str, ...]]:
+    """What must be visible of an object to be counted, None where whole structures are, and notes for a person.
 
     Args:
-        run: knows the shares, it may be, where none are given.
+        run: its own shares are taken where none are given.
         given: the shares.
 
     Raises:
@@ -64,16 +63,16 @@ def seen_by(
     if truth is not None and truth.derivation is not None:
         if given is not None:
             raise ProbsceneError(
-                "Expected labels of what can be seen with a visible share, actual whole structures; leave out the "
+                "expected labels of what can be seen with a visible share, got whole structures; leave out the "
                 "share, or give labels that people made."
             )
         return None, ()
     shares = _of_run(model, run) if given is None else visible_shares(given, model.classes)
     if given is None and not shares:
-        return (None if truth is None or truth.min_height is None else Seen(truth.min_height)), ()
-    said = _percentages(shares) if given is not None else _as_read(run, shares)
-    note = f"Prior and learnt scenes are rendered, and objects counted of which at least this is visible: {said}."
-    return Seen(0.0 if truth is None else truth.min_height or 0.0, shares), (note,)
+        return (None if truth is None or truth.min_height is None else Visibility(truth.min_height)), ()
+    text = _percentages(shares) if given is not None else _shares_with_source(run, shares)
+    note = f"Prior and learnt scenes are rendered, and objects counted of which at least this is visible: {text}."
+    return Visibility(0.0 if truth is None else truth.min_height or 0.0, shares), (note,)
 
 
 def visible_shares(given: Visible, classes: tuple[str, ...]) -> dict[str, float]:
@@ -91,79 +90,90 @@ def visible_shares(given: Visible, classes: tuple[str, ...]) -> dict[str, float]
     found: dict[str, float] = {}
     for name, share in pairs:
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
-            raise ProbsceneError(f"Expected a visible share from 0 to 1, or CLASS=SHARE, actual {share!r}.")
+            raise ProbsceneError(f"expected a visible share from 0 to 1, or CLASS=SHARE, got {share!r}.")
         if name in found:
-            raise ProbsceneError(
-                f"Expected one visible share {f'of {name}' if name else 'of all classes'}, actual two."
-            )
+            raise ProbsceneError(f"expected one visible share {f'of {name}' if name else 'of all classes'}, got two.")
         found[name] = float(share)
     if unknown := next((name for name in found if name and name not in classes), None):
         raise ProbsceneError(
-            f"Expected a visible share of a class among {', '.join(classes)}, actual {unknown!r}; mend the name."
+            f"expected a visible share of a class among {', '.join(classes)}, got {unknown!r}; fix the name."
         )
     every = {name: found[""] for name in classes} if "" in found else {}
     return every | {name: share for name, share in found.items() if name}
 
 
-def hidden(model: SceneModel, policy: Policy, columns: Sequence[int], seed: int = 0) -> dict[str, float]:
-    """Of each of some classes, the share of the objects in scenes with structures from ``policy`` that are hardly
-    seen; classes without objects are left out.
+def hidden_shares(model: SceneModel, policy: Policy, columns: Sequence[int], seed: int = 0) -> dict[str, float]:
+    """Of each of some classes, the share of the objects in scenes of ``policy`` that are hardly visible; classes
+    without objects are left out.
 
     Args:
         columns: the classes, by number.
     """
     render, drawn, hardly = renderer_for(model), torch.zeros(len(columns)), torch.zeros(len(columns))
     kinds = torch.tensor([model.grammar.kind(model.classes[c]) for c in columns]).view(-1, 1, 1)
-    for chunk in range(LOOKED_AT // CHUNK):
+    for chunk in range(HIDDEN_SCENES // CHUNK):
         batch = render(draw_chunk(model, policy, seed, chunk).drawing)
         of_class = batch.kind == kinds
         drawn += of_class.sum((1, 2))
-        hardly += (of_class & (batch.visible < HARDLY)).sum((1, 2))
-    each = zip((model.classes[c] for c in columns), (hardly / drawn).tolist(), strict=True)
-    return {name: share for name, share in each if math.isfinite(share)}
+        hardly += (of_class & (batch.visible < HARDLY_VISIBLE)).sum((1, 2))
+    shares = zip((model.classes[c] for c in columns), (hardly / drawn).tolist(), strict=True)
+    return {name: share for name, share in shares if math.isfinite(share)}
 
 
-def whole_note(model: SceneModel, policy: Policy, truth: Labels | None, seen: Seen | None) -> tuple[str, ...]:
-    """A note that labels are compared with whole structures, where what can be seen is something else."""
-    if truth is None or truth.derivation is not None or seen is not None:
+def hidden_note(
+    model: SceneModel, policy: Policy, truth: Labels | None, criterion: Visibility | None
+) -> tuple[str, ...]:
+    """A note that labels are compared with whole structures, where many objects are hidden."""
+    if truth is None or truth.derivation is not None or criterion is not None:
         return ()
-    shares = {name: share for name, share in hidden(model, policy, truth.columns(model)).items() if share > SOME}
+    shares = {
+        name: share
+        for name, share in hidden_shares(model, policy, truth.columns(model)).items()
+        if share > MIN_HIDDEN_SHARE
+    }
     if not shares:
         return ()
-    said = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
+    text = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
     return (
         "Counts are compared with whole structures; in learnt scenes less than a quarter can be seen of some objects "
-        f"({said}). If labels leave out what is hidden, add --visible {HARDLY:g}, or --visible CLASS=SHARE.",
+        f"({text}). If labels leave out what is hidden, add --visible {HARDLY_VISIBLE:g}, or --visible CLASS=SHARE.",
     )
 
 
-def number_of(seen: Seen | None, num: int) -> int:
-    """How many scenes ``counted`` counts of ``num``."""
-    return num if seen is None else min(num, SHOWN)
+def num_counted(criterion: Visibility | None, num: int) -> int:
+    """The number of scenes that ``count_scenes`` counts of ``num``."""
+    return num if criterion is None else min(num, MAX_RENDERED)
 
 
-def counted(
-    model: SceneModel, policy: Policy, num: int, seed: int, seen: Seen | None, each: Each | None = None
+def count_scenes(
+    model: SceneModel,
+    policy: Policy,
+    num: int,
+    seed: int,
+    criterion: Visibility | None,
+    callback: Callback | None = None,
 ) -> StructureCounts:
-    """The counts of scenes with structures from ``policy``: rendered where it is said what must be seen of an object,
-    else as ``sampled`` gives them."""
-    if seen is None:
-        return sampled(model, policy, num, seed, each)
-    return StructureCounts(shown(model, policy, number_of(seen, num), seed, seen, each), {})
+    """The counts of scenes with structures from ``policy``: of visible objects in renders where there is a criterion,
+    else as ``sample_counts`` gives them."""
+    if criterion is None:
+        return sample_counts(model, policy, num, seed, callback)
+    return StructureCounts(count_visible(model, policy, num_counted(criterion, num), seed, criterion, callback), {})
 
 
-def shown(model: SceneModel, policy: Policy, num: int, seed: int, seen: Seen, each: Each | None = None) -> Counts:
-    """The labels ``(num, C)`` by class of what ``generate`` would write in KITTI's format and is seen well enough; the
+def count_visible(
+    model: SceneModel, policy: Policy, num: int, seed: int, criterion: Visibility, callback: Callback | None = None
+) -> Counts:
+    """The labels ``(num, C)`` by class of what ``generate`` would write in KITTI's format and is visible enough; the
     same for the same seed."""
     render, parts = renderer_for(model), []
     numbers = torch.arange(1, len(model.classes) + 1).view(-1, 1, 1)
-    least = torch.tensor([seen.shares.get(name, 0.0) for name in model.classes]).view(-1, 1, 1)
+    min_share = torch.tensor([criterion.shares.get(name, 0.0) for name in model.classes]).view(-1, 1, 1)
     for chunk, first in enumerate(range(0, num, CHUNK)):
         batch = render(draw_chunk(model, policy, seed, chunk).drawing[: num - first])
-        enough = (_height(model, batch) >= seen.min_height) & (batch.visible >= least)
+        enough = (_height(model, batch) >= criterion.min_height) & (batch.visible >= min_share)
         parts.append(((labelled(model, batch) == numbers) & enough).sum(2).T)
-        if each is not None:
-            each(len(parts[-1]))
+        if callback is not None:
+            callback(len(parts[-1]))
     return torch.cat(parts).numpy()
 
 
@@ -171,7 +181,7 @@ def _percentages(shares: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {100 * share:.3g} %" for name, share in shares.items())
 
 
-def _as_read(run: Storage, shares: Mapping[str, float]) -> str:
+def _shares_with_source(run: Storage, shares: Mapping[str, float]) -> str:
     """The same, with what each class was read by in the run's images."""
     records, words = run.readings["classes"], dict[str, dict[str, float]]()
     for name, share in shares.items():
@@ -186,7 +196,7 @@ def _of_run(model: SceneModel, run: Storage) -> dict[str, float]:
     try:
         return visible_shares(shares, model.classes)
     except ProbsceneError as error:
-        raise RunError(f"Expected visible shares of the model's classes in {run.path}, actual {shares}.") from error
+        raise RunError(f"expected visible shares of the model's classes in {run.path}, got {shares}.") from error
 
 
 def _number(text: str) -> float | str:

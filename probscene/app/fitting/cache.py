@@ -19,9 +19,9 @@ from probscene.inference.features.base import FeatureNet
 
 from ..files import make_folder, write_text
 from ..loading import assets_folder, folder_digest
-from .parts import IN_MEMORY, is_file_part
+from .plugins import IN_MEMORY
 from .run import RunFolder
-from .storage import load_tensors, save_tensors, state_of
+from .store import load_tensors, save_tensors, state_of
 
 
 class Cached(NamedTuple):
@@ -49,9 +49,9 @@ class NetworkCache:
     def __init__(self, run: RunFolder, net: FeatureNet, folder: Path | None = None, target: str = ""):
         self.folder = (cache_folder() if folder is None else Path(folder)) / "features"
         record = run.record
-        words = (record["model"], record["preset"]["features"])
+        own = run.config.words().get("features", "")
         # What is in memory alone may change from one fit to the next without a trace.
-        self.usable = not any(word.startswith(IN_MEMORY) for word in words)
+        self.usable = not any(word.startswith(IN_MEMORY) for word in (record["model"], own))
         about: dict[str, Any] = {
             "code": _code_digest(),
             "torch": torch.__version__,
@@ -59,7 +59,7 @@ class NetworkCache:
             "model": [record["model"], record["model_sha256"], record["assets"], list(run.model.canvas)],
             **({"modules": record["modules"]} if "modules" in record else {}),
             "assets": folder_digest(assets_folder(run.model, record.get("assets_folder"))),
-            "features": [words[1], repr(run.features) if self.usable and not is_file_part(words[1]) else ""],
+            "features": own or repr(run.features),
             "weights": _digest(state_of(net)),
             "parts": record.get("parts", {}),
             "seed": record["seed"],

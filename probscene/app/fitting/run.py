@@ -16,25 +16,22 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 
 from ..files import make_folder, write_json, write_whole
-from ..labelling.few import FewLabels
 from ..loading import BUILT_IN, assets_record, lasting_reference, load_model, recorded_model, split_reference
 from ..modules import file_digest
 from ..neighbours import neighbours
-from .learnt.parameters import apart, with_parameters
-from .parts import (
+from .config import FitConfig, GuideConfig, from_flat_preset
+from .learnt_parameters import split_tensors, with_parameters
+from .plugins import (
     IN_MEMORY,
-    CheckedDivergence,
-    CheckedNet,
-    Parts,
+    Plugins,
+    ValidatedDivergence,
+    ValidatedNet,
     as_divergence,
-    as_guide_maker,
     check_guide,
     is_file_part,
-    load_part,
     part_file,
 )
-from .preset import Preset
-from .storage import FORMAT, Storage, check_free, load_state, read_record
+from .store import FORMAT, Storage, check_free, load_state, read_record
 
 WHOLE_MODEL = "model"  # folder
 PRIOR_KEPT = "prior_kept"  # the only tensor of a guide that was given up
@@ -45,20 +42,18 @@ class RunFolder(Storage):
 
     Args:
         model: the scene model, where it is in memory; else it is loaded once, when it is asked for.
-        parts: what the user brought as objects.
+        plugins: what the user brought as objects.
 
     Attributes:
         path: the folder.
         record: the contents of ``run.json``.
-        built: the feature network, untrained, where the fit is to begin with one that was built before.
-        few: labels of some of the target's images.
     """
 
-    def __init__(self, path: Path, record: dict[str, Any], model: SceneModel | None = None, parts: Parts | None = None):
+    def __init__(
+        self, path: Path, record: dict[str, Any], model: SceneModel | None = None, plugins: Plugins | None = None
+    ):
         super().__init__(path, record)
-        self.parts, self._model = parts or Parts(), model
-        self.built: FeatureNet | None = None
-        self.few: FewLabels | None = None
+        self.plugins, self._model = plugins or Plugins(), model
         self._network: FeatureNet | None = None
 
     @classmethod
@@ -69,7 +64,7 @@ class RunFolder(Storage):
         record: dict[str, Any],
         assets: Path | None = None,
         loaded: SceneModel | None = None,
-        parts: Parts | None = None,
+        plugins: Plugins | None = None,
     ) -> Self:
         """A new run folder; ``record`` is kept in ``run.json``.
 
@@ -77,7 +72,7 @@ class RunFolder(Storage):
             model: a reference; or a model that is in memory alone, which the folder then cannot give back.
             assets: a folder that the model is drawn with, from now on whenever the run is opened.
             loaded: the model of a reference, where it is loaded already.
-            parts: what the user brought as objects.
+            plugins: what the user brought as objects.
 
         Raises:
             RunError: the folder holds a run or other files already.
@@ -86,39 +81,39 @@ class RunFolder(Storage):
         check_free(path := Path(path))
         if isinstance(model, SceneModel):
             reference, file, digest, loaded = f"{IN_MEMORY}{model.name}", None, None, model
-            beside = {}
+            prefixed = {}
         else:
             loaded = loaded or load_model(model, assets)
             reference, name = lasting_reference(model), split_reference(model)[0]
             file = None if name in BUILT_IN else Path(name)
             digest = None if file is None else file_digest(file)
-            beside = {} if file is None else neighbours(file)
+            prefixed = {} if file is None else neighbours(file)
         make_folder(path)
         about: dict[str, Any] = {"format": FORMAT, "model": reference, "model_sha256": digest}
-        if beside:
-            about["modules"] = {name: file_digest(each) for name, each in beside.items()}
+        if prefixed:
+            about["modules"] = {name: file_digest(each) for name, each in prefixed.items()}
         about |= assets_record(loaded, assets)
-        about |= {"within_support": not record.get("preset", {}).get("on_prior")}
-        run = cls(path, record | about, loaded, parts)
+        about |= {"within_support": not record.get("config", {}).get("pretrain", {}).get("on_prior")}
+        run = cls(path, record | about, loaded, plugins)
         write_json(path / "run.json", run.record)  # first: with it, what is interrupted here can be resumed
         if file is not None:
             write_whole(path / "model.py", lambda temporary: shutil.copyfile(file, temporary))
-            for name, each in {file.name: file, **beside}.items() if beside else ():
+            for name, each in {file.name: file, **prefixed}.items() if prefixed else ():
                 make_folder((path / WHOLE_MODEL / name).parent)
                 write_whole(path / WHOLE_MODEL / name, partial(shutil.copyfile, each))
         return run
 
     @classmethod
-    def at(cls, path: Path, model: SceneModel | None = None, parts: Parts | None = None) -> Self:
+    def at(cls, path: Path, model: SceneModel | None = None, plugins: Plugins | None = None) -> Self:
         """An existing run folder.
 
         Args:
-            model, parts: see ``RunFolder``; for a run that was begun with what was in memory alone.
+            model, plugins: see ``RunFolder``; for a run that was begun with what was in memory alone.
 
         Raises:
             RunError: there is none, it is damaged, or another version wrote it.
         """
-        return cls(path, read_record(Path(path)), model, parts)
+        return cls(path, read_record(Path(path)), model, plugins)
 
     @property
     def model(self) -> SceneModel:
@@ -136,7 +131,7 @@ class RunFolder(Storage):
             for name, digest in self.record.get("modules", {}).items():
                 self._unchanged(file.parent / name, digest, "model's")
             self._model = recorded_model(self.record, self.path)
-        if self.record.get("preset", {}).get("on_prior") and self._model.pretraining is not None:
+        if self._on_prior and self._model.pretraining is not None:
             self._model = replace(self._model, pretraining=None)
         return self._model
 
@@ -149,12 +144,12 @@ class RunFolder(Storage):
         Raises:
             RunError: one of them is not.
         """
-        objects, given = self.objects, {**vars(self.parts), "model": self._model}
+        objects, given = self.objects, {**vars(self.plugins), "model": self._model}
         if set(missing := [name for name in objects if given[name] is None]) & set(needed):
             named = ", ".join(f"{name} ({objects[name]})" for name in missing)
             again = ", ".join(f"{name}=..." for name in missing)
             raise RunError(
-                f"Expected all that the run in {self.path} was begun with, actual its folder, which cannot give back "
+                f"expected all that the run in {self.path} was begun with, got its folder, which cannot give back "
                 f"what was in memory: {named}. Open it from Python: probscene.Run.open({str(self.path)!r}, {again})."
             )
 
@@ -166,9 +161,16 @@ class RunFolder(Storage):
         return Path(named) if isinstance(named, str) else Path(os.path.commonpath([Path(f).parent for f in named]))
 
     @cached_property
-    def preset(self) -> Preset:
-        """What the run was begun with."""
-        return Preset.of(self.record["preset"])
+    def config(self) -> FitConfig:
+        """How the run learns. Parts that were in memory alone are words in it, see ``objects``."""
+        if "config" in self.record:
+            return FitConfig.from_record(self.record["config"])
+        return from_flat_preset(self.record.get("preset", {}), self.record.get("guide", {}))
+
+    @property
+    def _on_prior(self) -> bool:
+        """Whether guides are pretrained on the prior itself; an evaluation's bare record says nothing of it."""
+        return ("config" in self.record or "preset" in self.record) and self.config.pretrain.on_prior
 
     @cached_property
     def features(self) -> Features:
@@ -177,12 +179,11 @@ class RunFolder(Storage):
         Raises:
             RunError: they were in memory alone, or their file is gone or has changed.
         """
-        word = self.preset.features
-        if self.parts.features is not None:
-            return self.parts.features
+        if self.plugins.features is not None:
+            return self.plugins.features
         self.check_objects("features")
-        self._unchanged_part(word)
-        return self.preset.make_features()
+        self._check_unchanged("features")
+        return self.config.make_features()
 
     def build_network(self) -> FeatureNet:
         """The feature network as it is before any training.
@@ -192,7 +193,7 @@ class RunFolder(Storage):
             ModelError: a user's own that cannot be built, or that is no network.
         """
         net = self.features.build(self.model)
-        return net if _is_ours(net) else CheckedNet(net, self.features)
+        return net if _is_ours(net) else ValidatedNet(net, self.features)
 
     def network(self) -> FeatureNet | None:
         """The feature network with its state, once it is trained; None before. Loaded once, see ``load_state``."""
@@ -218,34 +219,32 @@ class RunFolder(Storage):
         Raises:
             RunError: it was in memory alone, or its file is gone or has changed.
         """
-        word = self.preset.objective
-        if self.parts.divergence is not None:
-            chosen: Divergence = CheckedDivergence(self.parts.divergence)
+        if self.plugins.divergence is not None:
+            chosen: Divergence = ValidatedDivergence(self.plugins.divergence)
         else:
             self.check_objects("divergence")
-            self._unchanged_part(word)
-            chosen = self.preset.divergence()
+            self._check_unchanged("divergence")
+            made = self.config.make_divergence()
+            chosen = made if _is_ours(made) else ValidatedDivergence(made)
         found = self.features.divergence(net, chosen)
-        return found if _is_ours(found) else CheckedDivergence(as_divergence(found))
+        return found if _is_ours(found) else ValidatedDivergence(as_divergence(found))
 
     def new_guide(self) -> Guide:
-        """An untrained guide of the kind and size that the run was begun with; one that names no kind has an LSTM.
+        """An untrained guide of the kind and size that the run was begun with.
 
         Raises:
             RunError: its class was in memory alone, or its file is gone or has changed.
             ModelError: see ``check_guide``.
         """
         model = self.model
-        settings = {"kind": "lstm", **self.record["guide"]}
-        make, kind = self.parts.guide, settings["kind"]
         self.check_objects("guide")
-        if make is None and is_file_part(kind):
-            self._unchanged_part(kind)
-            make = as_guide_maker(load_part(kind))
-        made = guide_of(model.grammar, model.max_steps, make, **settings)
-        made = made if make is None else check_guide(made, model.max_steps)
+        self._check_unchanged("guide")
+        make = self.plugins.guide or self.config.guide_maker()
+        made = guide_of(model.grammar, model.max_steps, make)
+        if self.plugins.guide is not None or not isinstance(self.config.guide, GuideConfig):
+            made = check_guide(made, model.max_steps)
         if self.record.get("within_support"):  # runs of before have none, and stay as they were
-            made.bind(None if model.support is None else model.support.holding(model.prior, self.unread))
+            made.bind(model.guide_support(self.unread))
         return made
 
     @cached_property
@@ -257,15 +256,15 @@ class RunFolder(Storage):
         """
         tensors = self.read_tensors("guide")
         if tensors is None:
-            raise RunError(f"Expected a finished fit in {self.path}, actual an unfinished one; go on with --resume.")
+            raise RunError(f"expected a finished fit in {self.path}, got an unfinished one; go on with --resume.")
         if PRIOR_KEPT in tensors:
             return self.model.prior
         guide = self.new_guide()
         try:
-            guide.load_state_dict(apart(tensors)[0])
+            guide.load_state_dict(split_tensors(tensors)[0])
         except RuntimeError as error:
-            raise RunError(f"Expected a guide for model {self.model.name} in {self.path}, actual another.") from error
-        return with_parameters(self, guide.eval(), apart(tensors)[1])
+            raise RunError(f"expected a guide for model {self.model.name} in {self.path}, got another.") from error
+        return with_parameters(self.model, self.config, self.parameters, guide.eval(), split_tensors(tensors)[1])
 
     def check_finished(self) -> None:
         """See that there is a learnt guide.
@@ -275,8 +274,9 @@ class RunFolder(Storage):
         """
         _ = self.guide
 
-    def _unchanged_part(self, word: str) -> None:
-        if is_file_part(word):
+    def _check_unchanged(self, part: str) -> None:
+        """See that the file of features, divergence or guide is as it was."""
+        if is_file_part(word := self.config.words().get(part, "")):
             parts = self.record.get("parts", {})
             for file in (part_file(word), *neighbours(part_file(word)).values()):
                 self._unchanged(file, parts.get(str(file)), "part's")
@@ -291,7 +291,7 @@ class RunFolder(Storage):
                 else ""
             )
             raise RunError(
-                f"Expected the {what} file {file} as it was when {self.path} was fitted, actual a missing or changed "
+                f"expected the {what} file {file} as it was when {self.path} was fitted, got a missing or changed "
                 f"file. {kept or 'Put it back, or fit again.'}"
             )
 

@@ -14,20 +14,20 @@ from probscene.dataset import Images
 from probscene.errors import RunError
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
-from probscene.inference.judging.support import outside
+from probscene.inference.statistics.domain_shift import support_outliers
 from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.threads import threads
 
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..loading import renderer_for
-from .observer import RENDERED_AT_ONCE
+from .rendered_features import RENDERED_AT_ONCE
 from .run import RunFolder
 
-RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``unlike`` judges
+RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``domain_shift`` judges
 NEIGHBOURS = 8
 ALIKE = 0.5  # below this share no more renders are asked for
-UNLIKE = 0.87  # from this share on the target's images look unlike renders
+DOMAIN_SHIFT_SHARE = 0.87  # from this share on the target's images look unlike renders
 
 Each = Callable[[int], None]
 """Told how many more images are done."""
@@ -56,10 +56,11 @@ def images_of(model: SceneModel, policy: Policy, num: int, seed: int = 0) -> Ite
         yield as_written(model, render(scenes.drawing[: num - first]).image)
 
 
-def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], None] | None = None) -> float:
-    """The share of the target's images that lie ``outside`` renders, by EfficientNet-Lite's pooled features or by the
-    texture in its finest maps, whichever is less. Images of other structures and layouts lie among renders of the
-    pretraining policy, at least in part; a camera's do not. Fewer renders do where they hold half of the images.
+def domain_shift(model: SceneModel, target: Images, progress: Callable[[int, int], None] | None = None) -> float:
+    """The share of the target's images that lie outside the support of renders (``support_outliers``), by
+    EfficientNet-Lite's pooled features or by the texture in its finest maps, whichever is less. Images of other
+    structures and layouts lie among renders of the pretraining policy, at least in part; a camera's do not. Fewer
+    renders do where they hold half of the images.
 
     Args:
         progress: told how many of how many images are looked at.
@@ -74,7 +75,9 @@ def unlike(model: SceneModel, target: Images, progress: Callable[[int, int], Non
             of_renders.append(look.looks(images))
             drawn = [torch.cat(some).double().numpy() for some in zip(*of_renders, strict=True)]
             sides = zip(of_target, drawn, strict=True)
-            share = min(float(outside(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in sides)
+            share = min(
+                float(support_outliers(real.double().numpy(), renders, NEIGHBOURS).mean()) for real, renders in sides
+            )
             done = len(rows) + len(drawn[0])
             total = done if share < ALIKE else total
             if progress is not None:
@@ -118,7 +121,7 @@ def own_net(run: RunFolder) -> FeatureNet:
     """
     net = run.network()
     if net is None:
-        raise RunError(f"Expected the feature network in {run.path}, actual none; go on with --resume.")
+        raise RunError(f"expected the feature network in {run.path}, got none; go on with --resume.")
     return net
 
 

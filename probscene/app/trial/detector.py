@@ -35,28 +35,33 @@ STRIDES, CHANNELS, CONVOLUTIONS = (8, 16, 32), 64, 2
 SIDES = (4, 8, 16)  # pixels: an object whose ends are up to eight times that from a place belongs to that level
 START = 4.0  # in these sides, how far the ends of an object are from a place before anything is learnt
 REACH = 3.0  # how far from an object's middle places learn it, in these sides
-SCORE, MOST = 0.02, 100  # of what is detected: the least score, and so many an image
+MIN_SCORE, MAX_DETECTIONS = 0.02, 100  # of what is detected; detections an image
 
 
 class Recipe(NamedTuple):
     """How a detector is trained, where nothing else is asked for.
 
     Attributes:
-        presentations: of images, in all.
-        batch: images a step.
-        rate: of Adam, at its highest.
-        backbone: what the rate of pretrained layers is times that.
-        first: the detector's first label; 1 where 0 is the background.
+        iterations: steps of the optimiser, in all.
+        batch_size: images a step.
+        learning_rate: of Adam, at its highest.
+        backbone_factor: of the learning rate, for pretrained layers.
+        first_label: the detector's first label; 1 where 0 is the background.
     """
 
-    presentations: int
-    batch: int
-    rate: float
-    backbone: float
-    first: int
+    iterations: int
+    batch_size: int
+    learning_rate: float
+    backbone_factor: float
+    first_label: int
+
+    @property
+    def num_images(self) -> int:
+        """How many images a training is shown."""
+        return self.iterations * self.batch_size
 
 
-RECIPES = {"efficientnet": Recipe(2400, 4, 2e-3, 0.1, 0), "maskrcnn": Recipe(10000, 2, 1e-3, 1.0, 1)}
+RECIPES = {"efficientnet": Recipe(600, 4, 2e-3, 0.1, 0), "maskrcnn": Recipe(5000, 2, 1e-3, 1.0, 1)}
 
 
 def checked(choice: str) -> str:
@@ -68,7 +73,7 @@ def checked(choice: str) -> str:
     """
     name, _, file = choice.partition("=")
     if name not in RECIPES or (name == "maskrcnn") != bool(file):
-        raise ProbsceneError(f"Expected a detector efficientnet or maskrcnn=FILE, actual {choice!r}.")
+        raise ProbsceneError(f"expected a detector efficientnet or maskrcnn=FILE, got {choice!r}.")
     if file:
         build(choice, 1, (64, 64))
     return name
@@ -151,9 +156,9 @@ def _fcos(classes: int, size: tuple[int, int]) -> FCOS:
         image_std=[128 / 255] * 3,
         anchor_generator=AnchorGenerator(tuple((side,) for side in SIDES), ((1.0,),) * len(SIDES)),
         center_sampling_radius=REACH,
-        score_thresh=SCORE,
+        score_thresh=MIN_SCORE,
         nms_thresh=0.5,
-        detections_per_img=MOST,
+        detections_per_img=MAX_DETECTIONS,
     )
     detector.head.classification_head = FCOSClassificationHead(CHANNELS, 1, classes, CONVOLUTIONS)
     detector.head.regression_head = FCOSRegressionHead(CHANNELS, 1, CONVOLUTIONS)
@@ -170,8 +175,8 @@ def _mask_rcnn(file: Path, classes: int, size: tuple[int, int]) -> nn.Module:
         91,
         min_size=min(size),
         max_size=max(size),
-        box_score_thresh=SCORE,
-        box_detections_per_img=MOST,
+        box_score_thresh=MIN_SCORE,
+        box_detections_per_img=MAX_DETECTIONS,
     )
     whole = any(name.startswith("backbone.") for name in tensors)
     into = detector if whole else detector.backbone.body
@@ -181,7 +186,7 @@ def _mask_rcnn(file: Path, classes: int, size: tuple[int, int]) -> nn.Module:
             raise RuntimeError(f"no {lacking[0]}")
     except RuntimeError as error:
         raise DataError(
-            f"Expected a state dict of torchvision's maskrcnn_resnet50_fpn or resnet50 in {file}, actual another "
+            f"expected a state dict of torchvision's maskrcnn_resnet50_fpn or resnet50 in {file}, got another "
             f"network's ({' '.join(str(error).split())[:160]}...)."
         ) from error
     heads = detector.roi_heads

@@ -1,7 +1,7 @@
 """The trainings of a trial: each is one file of what its detector finds in the test images, whole or absent.
 
     trainings/ROW-SEED.safetensors     boxes, classes, scores and images of all detections
-    trainings/ROW-SEED.weights         of a chain, until the row after it is trained
+    trainings/ROW-SEED.weights         where rows start from the one before, until the next is trained
 
 Rows are trained seed by seed, so that the first seed of all is there first.
 """
@@ -28,8 +28,8 @@ from .plan import Part, chosen
 from .sets import Example, LabelledSet
 from .training import Detections, Stage, detect, train
 
-CHAIN_RATES = (1.0, 0.5, 0.1)  # of the first row, the second, and those after it, in the paper's supplement
-LATER_RATE = 0.5  # of a row's later stages
+WARM_START_RATES = (1.0, 0.5, 0.1)  # of the first row, the second, and those after it, in the paper's supplement
+FINETUNE_RATE = 0.5  # of a row's later stages
 
 
 class Job(NamedTuple):
@@ -41,8 +41,8 @@ class Job(NamedTuple):
         size: height and width at which images come.
         rows: by name, what is shown: stages of parts.
         digests: by row, what its trainings depend on.
-        last: the share of the presentations that the last of several stages has.
-        chain: every row goes on from the detector of the row before.
+        finetune_fraction: the share of the images that the last of several stages is shown.
+        warm_start: every row starts from the detector of the row before.
         value_range: of images of 16 bits, see ``decoding.read_rgb``.
     """
 
@@ -56,19 +56,19 @@ class Job(NamedTuple):
     test: tuple[Example, ...]
     seeds: int
     seed: int
-    last: float
-    chain: bool
+    finetune_fraction: float
+    warm_start: bool
     value_range: tuple[float, float] | None = None
 
     def run(self, workers: int, progress: Callable[[int, int], None]) -> None:
-        """Do what is missing; ``progress`` hears of presentations done, and of all.
+        """Do what is missing; ``progress`` is called with the number of images shown, and of all.
 
         Raises:
             ProbsceneError: a loss that is not finite.
             MachineError: the disk is full, or a worker was killed.
         """
         make_folder(self.out / "trainings")
-        budget, names = self.recipe.presentations, tuple(self.rows)
+        budget, names = self.recipe.num_images, tuple(self.rows)
         total = budget * len(names) * self.seeds
         there = sum(self.is_done(name, s) for name in names for s in range(self.seeds))
         done = budget * there
@@ -79,7 +79,7 @@ class Job(NamedTuple):
             done += number
             progress(done, total)
 
-        width = 1 if self.chain else len(names)
+        width = 1 if self.warm_start else len(names)
         tasks = [task for task in range(width * self.seeds) if self._missing(task)]
         if workers == 1:
             with threads(1):
@@ -90,7 +90,7 @@ class Job(NamedTuple):
             spread(_worker, (self,), workers, tasks, lambda task: shown(budget * lacking[task]))
 
     def work(self, task: int, shown: Callable[[int], None] = lambda number: None) -> int:
-        """Train one detector, or of a chain all rows for a seed; returns the task."""
+        """Train one detector, or where rows start from the one before all rows for a seed; returns the task."""
         names = tuple(self.rows)
         for name in self._missing(task):
             row, s = names.index(name), self._seed_of(task)
@@ -98,34 +98,34 @@ class Job(NamedTuple):
             with chunk_randomness(self.seed, s):
                 detector = build(self.choice, len(self.classes), self.size)
                 rate = 1.0
-                if self.chain:
-                    rate = CHAIN_RATES[min(row, len(CHAIN_RATES) - 1)]
+                if self.warm_start:
+                    rate = WARM_START_RATES[min(row, len(WARM_START_RATES) - 1)]
                     if row:
                         before = self._weights(names[row - 1], s)
                         detector.load_state_dict(safetensors.torch.load_file(before))
                 stages = self.stages(name, s, rate)
                 train(detector, stages, self.recipe, self.size, (self.seed, s), shown, self.value_range)
-            like = self.size, self.recipe.first, self.value_range
+            like = self.size, self.recipe.first_label, self.value_range
             found = [detect(detector, example.path, *like) for example in self.test]
-            if self.chain and row + 1 < len(names):
+            if self.warm_start and row + 1 < len(names):
                 state = {key: value.contiguous() for key, value in detector.state_dict().items()}
                 write_whole(self._weights(name, s), partial(safetensors.torch.save_file, state))
             write_whole(self._file(name, s), partial(_save, found, {"settings": self.digests[name]}))
-            if self.chain and row:
+            if self.warm_start and row:
                 self._weights(names[row - 1], s).unlink(missing_ok=True)
         return task
 
     def stages(self, name: str, seed: int, rate: float = 1.0) -> list[Stage]:
         """What a row's detector is shown for a seed."""
-        stages, budget = self.rows[name], self.recipe.presentations
-        last = round(self.last * budget) if len(stages) > 1 else budget
+        stages, budget = self.rows[name], self.recipe.num_images
+        last = round(self.finetune_fraction * budget) if len(stages) > 1 else budget
         before = [(budget - last) // max(1, len(stages) - 1)] * (len(stages) - 1)
         if before:
             before[0] += budget - last - sum(before)
         shown = []
         for i, (stage, number) in enumerate(zip(stages, [*before, last], strict=True)):
             parts = tuple(chosen(found, part, seed + 1000 * self.seed) for found, part in stage)
-            shown.append(Stage(parts, number, rate * (LATER_RATE if i else 1.0)))
+            shown.append(Stage(parts, number, rate * (FINETUNE_RATE if i else 1.0)))
         return shown
 
     def detections(self, name: str, seed: int) -> list[Detections]:
@@ -153,17 +153,18 @@ class Job(NamedTuple):
             return False
         if before != self.digests[name]:
             raise RunError(
-                f"Expected the set {name!r} as {file} was trained on, actual another; rename the set, or name another "
+                f"expected the set {name!r} as {file} was trained on, got another; rename the set, or name another "
                 "folder."
             )
         return True
 
     def _missing(self, task: int) -> list[str]:
         names, s = tuple(self.rows), self._seed_of(task)
-        return [name for name in (names if self.chain else [names[task % len(names)]]) if not self.is_done(name, s)]
+        own = names if self.warm_start else (names[task % len(names)],)
+        return [name for name in own if not self.is_done(name, s)]
 
     def _seed_of(self, task: int) -> int:
-        return task if self.chain else task // len(self.rows)
+        return task if self.warm_start else task // len(self.rows)
 
     def _file(self, name: str, seed: int) -> Path:
         return self.out / "trainings" / f"{name}-{seed}.safetensors"

@@ -12,7 +12,7 @@ from .tables import shown
 
 REAL, OTHER = "#30363d", "#2b7bba"  # of rows that are shown labelled photographs alone, and of the others
 INK, FAINT = "#1f2328", "#d0d7de"
-MOST, LEAST = 6, 2.0  # panels; percent that a panel spans
+MAX_PANELS, MIN_PANEL_SPAN = 6, 2.0  # panels; percent that a panel spans
 PANEL, LINE, NAMES = 2.1, 0.3, 2.0  # inches
 
 
@@ -28,7 +28,7 @@ def draw(results: Results, out: Path) -> None:
 
 def picture(results: Results) -> Figure:
     """The figure: a dot is the mean of the seeds, a line its 95 % interval, a small mark each seed."""
-    columns = shown(results)[:MOST]
+    columns = shown(results)[:MAX_PANELS]
     size = (NAMES + PANEL * len(columns), 1.1 + LINE * len(results.rows))
     figure = Figure(size, layout="constrained", facecolor="white")
     panels = figure.subplots(1, len(columns), squeeze=False, sharey=True)[0]
@@ -60,5 +60,5 @@ def _panel(axes: Axes, results: Results, column: Column) -> None:
     axes.spines["bottom"].set_color(FAINT)
     axes.margins(x=0.06)
     low, high = axes.get_xlim()
-    if high - low < LEAST:  # one value, or nearly
-        axes.set_xlim((low + high - LEAST) / 2, (low + high + LEAST) / 2)
+    if high - low < MIN_PANEL_SPAN:  # one value, or nearly
+        axes.set_xlim((low + high - MIN_PANEL_SPAN) / 2, (low + high + MIN_PANEL_SPAN) / 2)

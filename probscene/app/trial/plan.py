@@ -19,12 +19,12 @@ import numpy as np
 
 from probscene.errors import DataError, ProbsceneError
 
-from ..labelling.naming import composed
+from ..labels.naming import composed
 from .sets import Example, LabelledSet
 
 REAL = "real"
-NAMED = 5  # images in a message
-LOOSE = 1.25  # times as wide as generated boxes, from which photographs' labels are said to be looser
+MAX_NAMED_IMAGES = 5  # images in a message
+LOOSE_BOX_RATIO = 1.25  # times as wide as generated boxes, from which photographs' labels are said to be looser
 
 
 class Part(NamedTuple):
@@ -79,15 +79,15 @@ def plan(sets: Mapping[str, str | Path], known: Iterable[str], numbers: Iterable
     for name in known:
         if name != REAL:
             rows[name] = Row(name, ((Part(name),),))
-    for name, said in sets.items():
+    for name, text in sets.items():
         if name in rows or name in known:
-            raise ProbsceneError(f"Expected a name for each set of a trial, actual {name!r} twice; rename one.")
+            raise ProbsceneError(f"expected a name for each set of a trial, got {name!r} twice; rename one.")
         if not name or name.startswith(".") or any(letter in name for letter in '/\\:"\n'):
-            raise ProbsceneError(f"Expected a name that can be a file's for a set of a trial, actual {name!r}.")
-        rows[name] = Row(name, _stages(said, known, rows, paths))
+            raise ProbsceneError(f"expected a name that can be a file's for a set of a trial, got {name!r}.")
+        rows[name] = Row(name, _stages(text, known, rows, paths))
     if not rows:
         raise ProbsceneError(
-            "Expected sets to compare, actual none; give --set NAME=PATH, --run RUN or --real-numbers 10,20,50,all."
+            "expected sets to compare, got none; give --set NAME=PATH, --run RUN or --real-numbers 10,20,50,all."
         )
     return Plan(tuple(rows.values()), paths)
 
@@ -109,12 +109,12 @@ def only(found: LabelledSet, names: Path) -> LabelledSet:
     try:
         stems = list(dict.fromkeys(names.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"Expected a text file of image names at {names}, actual none to be read ({error}).") from error
+        raise DataError(f"expected a text file of image names at {names}, got none to be read ({error}).") from error
     there = {composed(example.path.stem): example for example in found.examples}
     lacking = [stem for stem in stems if composed(stem) not in there]
     if lacking or not stems:
         actual = f"{lacking[0]!r}, which it has not" if lacking else "none"
-        raise DataError(f"Expected in {names} names of images of {found.path}, without ending, actual {actual}.")
+        raise DataError(f"expected in {names} names of images of {found.path}, without ending, got {actual}.")
     return found._replace(examples=tuple(there[composed(stem)] for stem in stems))
 
 
@@ -126,7 +126,7 @@ def split(found: LabelledSet, number: int, seed: int) -> tuple[LabelledSet, Labe
     """
     total = len(found.examples)
     if not 0 < number < total:
-        raise ProbsceneError(f"Expected to hold out 1 to {total - 1} of the images of {found.path}, actual {number}.")
+        raise ProbsceneError(f"expected to hold out 1 to {total - 1} of the images of {found.path}, got {number}.")
     order = np.random.default_rng([seed, 30]).permutation(total)
     test = tuple(found.examples[i] for i in sorted(order[:number]))
     held = {example.digest for example in test if len(example.boxes)}
@@ -154,7 +154,7 @@ def check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet,
             there = None if part.source in later else len(loaded[part.source].examples)
             if there is not None and (part.number or 0) > there:
                 raise DataError(
-                    f"Expected at least {part.number} images in {part.source} for the set {row.name!r}, actual {there}."
+                    f"expected at least {part.number} images in {part.source} for the set {row.name!r}, got {there}."
                 )
     of_digest = {example.digest: example for example in tested.examples}
     used = {part.source for row in planned.rows for stage in row.stages for part in stage}
@@ -165,11 +165,11 @@ def check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet,
             if e.digest in of_digest and len(e.boxes) + len(of_digest[e.digest].boxes)  # empty scenes may be the same
         ]
         if both:
-            more = f" and {len(both) - NAMED} more" if len(both) > NAMED else ""
+            more = f" and {len(both) - MAX_NAMED_IMAGES} more" if len(both) > MAX_NAMED_IMAGES else ""
             raise DataError(
-                f"Expected test images that are in no set, actual {len(both)} in {name!r}: "
-                f"{'; '.join(both[:NAMED])}{more}. Take them out of one of the two; for a part of one folder, name "
-                "'real' with --hold-out N."
+                f"expected test images that are in no set, got {len(both)} in {name!r}: "
+                f"{'; '.join(both[:MAX_NAMED_IMAGES])}{more}. Take them out of one of the two; for a part of "
+                "one folder, name 'real' with --hold-out N."
             )
 
 
@@ -183,7 +183,7 @@ def baselines_of(planned: Plan, names: Iterable[str]) -> tuple[str, ...]:
     chosen = tuple(names) or (there[0],)
     unknown = [name for name in chosen if name not in there]
     if unknown:
-        raise ProbsceneError(f"Expected a baseline among {', '.join(there)}, actual {unknown[0]!r}.")
+        raise ProbsceneError(f"expected a baseline among {', '.join(there)}, got {unknown[0]!r}.")
     return chosen
 
 
@@ -192,17 +192,17 @@ def _row_name(part: Part) -> str:
 
 
 def _stages(
-    said: str | Path, known: tuple[str, ...], rows: Mapping[str, Row], paths: dict[str, Path]
+    text: str | Path, known: tuple[str, ...], rows: Mapping[str, Row], paths: dict[str, Path]
 ) -> tuple[tuple[Part, ...], ...]:
-    if isinstance(said, Path) or Path(said).exists():
-        return ((_path(str(said), paths),),)
+    if isinstance(text, Path) or Path(text).exists():
+        return ((_path(str(text), paths),),)
     stages: list[tuple[Part, ...]] = []
-    for words in said.split(","):
+    for words in text.split(","):
         found: list[tuple[tuple[Part, ...], ...]] = [
             _named(word.strip(), known, rows, paths) for word in words.split("+")
         ]
         if len(found) > 1 and any(len(of) > 1 for of in found):
-            raise ProbsceneError(f"Expected sets of one stage on both sides of +, actual {words!r}.")
+            raise ProbsceneError(f"expected sets of one stage on both sides of +, got {words!r}.")
         stages += found[0] if len(found) == 1 else [tuple(part for of in found for part in of[0])]
     return tuple(stages)
 
@@ -220,7 +220,7 @@ def _named(
     if not colon:
         return ((_path(word, paths),),)
     if not number.isdecimal() or int(number) < 1:
-        raise ProbsceneError(f"Expected a positive number of images after the colon, actual {word!r}.")
+        raise ProbsceneError(f"expected a positive number of images after the colon, got {word!r}.")
     if before in known:
         return ((Part(before, int(number)),),)
     return ((Part(_path(before, paths).source, int(number)),),)
@@ -229,7 +229,7 @@ def _named(
 def _path(word: str, paths: dict[str, Path]) -> Part:
     if not list_of(Path(word))[0].exists():
         raise DataError(
-            f"Expected a labelled set at {word!r}, actual none; name a folder of COCO, KITTI or YOLO, a JSON file, an "
+            f"expected a labelled set at {word!r}, got none; name a folder of COCO, KITTI or YOLO, a JSON file, an "
             "earlier row, or real, prior, start or learnt where they are given."
         )
     paths[word] = Path(word)
@@ -245,7 +245,7 @@ def looser(photographs: LabelledSet, made: LabelledSet) -> str | None:
     sides = [_sides(found, len(made.classes), made.examples[0].size) for found in (photographs, made)]
     known = {name: (a, b) for name, a, b in zip(made.classes, *sides, strict=True) if a > 0 and b > 0}
     margin = round(float(np.median([(a - b) / 2 for a, b in known.values()]))) if known else 0
-    if margin < 1 or max(a / b for a, b in known.values()) < LOOSE:
+    if margin < 1 or max(a / b for a, b in known.values()) < LOOSE_BOX_RATIO:
         return None
     words = ", ".join(f"{name} {a:.0f} for {b:.0f}" for name, (a, b) in known.items())
     return (

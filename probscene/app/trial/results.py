@@ -40,7 +40,7 @@ class Results(NamedTuple):
         baselines: rows that others are compared with.
         coco: by row, COCO's own figures, the mean over the seeds.
         counts: of test images, seeds, resamples.
-        budget: presentations, in words of the detector.
+        budget: iterations, batch size and image size, and the detector.
     """
 
     rows: tuple[str, ...]
@@ -147,7 +147,9 @@ def score(
     progress(len(rows), len(rows))
     ladder = {row.name: n if n > 0 else photographs for row in rows if (n := row.photographs) is not None}
     counts = {"test_images": len(job.test), "seeds": job.seeds, "resamples": resamples}
-    words = f"{job.choice.partition('=')[0]}, {job.recipe.presentations:,} presentations at {job.size[1]}x{job.size[0]}"
+    recipe, (height, width) = job.recipe, job.size
+    training = f"{recipe.iterations:,} iterations of {recipe.batch_size} images at {width}x{height}"
+    words = f"{job.choice.partition('=')[0]}, {training}"
     names = tuple(row.name for row in rows)
     return Results(names, tuple(columns), samples, by_seed, ladder, baselines, coco, counts, words)
 

@@ -20,11 +20,11 @@ from probscene.decoding import quiet, read, stored
 from probscene.errors import DataError
 from probscene.image_bytes import Fault
 
-from ..labelling.annotations import Annotated, Annotation
-from ..labelling.kitti import DONT_CARE, TYPES, class_of
-from ..labelling.naming import composed, matched
-from ..labelling.reading import read_annotations
-from ..labelling.yolo import images_beside
+from ..labels.annotations import Annotated, Annotation
+from ..labels.kitti import DONT_CARE, TYPES, class_of
+from ..labels.naming import composed, matched
+from ..labels.reading import read_annotations
+from ..labels.yolo import images_beside
 
 Progress = Callable[[int, int], None]
 
@@ -34,7 +34,7 @@ LEVELS = {EASY: (40.0, 0, 0.15), MODERATE: (25.0, 1, 0.30), HARD: (25.0, 2, 0.50
 """KITTI's levels: least height in pixels, most occluded, most truncated."""
 ALIKE = {"Van": "Car", "Person_sitting": "Pedestrian"}
 """Whom KITTI's protocol does not count as the other, nor as a mistake."""
-NAMED = 5  # images in a message
+MAX_NAMED_IMAGES = 5  # images in a message
 
 
 class Example(NamedTuple):
@@ -87,7 +87,7 @@ def read_set(
 
     Args:
         classes: those to keep; all that it has where None. KITTI's types count as classes of their names, whatever the
-            case, or by ``labelling.kitti.TYPES``.
+            case, or by ``labels.kitti.TYPES``.
         same: a set of COCO or YOLO must have no others.
         progress: called with the number of images read, and of all.
 
@@ -102,14 +102,14 @@ def read_set(
     if not labels.images or not files:
         actual = f"no image such as {labels.images[0].name}" if labels.images else "none of them"
         raise DataError(
-            f"Expected labelled images in {path}: annotations.json (COCO) with its images, KITTI's image_2 and "
-            f"label_2, or YOLO's data.yaml, images and labels, actual {actual}; name the folder of a data set."
+            f"expected labelled images in {path}: annotations.json (COCO) with its images, KITTI's image_2 and "
+            f"label_2, or YOLO's data.yaml, images and labels, got {actual}; name the folder of a data set."
         )
     found = matched(labels.images, files, files[0].parent, stems=labels.stems)
     lacking = [file for i, file in enumerate(files) if i not in found.entries] if labels.stems else []
     if lacking:
         raise DataError(
-            f"Expected a label file for each image in {labels.path}, actual none of {lacking[0]}; write an empty one "
+            f"expected a label file for each image in {labels.path}, got none of {lacking[0]}; write an empty one "
             "where it shows nothing, or take it out."
         )
     # In the order of COCO's list, and in that of the files of others.
@@ -137,10 +137,10 @@ def read_set(
         examples.append(_example(files[i], pixels, entries, kept))
         progress(number, len(order))
     if bad:
-        more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+        more = f" and {len(bad) - MAX_NAMED_IMAGES} more" if len(bad) > MAX_NAMED_IMAGES else ""
         raise DataError(
-            f"Expected images that decode in {path}, actual {len(bad)} of {len(order)} bad: "
-            f"{', '.join(bad[:NAMED])}{more}; mend or delete them."
+            f"expected images that decode in {path}, got {len(bad)} of {len(order)} bad: "
+            f"{', '.join(bad[:MAX_NAMED_IMAGES])}{more}; fix or delete them."
         )
     return LabelledSet(path, kept, tuple(examples), labels.kitti, found.notes)
 
@@ -218,13 +218,13 @@ def _kept(path: Path, wanted: tuple[str, ...] | None, there: tuple[str, ...], sa
         near = {name.casefold(): name for name in there}
         hints = [f"{near[name.casefold()]!r} differs in case" for name in lacking if name.casefold() in near]
         raise DataError(
-            f"Expected the classes {', '.join(wanted or ())} in {path}, actual {', '.join(there) or 'none'}"
+            f"expected the classes {', '.join(wanted or ())} in {path}, got {', '.join(there) or 'none'}"
             f"{' (' + '; '.join(hints) + ')' if hints else ''}; rename {', '.join(lacking)} there, or name the classes "
             "that all sets have by --classes."
         )
     if more:
         raise DataError(
-            f"Expected the classes {', '.join(wanted or ())} in {path}, actual {', '.join(more)}, too; name the "
+            f"expected the classes {', '.join(wanted or ())} in {path}, got {', '.join(more)}, too; name the "
             "classes that all sets have by --classes."
         )
     return there if wanted is None else wanted
@@ -241,8 +241,8 @@ def _example(path: Path, pixels: NDArray, objects: list[_Object], classes: tuple
     if len(off):
         (x0, y0, x1, y1), one = boxes[off[0]], objects[off[0]].one
         raise DataError(
-            f"Expected boxes on the image {path} of {width}x{height} {one.where}, actual {one.name} from {x0:g}, "
-            f"{y0:g} to {x1:g}, {y1:g}; mend it."
+            f"expected boxes on the image {path} of {width}x{height} {one.where}, got {one.name} from {x0:g}, "
+            f"{y0:g} to {x1:g}, {y1:g}; fix it."
         )
     of_class = np.array([-1 if name is None else classes.index(name) for _, name, *_ in objects], np.int64)
     levels = np.array([each.level for each in objects], np.int64)

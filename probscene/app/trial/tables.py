@@ -9,7 +9,7 @@ from rich.table import Table
 from .bootstrap import Estimate
 from .results import MEAN, Column, Results
 
-WIDE, LONGEST = 160, 28  # characters of the file, and of a name before it is folded
+TEXT_WIDTH, MAX_NAME_LENGTH = 160, 28  # characters of the file, and of a name before it is folded
 
 
 def show(results: Results, console: Console) -> None:
@@ -26,7 +26,7 @@ def show(results: Results, console: Console) -> None:
 def text(results: Results) -> str:
     """The same for a file."""
     out = io.StringIO()
-    show(results, Console(file=out, width=WIDE, highlight=False, no_color=True))
+    show(results, Console(file=out, width=TEXT_WIDTH, highlight=False, no_color=True))
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
 
 
@@ -41,7 +41,7 @@ def shown(results: Results) -> list[Column]:
     return [*((name, main) for name in (*classes, MEAN)), *((MEAN, m) for m in measures if m != main)]
 
 
-def precision(results: Results, width: int = WIDE) -> list[Table]:
+def precision(results: Results, width: int = TEXT_WIDTH) -> list[Table]:
     """Average precision in percent, with intervals, and worth; tables that fit into so many characters."""
     rows = results.rows
     columns = {_head(results, c): [_cell(results.precision(row, c)) for row in rows] for c in shown(results)}
@@ -53,7 +53,7 @@ def precision(results: Results, width: int = WIDE) -> list[Table]:
     return _tables("Average precision in %, tested on real images", rows, columns, width)
 
 
-def differences(results: Results, other: str, width: int = WIDE) -> list[Table]:
+def differences(results: Results, other: str, width: int = TEXT_WIDTH) -> list[Table]:
     """Each row less a baseline, in points."""
     rows = [row for row in results.rows if row != other]
     columns = {
@@ -81,7 +81,7 @@ def _head(results: Results, column: Column) -> str:
 
 def _tables(title: str, rows: Sequence[str], columns: Mapping[str, list[str]], width: int) -> list[Table]:
     """As many columns side by side as fit, the rest in further tables."""
-    lead = min(LONGEST, max(len(row) for row in (*rows, "set")))
+    lead = min(MAX_NAME_LENGTH, max(len(row) for row in (*rows, "set")))
     tables, left = [], 0
     for head, cells in columns.items():
         wide = 3 + max(len(line) for text in (head, *cells) for line in text.split("\n"))

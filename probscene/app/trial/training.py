@@ -1,4 +1,4 @@
-"""Train a detector on labelled images, the same number of presentations whatever the set, and detect with it.
+"""Train a detector on labelled images, the same number of images whatever the set, and detect with it.
 
 Everything random comes from the training's seed: the same bytes on one thread, whatever the number of processes.
 Axis letters: N objects, H W.
@@ -23,26 +23,27 @@ from .sets import Example
 
 SCALES = (0.75, 1.33)  # images are shown at
 SHIFT = 0.1  # of the image's sides
-LEAST_SIDE, LEAST_PART = 2.0, 0.35  # pixels, and a share of its box: of objects that the frame cuts, less is no object
-LIGHT = 0.25  # brightness, contrast and saturation change by so much
-FILL = 127  # around the image
-WARM = 0.05  # of the steps, in which the rate rises
-CLIP = 10.0  # of the gradient's norm
-KEPT = 256 * 2**20  # bytes of images that are kept in memory
+MIN_BOX_SIDE = 2.0  # pixels, and
+MIN_BOX_FRACTION = 0.35  # of its box: objects of which the frame leaves less are dropped
+COLOUR_JITTER = 0.25  # brightness, contrast and saturation change by so much
+PADDING_VALUE = 127  # around the image
+WARMUP_FRACTION = 0.05  # of the steps, in which the rate rises
+MAX_GRAD_NORM = 10.0  # of the gradient's norm
+IMAGE_CACHE_BYTES = 256 * 2**20  # bytes of images that are kept in memory
 
 
 class Stage(NamedTuple):
-    """What is shown for a number of presentations.
+    """A stage of a training: what is shown, and how long.
 
     Attributes:
-        parts: examples by set; each part has the same share of the presentations.
-        presentations: of images.
-        rate: what the recipe's is times that.
+        parts: examples by set; each part has the same share of the images shown.
+        num_images: how many images are shown.
+        rate_factor: of the recipe's learning rate.
     """
 
     parts: tuple[tuple[Example, ...], ...]
-    presentations: int
-    rate: float = 1.0
+    num_images: int
+    rate_factor: float = 1.0
 
 
 class Detections(NamedTuple):
@@ -68,7 +69,7 @@ def train(
     Args:
         size: height and width at which images come.
         seed: words of it.
-        shown: called with the number of presentations of each step.
+        shown: called with the number of images of each step.
         value_range: of images of 16 bits, see ``read_rgb``.
 
     Raises:
@@ -77,7 +78,7 @@ def train(
     pictures = Pictures(size, value_range)
     for number, stage in enumerate(stages):
         random = np.random.default_rng([*seed, number])
-        _run_stage(detector, stage, recipe, pictures, random, shown)
+        _train_stage(detector, stage, recipe, pictures, random, shown)
 
 
 def detect(
@@ -106,7 +107,7 @@ def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> tuple[NDArray[np.
     """An image ``(H, W, 3)`` at the top left of a frame of ``size``, as large as it goes in there, and its scale."""
     scale = min(size[0] / image.shape[0], size[1] / image.shape[1])
     height, width = (max(1, round(side * scale)) for side in image.shape[:2])
-    frame = np.full((*size, 3), FILL, np.uint8)
+    frame = np.full((*size, 3), PADDING_VALUE, np.uint8)
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     frame[:height, :width] = cv2.resize(image, (width, height), interpolation=how)
     return frame, scale
@@ -117,7 +118,7 @@ class Pictures:
 
     def __init__(self, size: tuple[int, int], value_range: tuple[float, float] | None = None):
         self.size, self.value_range, self._kept = size, value_range, {}
-        self._room = KEPT // (3 * math.prod(size))
+        self._room = IMAGE_CACHE_BYTES // (3 * math.prod(size))
 
     def __call__(self, example: Example) -> tuple[NDArray[np.uint8], float]:
         """See ``fitted``."""
@@ -142,13 +143,13 @@ def augmented(
     x = width / 2 + random.uniform(-SHIFT, SHIFT) * width - across * width / 2
     y = height / 2 + random.uniform(-SHIFT, SHIFT) * height - scale * height / 2
     move = np.array([[across, 0, x + (across - 1) / 2], [0, scale, y + (scale - 1) / 2]])  # of pixels' middles
-    image = cv2.warpAffine(image, move, (width, height), flags=cv2.INTER_LINEAR, borderValue=(FILL,) * 3)
+    image = cv2.warpAffine(image, move, (width, height), flags=cv2.INTER_LINEAR, borderValue=(PADDING_VALUE,) * 3)
     boxes, classes = example.boxes[example.real] * fit, example.classes[example.real]
     ends = np.sort(boxes[:, [0, 2]] * across + x, 1), boxes[:, [1, 3]] * scale + y
     whole = np.stack([ends[0][:, 0], ends[1][:, 0], ends[0][:, 1], ends[1][:, 1]], 1)
     cut = np.clip(whole, 0, [width, height, width, height])
     sides, before = cut[:, 2:] - cut[:, :2], whole[:, 2:] - whole[:, :2]
-    stay = (sides.min(1, initial=np.inf) >= LEAST_SIDE) & (sides.prod(1) >= LEAST_PART * before.prod(1))
+    stay = (sides.min(1, initial=np.inf) >= MIN_BOX_SIDE) & (sides.prod(1) >= MIN_BOX_FRACTION * before.prod(1))
     return _lit(image, random), cut[stay].astype(np.float32), classes[stay]
 
 
@@ -165,7 +166,7 @@ def _again(part: tuple[Example, ...], random: np.random.Generator) -> Iterator[E
             yield part[i]
 
 
-def _run_stage(
+def _train_stage(
     detector: Any,
     stage: Stage,
     recipe: Recipe,
@@ -175,39 +176,42 @@ def _run_stage(
 ) -> None:
     body = {id(p) for p in pretrained_part(detector).parameters()}
     groups = [[p for p in detector.parameters() if p.requires_grad and (id(p) in body) == of] for of in (False, True)]
-    rates = (recipe.rate * stage.rate, recipe.rate * stage.rate * recipe.backbone)
+    rate = recipe.learning_rate * stage.rate_factor
+    rates = (rate, rate * recipe.backbone_factor)
     adam = torch.optim.Adam([{"params": g, "lr": r} for g, r in zip(groups, rates, strict=True)], fused=True)
-    steps = math.ceil(stage.presentations / recipe.batch)
-    schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: _course((step + 1) / steps))
+    steps = math.ceil(stage.num_images / recipe.batch_size)
+    schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: _schedule((step + 1) / steps))
     detector.train()
-    examples, left = order(stage.parts, stage.presentations, random), stage.presentations
+    examples, left = order(stage.parts, stage.num_images, random), stage.num_images
     while left:
-        batch = [next(examples) for _ in range(min(recipe.batch, left))]
+        batch = [next(examples) for _ in range(min(recipe.batch_size, left))]
         images, targets = [], []
         for example in batch:
             image, boxes, classes = augmented(example, pictures, random)
             images.append(_tensor(image))
-            labels = torch.from_numpy(classes) + recipe.first
+            labels = torch.from_numpy(classes) + recipe.first_label
             targets.append({"boxes": torch.from_numpy(boxes).reshape(-1, 4), "labels": labels})
         loss = torch.stack([*detector(images, targets).values()]).sum()
         if not torch.isfinite(loss):
-            raise ProbsceneError("Expected a finite loss of the detector, actual one that is not; give a lower --rate.")
+            raise ProbsceneError("expected a finite loss of the detector, got one that is not; give a lower --rate.")
         adam.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_([p for group in groups for p in group], CLIP)
+        nn.utils.clip_grad_norm_([p for group in groups for p in group], MAX_GRAD_NORM)
         adam.step()
         schedule.step()
         left -= len(batch)
         shown(len(batch))
 
 
-def _course(way: float) -> float:
-    """The rate, as a share of its highest, at a share of the steps: up in a line, down as a cosine."""
-    return way / WARM if way < WARM else 0.5 * (1 + math.cos(math.pi * (way - WARM) / (1 - WARM)))
+def _schedule(progress: float) -> float:
+    """The learning rate, as a share of its highest, at a share of the steps: linear warm-up, then a cosine."""
+    if progress < WARMUP_FRACTION:
+        return progress / WARMUP_FRACTION
+    return 0.5 * (1 + math.cos(math.pi * (progress - WARMUP_FRACTION) / (1 - WARMUP_FRACTION)))
 
 
 def _lit(image: NDArray, random: np.random.Generator) -> NDArray[np.uint8]:
-    gain, contrast, colour = random.uniform(1 - LIGHT, 1 + LIGHT, 3)
+    gain, contrast, colour = random.uniform(1 - COLOUR_JITTER, 1 + COLOUR_JITTER, 3)
     pixels = image.astype(np.float32) * gain
     pixels = (pixels - pixels.mean()) * contrast + pixels.mean()
     pale = pixels.mean(2, keepdims=True)

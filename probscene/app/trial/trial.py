@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from probscene.dataset import range_of
 from probscene.errors import DataError, ProbsceneError, RunError
 
 from ..arguments import checked_seed, positive
-from ..datasets.generate import generate, generate_scenes
+from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_text
 from ..fitting.run import RunFolder
 from ..progress import Progress, silent
@@ -33,29 +34,28 @@ from .sets import LabelledSet, digest_of, read_set
 from .tables import text
 
 FORMAT = 1
-AREA, STEP = 256 * 192, 32  # pixels at which images come where no size is given, and what sides are multiples of
-NUMBERS = (10, 20, 50, None)
+DEFAULT_AREA = 256 * 192  # pixels of an image where no size is given
+SIDE_MULTIPLE = 32  # of an image's height and width
+DEFAULT_NUMBERS = (10, 20, 50, None)  # of labelled photographs; None for all
 
 
 class Budget(NamedTuple):
-    """How each detector is trained; the detector's recipe where None, see ``detector.RECIPES``.
+    """How each detector is trained; by the detector's recipe where None, see ``detector.RECIPES``.
 
     Attributes:
-        presentations: of images.
-        batch: images a step.
-        rate: of Adam, at its highest.
-        last: the share of the presentations that the last of several stages has.
-        chain: every row goes on from the row before, as in the paper, at half the rate and then at a tenth.
+        iterations: steps of the optimiser.
+        batch_size: images a step.
+        learning_rate: of Adam, at its highest.
+        finetune_fraction: the share of the images that the last of several stages is shown.
+        warm_start: every row starts from the detector of the row before, as in the paper, at half the learning rate and
+            then at a tenth.
     """
 
-    presentations: int | None = None
-    batch: int | None = None
-    rate: float | None = None
-    last: float = 0.5
-    chain: bool = False
-
-
-AS_USUAL = Budget()
+    iterations: int | None = None
+    batch_size: int | None = None
+    learning_rate: float | None = None
+    finetune_fraction: float = 0.5
+    warm_start: bool = False
 
 
 class Generated(NamedTuple):
@@ -68,46 +68,73 @@ class Generated(NamedTuple):
     box_margin: int = 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrialOptions:
+    """What a trial compares, and how.
+
+    Args:
+        hold_out: so many of the labelled real images, by the seed, are for testing, the others are ``real``.
+        real: labelled photographs to train on.
+        numbers: of them, with a row each, None for all; (10, 20, 50, all), as far as there are, where not given.
+        generated: what is generated of a run.
+        classes: those that the trial is about; else all, which are then the same in all sets.
+        detector: ``"efficientnet"``, or ``"maskrcnn=FILE"`` with torchvision's weights.
+        budget: how each is trained.
+        size: height and width at which images come, multiples of 32.
+        seeds: trainings of each row.
+        seed: of the trial: the split, the choices of photographs, the detectors' initialisation, the bootstrap.
+        baselines: rows that the others are compared with; the first where there is none.
+        resamples: of the bootstrap.
+        value_range: of photographs of 16 bits, see ``ImageFolder``; the run's, else what is found in all of them, where
+            None.
+    """
+
+    hold_out: int | None = None
+    real: Path | None = None
+    numbers: Iterable[int | None] | None = None
+    generated: Generated | None = None
+    classes: Iterable[str] | None = None
+    detector: str = "efficientnet"
+    budget: Budget = Budget()
+    size: tuple[int, int] | None = None
+    seeds: int = 5
+    seed: int = 0
+    baselines: Iterable[str] = ()
+    resamples: int = 1000
+    value_range: Sequence[float] | None = None
+
+    def check(self) -> None:
+        """Check what can be checked without the images.
+
+        Raises:
+            ProbsceneError: a setting that makes no sense.
+        """
+        checked_seed(self.seed)
+        positive(self.seeds, "seeds")
+        positive(self.resamples, "resamples")
+        if self.size is not None and any(side < SIDE_MULTIPLE or side % SIDE_MULTIPLE for side in self.size):
+            raise ProbsceneError(f"expected a size of multiples of {SIDE_MULTIPLE}, got {self.size[1]}x{self.size[0]}.")
+        if self.hold_out is not None and self.real is not None:
+            raise ProbsceneError("expected photographs to train on from --hold-out or from --real, got both; give one.")
+
+
 def trial(
     test: Path,
     out: Path,
     sets: Mapping[str, str | Path],
-    show: Progress = silent,
+    options: TrialOptions = TrialOptions(),
     *,
-    hold_out: int | None = None,
-    real: Path | None = None,
-    numbers: Iterable[int | None] | None = None,
-    generated: Generated | None = None,
-    classes: Iterable[str] | None = None,
-    detector: str = "efficientnet",
-    budget: Budget = AS_USUAL,
-    size: tuple[int, int] | None = None,
-    seeds: int = 5,
-    seed: int = 0,
-    baselines: Iterable[str] = (),
-    resamples: int = 1000,
     workers: int = 1,
-    value_range: Sequence[float] | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    show: Progress = silent,
+    callback: Callable[[str], None] = lambda message: None,
 ) -> Results:
     """Train, test, compare; the same call goes on after an interruption. Nothing is trained before all is checked.
 
     Args:
         test: labelled real images, see ``sets``; ``FOLDER@LIST`` for some of them.
         sets: what each row's detector is shown, see ``plan``.
-        hold_out: so many of ``test``'s images, by the seed, are for testing, the others are ``real``.
-        real: labelled photographs to train on.
-        numbers: of them, with a row each, None for all; (10, 20, 50, all), as far as there are, where not given.
-        classes: those that the trial is about; else all, which are then the same in all sets.
-        size: height and width at which images come, multiples of 32.
-        seeds: trainings of each row.
-        seed: of the trial: the split, the choices of photographs, the detectors' starts, the bootstrap.
-        baselines: rows that the others are compared with; the first where there is none.
-        resamples: of the bootstrap.
         workers: processes; the results do not depend on their number.
-        value_range: of photographs of 16 bits, see ``ImageFolder``; the run's, else what is found in all of them, where
-            None.
-        say: hears a note on the sets, before anything is trained.
+        callback: called with notes on the sets, before anything is trained.
 
     Raises:
         ProbsceneError: a setting that makes no sense.
@@ -115,38 +142,35 @@ def trial(
         RunError: the folder holds a trial of other settings.
         MachineError: the disk is full, or a worker was killed.
     """
-    choice, recipe = detector, _recipe(detector, budget)
-    checked_seed(seed)
-    for number, what in ((seeds, "seeds"), (workers, "workers"), (resamples, "resamples")):
-        positive(number, what)
-    if size is not None and any(side < STEP or side % STEP for side in size):
-        raise ProbsceneError(f"Expected a size of multiples of {STEP}, actual {size[1]}x{size[0]}.")
-    if hold_out is not None and real is not None:
-        raise ProbsceneError("Expected photographs to train on from --hold-out or from --real, actual both; give one.")
-    tested, photographs = _photographs(test, real, hold_out, seed, classes, show)
-    names, same = tested.classes, classes is None
+    recipe, budget, generated = _recipe(options.detector, options.budget), options.budget, options.generated
+    options.check()
+    positive(workers, "workers")
+    tested, photographs = _photographs(test, options, show)
+    names, same = tested.classes, options.classes is None
     known = [] if generated is None else list(_sources(generated))
     if photographs is not None:
         known.insert(0, REAL)
         there = len(photographs.examples)
-        wanted = [n for n in NUMBERS if n is None or n < there] if numbers is None else list(numbers)
+        usual = [n for n in DEFAULT_NUMBERS if n is None or n < there]
+        wanted = usual if options.numbers is None else list(options.numbers)
     else:
-        wanted = list(numbers or ())
+        wanted = list(options.numbers or ())
         if wanted:
-            raise ProbsceneError("Expected --hold-out N or --real PATH for --real-numbers, actual neither.")
+            raise ProbsceneError("expected --hold-out N or --real PATH for --real-numbers, got neither.")
     planned = plan(sets, known, wanted)
-    bases = baselines_of(planned, baselines)
+    bases = baselines_of(planned, options.baselines)
     loaded = {} if photographs is None else {REAL: photographs}
     loaded |= {key: _read(path, names, show, same) for key, path in planned.paths.items()}
     for note in dict.fromkeys(note for found in (tested, *loaded.values()) for note in found.notes):
-        say(f"Note: {note}")
+        callback(f"Note: {note}")
     check(planned, loaded, tested, set(known) - {REAL})
     if generated is not None:
         _check_classes(generated, names, same)
-    size = size or _size(tested)
+    size, seed, seeds, value_range = options.size or _size(tested), options.seed, options.seeds, options.value_range
     shared = {
-        "format": FORMAT, "classes": list(names), "detector": fingerprint(choice), "recipe": list(recipe),
-        "last": budget.last, "chain": budget.chain, "size": list(size), "seed": seed, "test": digest_of(tested),
+        "format": FORMAT, "classes": list(names), "detector": fingerprint(options.detector),
+        "recipe": [recipe.num_images, *recipe[1:]], "last": budget.finetune_fraction, "chain": budget.warm_start,
+        "size": list(size), "seed": seed, "test": digest_of(tested),
     }  # fmt: skip
     if value_range is None and generated is not None:
         value_range = generated.run.record.get("value_range")
@@ -156,20 +180,32 @@ def trial(
         shared["value_range"] = list(used)
     _bind(out, shared)
     for note in notes:
-        say(f"Note: {note}")
+        callback(f"Note: {note}")
     if generated is not None:
         for key, path in _generate(generated, out / "sets", seed, workers, show).items():
             loaded[key] = _read(path, names, show)
         check(planned, loaded, tested, set())
         note = None if photographs is None else looser(photographs, loaded[known[-1]])
         if note is not None:
-            say(note)
+            callback(note)
     rows = {
         row.name: tuple(tuple((loaded[p.source], p) for p in stage) for stage in row.stages) for row in planned.rows
     }
     digests = _digests(planned, loaded, shared)
     job = Job(
-        out, choice, recipe, size, names, rows, digests, tested.examples, seeds, seed, budget.last, budget.chain, used
+        out,
+        options.detector,
+        recipe,
+        size,
+        names,
+        rows,
+        digests,
+        tested.examples,
+        seeds,
+        seed,
+        budget.finetune_fraction,
+        budget.warm_start,
+        used,
     )
     for row in planned.rows:
         for s in range(seeds):
@@ -177,8 +213,10 @@ def trial(
     write_json(out / "trial.json", {**shared, "rows": {row.name: row.record() for row in planned.rows}})
     job.run(workers, lambda done, total: show("training", done, total))
     there = 0 if photographs is None else len(photographs.examples)
-    found = score(job, tested, planned.rows, there, bases, resamples, lambda done, total: show("scoring", done, total))
-    write_json(out / "results.json", found.record() | {"settings": {**shared, "resamples": resamples}})
+    found = score(
+        job, tested, planned.rows, there, bases, options.resamples, lambda done, total: show("scoring", done, total)
+    )
+    write_json(out / "results.json", found.record() | {"settings": {**shared, "resamples": options.resamples}})
     write_text(out / "table.txt", text(found))
     draw(found, out / "results.png")
     return found
@@ -186,15 +224,16 @@ def trial(
 
 def _recipe(choice: str, budget: Budget):
     """What a detector is trained with."""
-    if not 0 < budget.last < 1:
-        raise ProbsceneError(f"Expected a share of the last set between 0 and 1, actual {budget.last}.")
+    if not 0 < budget.finetune_fraction < 1:
+        raise ProbsceneError(f"expected a fine-tuning fraction between 0 and 1, got {budget.finetune_fraction}.")
     recipe = RECIPES[checked(choice)]
-    given = {"presentations": budget.presentations, "batch": budget.batch, "rate": budget.rate}
-    recipe = recipe._replace(**{key: value for key, value in given.items() if value is not None})
-    positive(recipe.presentations, "presentations")
-    positive(recipe.batch, "images a step")
-    if not (recipe.rate > 0 and math.isfinite(recipe.rate)):
-        raise ProbsceneError(f"Expected a positive learning rate, actual {recipe.rate}.")
+    given = budget._asdict()
+    own = ("iterations", "batch_size", "learning_rate")
+    recipe = recipe._replace(**{key: given[key] for key in own if given[key] is not None})
+    positive(recipe.iterations, "iterations")
+    positive(recipe.batch_size, "images a step")
+    if not (recipe.learning_rate > 0 and math.isfinite(recipe.learning_rate)):
+        raise ProbsceneError(f"expected a positive learning rate, got {recipe.learning_rate}.")
     return recipe
 
 
@@ -204,20 +243,18 @@ def _read(path: Path, classes: Iterable[str] | None, show: Progress, same: bool 
     return found if names is None else only(found, names)
 
 
-def _photographs(
-    test: Path, real: Path | None, hold_out: int | None, seed: int, classes: Iterable[str] | None, show: Progress
-) -> tuple[LabelledSet, LabelledSet | None]:
+def _photographs(test: Path, options: TrialOptions, show: Progress) -> tuple[LabelledSet, LabelledSet | None]:
     """What is tested on, and the photographs to train on, if there are any."""
-    tested = _read(test, classes, show)
-    if hold_out is not None:
-        photographs, tested = split(tested, hold_out, seed)
+    tested, real = _read(test, options.classes, show), options.real
+    if options.hold_out is not None:
+        photographs, tested = split(tested, options.hold_out, options.seed)
     else:
-        photographs = None if real is None else _read(real, tested.classes, show, classes is None)
+        photographs = None if real is None else _read(real, tested.classes, show, options.classes is None)
     labelled = {int(c) for e in tested.examples for c in e.classes[e.real]}
     lacking = [name for number, name in enumerate(tested.classes) if number not in labelled]
     if lacking:
         raise DataError(
-            f"Expected test images in {test} with objects of every class, actual none of {', '.join(lacking)}; name "
+            f"expected test images in {test} with objects of every class, got none of {', '.join(lacking)}; name "
             "the classes that there are by --classes, or test on more images."
         )
     return tested, photographs
@@ -228,7 +265,7 @@ def _sources(generated: Generated) -> tuple[str, ...]:
     unknown = set(generated.sources) - {"prior", "start", "learnt"}
     if unknown or not generated.sources:
         actual = ", ".join(sorted(unknown)) or "none"
-        raise ProbsceneError(f"Expected sources of a run among prior, start and learnt, actual {actual}.")
+        raise ProbsceneError(f"expected sources of a run among prior, start and learnt, got {actual}.")
     generated.run.check_finished()
     same = generated.run.model.pretraining is None
     return tuple(name for name in dict.fromkeys(generated.sources) if not (name == "start" and same))
@@ -238,8 +275,8 @@ def _check_classes(generated: Generated, classes: tuple[str, ...], same: bool) -
     there = set(generated.run.model.classes)
     if set(classes) - there or (same and there - set(classes)):
         raise DataError(
-            f"Expected model {generated.run.model.name!r} to have the classes of the test images "
-            f"({', '.join(classes)}), actual {', '.join(generated.run.model.classes)}; rename its classes or those of "
+            f"expected model {generated.run.model.name!r} to have the classes of the test images "
+            f"({', '.join(classes)}), got {', '.join(generated.run.model.classes)}; rename its classes or those of "
             "the labels, or name the classes that both have by --classes."
         )
 
@@ -247,34 +284,34 @@ def _check_classes(generated: Generated, classes: tuple[str, ...], same: bool) -
 def _generate(generated: Generated, into: Path, seed: int, workers: int, show: Progress) -> dict[str, Path]:
     """Write what is generated of a run, as far as it is not there; by source its folder."""
     run, number = generated.run, positive(generated.number, "images to generate")
-    least, margin = generated.min_visible, generated.box_margin
+    options = DatasetOptions(min_visible=generated.min_visible, box_margin=generated.box_margin)
     policies = {"prior": run.model.prior, "start": run.model.pretraining_policy}
     folders = {}
     for source in _sources(generated):
         folders[source] = into / source
 
-        def said(done: int, total: int) -> None:
+        def callback(done: int, total: int) -> None:
             show("generating", done, total)
 
         if source == "learnt":
             w = 1 if run.objects else workers
-            generate(run, number, into / source, seed, w, "coco", said, least, box_margin=margin)
+            generate(run, number, into / source, seed, w, "coco", callback, options)
         else:
             policy = policies[source]
-            generate_scenes(run.model, policy, number, into / source, seed, "coco", said, least, box_margin=margin)
+            generate_scenes(run.model, policy, number, into / source, seed, "coco", callback, options)
     return folders
 
 
 def _size(tested: LabelledSet) -> tuple[int, int]:
-    """Of ``AREA``, in the shape of the test images."""
+    """Of ``DEFAULT_AREA``, in the shape of the test images."""
     shape = float(np.median([width / height for height, width in (e.size for e in tested.examples)]))
-    sides = math.sqrt(AREA / shape), math.sqrt(AREA * shape)
-    height, width = (max(STEP, STEP * round(side / STEP)) for side in sides)
+    sides = math.sqrt(DEFAULT_AREA / shape), math.sqrt(DEFAULT_AREA * shape)
+    height, width = (max(SIDE_MULTIPLE, SIDE_MULTIPLE * round(side / SIDE_MULTIPLE)) for side in sides)
     return height, width
 
 
 def _digests(planned: Plan, loaded: Mapping[str, LabelledSet], shared: Mapping[str, Any]) -> dict[str, str]:
-    """By row, of what its trainings depend on; in a chain also of the rows before it."""
+    """By row, of what its trainings depend on; where rows start from the one before also of those before it."""
     of_source = {name: digest_of(found) for name, found in loaded.items()}
 
     def one(row: Row) -> str:
@@ -297,19 +334,17 @@ def _bind(out: Path, shared: dict[str, Any]) -> None:
             before = json.loads(record.read_text(encoding="utf-8"))
         except ValueError as error:
             raise RunError(
-                f"Expected a trial's settings in {record}, actual a damaged file; name another folder."
+                f"expected a trial's settings in {record}, got a damaged file; name another folder."
             ) from error
         differing = [key for key in shared if before.get(key) != shared[key]]
         if differing:
             was, now = (", ".join(f"{key} {str(s.get(key))[:60]}" for key in differing) for s in (before, shared))
             raise RunError(
-                f"Expected the settings that the trial in {out} was begun with ({was}), actual {now}; give the "
+                f"expected the settings that the trial in {out} was begun with ({was}), got {now}; give the "
                 "same, or name another folder. Sets and seeds can be added."
             )
         return
     others = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith("."))
     if others:
-        raise DataError(
-            f"Expected a new or empty folder for the trial, actual {out} with {', '.join(others[:5])} in it."
-        )
+        raise DataError(f"expected a new or empty folder for the trial, got {out} with {', '.join(others[:5])} in it.")
     write_json(record, {**shared, "rows": {}})

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.textpath import TextPath
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from probscene.inference.judging.metrics import Histogram
+from probscene.inference.statistics.count_metrics import Histogram
 
 from ..evaluation.evaluate import Evaluation
 from .tables import nested_counts
@@ -31,10 +31,10 @@ SOURCES = {
     "read": "#01020a",
 }
 VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" for name, c in SOURCES.items()}
-READ = {"prior": "prior", "learnt": "learnt", "target": "truth"}  # in what a site is read, and its colour
-TALLEST = 6.0  # of a histogram over u, times the prior's density
-SMALL = 1e-3  # a share that would be no pixel high
-WIDE, SMALLER = (9.6, 2.9), (5.6, 2.5)  # inches
+SITE_COLOURS = {"prior": "prior", "learnt": "learnt", "target": "truth"}  # by what a site is read in
+MAX_DENSITY = 6.0  # of a histogram over u, times the prior's density
+MIN_SHARE = 1e-3  # that is a pixel high
+WIDE, NARROW = (9.6, 2.9), (5.6, 2.5)  # inches
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text, in the page's font
     "font.family": "sans-serif",
@@ -78,12 +78,12 @@ def nested(evaluation: Evaluation) -> list[str]:
         return charts
     for c, kind in enumerate(evaluation.classes):
         each = {name: source.kinds[c].histogram() for name, source in sources.items()}
-        charts.append(_counts(each, f"{kind} per image", "share of images", kind, SMALLER))
+        charts.append(_counts(each, f"{kind} per image", "share of images", kind, NARROW))
     for what, tallies in nested_counts(sources, evaluation.classes).items():
         each = {name: found.histogram() for name, found in tallies.items()}
         if len(each) > 1:
             share = "share of images" if what.endswith("per image") else "share"
-            charts.append(_counts(each, what, share, what, SMALLER))
+            charts.append(_counts(each, what, share, what, NARROW))
     return charts
 
 
@@ -92,13 +92,13 @@ def site(name: str, read: dict[str, list[float]]) -> str:
     1, of quantiles whose bins hold equal shares. A flat one is the prior's, were it read without error."""
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": f"site {name}", "font.size": 8}):
         figure, axes = _figure(2.6, 0.95)
-        for row, (source, colour) in enumerate(READ.items()):
+        for row, (source, colour) in enumerate(SITE_COLOURS.items()):
             edges = np.asarray(read[source], float)
             width = np.maximum(np.diff(edges), 1e-3)
-            height = np.minimum(1 / (len(width) * width), TALLEST) / TALLEST
-            axes.bar(edges[:-1], 0.9 * height, width, len(READ) - 1 - row, align="edge", color=SOURCES[colour])
+            height = np.minimum(1 / (len(width) * width), MAX_DENSITY) / MAX_DENSITY
+            axes.bar(edges[:-1], 0.9 * height, width, len(SITE_COLOURS) - 1 - row, align="edge", color=SOURCES[colour])
         axes.set_xlim(0, 1)
-        axes.set_ylim(0, len(READ))
+        axes.set_ylim(0, len(SITE_COLOURS))
         axes.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
         axes.set_yticks([])
         axes.spines["left"].set_visible(False)
@@ -129,7 +129,7 @@ def curves(log: list[dict]) -> list[str]:
 
 def _counts(each: dict[str, Histogram], x: str, y: str, salt: str, size: tuple[float, float] = WIDE) -> str:
     """Shares by count, up to the last that can be seen."""
-    bins = 1 + max(int(np.flatnonzero(found.share >= SMALL).max(initial=0)) for found in each.values())
+    bins = 1 + max(int(np.flatnonzero(found.share >= MIN_SHARE).max(initial=0)) for found in each.values())
     each = {name: Histogram(*(x[:bins] for x in found)) for name, found in each.items()}
     return _bars(each, range(bins), x, y, salt, size)
 

@@ -12,7 +12,7 @@ from probscene.errors import DataError
 
 from ..evaluation.compare import TRUTH, Comparison, Row
 from ..evaluation.sources import ESTIMATE, PRIOR, START
-from ..evaluation.structure_counts import ALL, OTHERS, label
+from ..evaluation.structure_counts import ALL, OTHERS, group_label
 from ..files import make_folder, write_whole
 from .charts import label_bins
 
@@ -20,20 +20,20 @@ COLOURS = {PRIOR: "#9aa3ad", START: "#8e7cc3", TRUTH: "#30363d", ESTIMATE: "#303
 RUNS = ("#2b7bba", "#e07b39", "#3a9a5b", "#b04f9e", "#c9a227", "#5c6bc0")
 INK, FAINT = "#1f2328", "#d0d7de"
 CLASSES = "class of an object"  # the row of ``Comparison.shares_of_classes``
-SEPARATE = 4  # classes that get a row each; more share one
-SMALL = 2e-3  # a share that would be no pixel high
-CELL = (2.15, 1.25)  # inches
+MAX_CLASS_ROWS = 4  # more classes share one row
+MIN_SHARE = 2e-3  # that is a pixel high
+CELL_SIZE = (2.15, 1.25)  # inches
 
 
-def make_place(out: Path) -> None:
-    """See that a picture can be written to ``out``, before the work is done that it shows.
+def make_folder_of(out: Path) -> None:
+    """Make the folder that a picture is written to, before the work is done that it shows.
 
     Raises:
         DataError: ``out`` is a folder.
         MachineError: its folder cannot be made.
     """
     if out.is_dir():
-        raise DataError(f"Expected a file to write the picture to, actual the folder {out}; name a file in it.")
+        raise DataError(f"expected a file to write the picture to, got the folder {out}; name a file in it.")
     make_folder(out.parent)
 
 
@@ -49,13 +49,15 @@ def draw(comparison: Comparison, out: Path) -> None:
 
 def picture(comparison: Comparison) -> Figure:
     """The figure: column heads are the sources' names, row heads say what is counted; every row has one scale."""
-    names, rows = list(comparison.sources), shown(comparison)
-    figure = Figure((1.5 + CELL[0] * len(names), 0.7 + CELL[1] * len(rows)), layout="constrained", facecolor="white")
+    names, rows = list(comparison.sources), picture_rows(comparison)
+    figure = Figure(
+        (1.5 + CELL_SIZE[0] * len(names), 0.7 + CELL_SIZE[1] * len(rows)), layout="constrained", facecolor="white"
+    )
     grid = figure.subplots(len(rows), len(names), squeeze=False)
     run_colours = dict(zip(comparison.runs, (RUNS[i % len(RUNS)] for i in range(len(comparison.runs))), strict=True))
     labels: dict[Axes, Sequence[int | str]] = {}
     for i, row in enumerate(rows):
-        bins = 1 + max(int(np.flatnonzero(share >= SMALL).max(initial=0)) for share in row.shares.values())
+        bins = 1 + max(int(np.flatnonzero(share >= MIN_SHARE).max(initial=0)) for share in row.shares.values())
         highest = max(share.max() for share in row.shares.values())
         for j, name in enumerate(names):
             axes = grid[i, j]
@@ -70,23 +72,23 @@ def picture(comparison: Comparison) -> Figure:
             textwrap.fill(row.label, 16), rotation=0, ha="right", va="center", fontsize=9, labelpad=8, color=INK
         )
     figure.draw_without_rendering()  # which lays it out
-    for axes, each in labels.items():
-        label_bins(axes, each)
+    for axes, names in labels.items():
+        label_bins(axes, names)
     return figure
 
 
-def shown(comparison: Comparison) -> list[Row]:
+def picture_rows(comparison: Comparison) -> list[Row]:
     """The rows of the picture: parents by rank, not pooled, and only ranks that the reference has; where there are many
     classes, their shares alone."""
-    pooled = {label(relation, g) for relation in comparison.sources[PRIOR].nested for g in (ALL, OTHERS)}
+    pooled = {group_label(relation, g) for relation in comparison.sources[PRIOR].nested for g in (ALL, OTHERS)}
     reference, C = comparison.reference, len(comparison.classes)
-    each = {row.label: row for row in comparison.rows()}.values()  # how many parents there are, once
-    rows = [row for row in each if row.label not in pooled and (not reference or reference in row.shares)]
-    return rows if C <= SEPARATE else [rows[0], comparison.shares_of_classes(), *rows[1 + C :]]
+    unique = {row.label: row for row in comparison.rows()}.values()  # how many parents there are, once
+    rows = [row for row in unique if row.label not in pooled and (not reference or reference in row.shares)]
+    return rows if C <= MAX_CLASS_ROWS else [rows[0], comparison.shares_of_classes(), *rows[1 + C :]]
 
 
 def _head(name: str) -> str:
-    return "estimate, no labels" if name == ESTIMATE else name
+    return {ESTIMATE: "estimate, no labels", START: "initialisation"}.get(name, name)
 
 
 def _cell(axes: Axes, row: Row, name: str, reference: str | None, colour: str, bins: int, highest: float) -> None:
@@ -94,9 +96,9 @@ def _cell(axes: Axes, row: Row, name: str, reference: str | None, colour: str, b
     if name in row.shares:
         share = row.shares[name][:bins]
         axes.bar(np.arange(len(share)), share, 0.86, color=colour)
-        said = [f"mean {row.means[name]:.2f}"] if name in row.means else []
-        said += [f"TV {row.apart[name]:.3f}"] if name in row.apart else []
-        axes.set_title("   ".join(said), loc="right", fontsize=7.5, color=INK, pad=3)
+        figures = [f"mean {row.means[name]:.2f}"] if name in row.means else []
+        figures += [f"TV {row.total_variation[name]:.3f}"] if name in row.total_variation else []
+        axes.set_title("   ".join(figures), loc="right", fontsize=7.5, color=INK, pad=3)
     else:
         axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", va="center", fontsize=8, color=INK)
     if known is not None and reference is not None and name != reference:

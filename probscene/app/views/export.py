@@ -26,9 +26,9 @@ def view(model_or_run: str, out: Path, num: int = 1, seed: int = 0, assets: Path
     """
     out = Path(out)
     if out.suffix not in SUFFIXES or out.is_dir():
-        raise DataError(f"Expected a file with the suffix {' or '.join(SUFFIXES)}, actual {out}; name one.")
+        raise DataError(f"expected a file with the suffix {' or '.join(SUFFIXES)}, got {out}; name one.")
     if num < 1 or (num > 1 and out.suffix == ".glb"):
-        raise ProbsceneError(f"Expected a positive number of scenes, one in a .glb, actual {num}.")
+        raise ProbsceneError(f"expected a positive number of scenes, one in a .glb, got {num}.")
     model, policy = opened(model_or_run, assets)
     with chunk_randomness(seed, 0):  # the first scenes of "preview" with this seed
         scenes = sample(model, policy, num)
@@ -41,6 +41,4 @@ def view(model_or_run: str, out: Path, num: int = 1, seed: int = 0, assets: Path
 
         write_gltf(out, scenes.drawing, 0, model.canvas)
     else:
-        raise DataError(
-            f"Expected a model in 3D for {out.name}, actual {model.name!r}, which draws sprites; write .rrd."
-        )
+        raise DataError(f"expected a model in 3D for {out.name}, got {model.name!r}, which draws sprites; write .rrd.")

@@ -32,10 +32,10 @@ def preview(
         MachineError: it cannot be written.
     """
     if num < 1:
-        raise ProbsceneError(f"Expected a positive number of images, actual {num}.")
+        raise ProbsceneError(f"expected a positive number of images, got {num}.")
     out = Path(out)
     if out.is_dir():
-        raise DataError(f"Expected a file to write the picture to, actual the folder {out}; name a file in it.")
+        raise DataError(f"expected a file to write the picture to, got the folder {out}; name a file in it.")
     model, policy = opened(model_or_run, assets)
     batch = scenes(model, policy, num, seed)
     images = pixels(batch.image)
@@ -57,7 +57,7 @@ def opened(model_or_run: str, assets: Path | None = None) -> tuple[SceneModel, P
     if is_run(model_or_run):
         if assets is not None:
             raise ProbsceneError(
-                f"Expected a model with --assets, actual the run {model_or_run}, which is drawn with what it was "
+                f"expected a model with --assets, got the run {model_or_run}, which is drawn with what it was "
                 "fitted with; leave --assets out."
             )
         run = RunFolder.at(Path(model_or_run))

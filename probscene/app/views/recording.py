@@ -32,7 +32,7 @@ def write_recording(path: Path, model: SceneModel, derivation: Derivation, drawi
         import rerun as rr
     except ImportError as error:
         raise MachineError(
-            "Expected the package rerun-sdk, which recordings are made with, actual none; install it with "
+            "expected the package rerun-sdk, which recordings are made with, got none; install it with "
             "pip install 'probscene[view]'."
         ) from error
     kinds = model.grammar.kinds

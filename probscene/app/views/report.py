@@ -20,28 +20,28 @@ from probscene.sampling import sample
 from probscene.threads import threads
 
 from ..chunks import chunk_randomness
+from ..evaluation.diagnose import FitDiagnostics, diagnose
 from ..evaluation.evaluate import Evaluation, evaluate
-from ..evaluation.judge import Judged, judge
 from ..evaluation.labels import read_labels
+from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
 from ..evaluation.sources import ESTIMATE, READ, START
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
-from ..fitting.fit import open_target
+from ..fitting.pipeline import open_target
 from ..fitting.run import RunFolder
-from ..fitting.storage import OTHER, timing
-from ..judging.looked import LEARNT, PRIOR, STRUCTURE, policies
+from ..fitting.store import OTHER, timing
 from ..pictures import Pixels, grid, pixels, shrunk
 from ..progress import STAGES, Display
 from . import charts, tables, verdict_text
 from .preview import scenes
 
-SAMPLES = 8  # images a row
+IMAGES_PER_ROW = 8
 SITES = (
     "Skill is the share of a site's variance that is read in renders. A site's value is given as its place in the "
     "prior, 0 to 1. Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt "
-    "from; the floor is that of two halves of it."
+    "from; the noise floor is that of two halves of it."
 )
-SHOWN, VALUES_OF = (0.05, 0.5, 0.95), 1000  # quantiles of a site of the scene, and scenes that they are of
+QUANTILES, QUANTILE_SCENES = (0.05, 0.5, 0.95), 1000  # of a site of the scene
 VALUES = "Of sites of the scene the last columns have quantiles of their values, in the program's units."
 OF_SITES = {
     "prior": "read in renders with the prior's parameters",
@@ -50,7 +50,7 @@ OF_SITES = {
 }
 LEGEND = {
     "prior": "prior",
-    "start": "start: where the fit set out",
+    START: "initialisation: the policy that the guide was pretrained on",
     "learnt": "learnt",
     "truth": "truth (labels)",
     READ: "read: what the feature network counts in learnt renders",
@@ -74,7 +74,7 @@ def report(
         out: ``report.html`` in the run folder where None.
         labels: of the run's target, see ``read_labels``.
         num: structures sampled a source.
-        judged_by: scenes rendered for the verdict, none where 0; see ``judge``.
+        judged_by: scenes rendered for the verdict, none where 0; see ``diagnose``.
         visible: see ``evaluate``.
         some_labels: labels need not cover all images.
 
@@ -96,8 +96,8 @@ def report(
         absent = str(error)
     truth = None if labels is None or images is None else read_labels(labels, run.model, images, some_labels)
     evaluation = evaluate(run, images, truth, show, num, visible=visible)
-    judged = judge(run, images, show, judged_by, evaluation) if images and judged_by != 0 else None
-    return write(run, evaluation, images, out, absent, judged)
+    diagnostics = diagnose(run, images, show, judged_by, evaluation) if images and judged_by != 0 else None
+    return write(run, evaluation, images, out, absent, diagnostics)
 
 
 def write(
@@ -106,7 +106,7 @@ def write(
     images: Images | None,
     out: Path | None = None,
     absent: str = "",
-    judged: Judged | None = None,
+    diagnostics: FitDiagnostics | None = None,
 ) -> Path:
     """``report`` from what is known already; ``absent`` says why there are no target images."""
     out = Path(out) if out is not None else run.path / "report.html"
@@ -121,7 +121,7 @@ def write(
             subtitle=html.escape(
                 f"Run {run.path.resolve()}, {target}, seed {record['seed']}, version {record['version']}"
             ),
-            trust=_trust(judged, images),
+            trust=_verdict(diagnostics, images),
             headline=_headline(evaluation),
             samples=_samples(run, images, absent),
             sites=_sites(run),
@@ -140,16 +140,16 @@ def write(
     return out
 
 
-def _trust(judged: Judged | None, images: Images | None) -> str:
-    if judged is None or images is None:
+def _verdict(found: FitDiagnostics | None, images: Images | None) -> str:
+    if found is None or images is None:
         return "<p>There is no verdict: no scenes were rendered to compare with target images.</p>"
-    if judged.trust is None:
-        return verdict_text.section(judged, "", "")
-    real = [pixels(images.load(i)[None])[0] for i in judged.real_unmatched]
+    if found.structure is None:
+        return verdict_text.section(found, "", "")
+    real = [pixels(images.load(i)[None])[0] for i in found.real_uncovered]
     return verdict_text.section(
-        judged,
-        _picture(real, f"Target images least like any generated scene: {', '.join(judged.names)}"),
-        _picture(list(judged.generated_unmatched), "Generated scenes least like any target image"),
+        found,
+        _picture(real, f"Target images least like any generated scene: {', '.join(found.names)}"),
+        _picture(list(found.generated_uncovered), "Generated scenes least like any target image"),
     )
 
 
@@ -158,30 +158,30 @@ def _headline(evaluation: Evaluation) -> str:
     for b, found in evaluation.distances().items():
         to = "to the truth" if b == "truth" else "to the network's estimate"
         for key, what in (("number", "number of objects"), ("classes", "classes")):
-            figures = " → ".join(_figure(each[key]) for each in found.values())
+            figures = " → ".join(_figure(distances[key]) for distances in found.values())
             rows.append(f'<div class="card">{what}, {to}<b>{figures}</b></div>')
-    walls = "".join(f"<p>{html.escape(text)}</p>" for text in (*evaluation.kept, *evaluation.warnings))
+    warnings = "".join(f"<p>{html.escape(text)}</p>" for text in (*evaluation.kept, *evaluation.warnings))
     if not rows:
-        return f"<p>There are neither labels nor an estimate to compare with.</p>{walls}"
-    start = ", of the start, from which the fit set out" if START in evaluation.sources else ""
-    note = f"Total variation: of the prior{start}, and of what was learnt."
-    return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>{walls}'
+        return f"<p>There are neither labels nor an estimate to compare with.</p>{warnings}"
+    initialisation = ", of the initialisation" if START in evaluation.sources else ""
+    note = f"Total variation: of the prior{initialisation}, and of what was learnt."
+    return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>{warnings}'
 
 
 def _samples(run: RunFolder, images: Images | None, absent: str) -> str:
     """A row of images of each source."""
     found = policies(run)
     order = [name for name in (PRIOR, STRUCTURE, LEARNT) if name in found]
-    rows = {name: pixels(scenes(run.model, found[name], SAMPLES, 0).image) for name in order}
-    parts = [_picture(pictures, said(run, name), SAMPLES) for name, pictures in rows.items()]
+    rows = {name: pixels(scenes(run.model, found[name], IMAGES_PER_ROW, 0).image) for name in order}
+    parts = [_picture(pictures, source_caption(run, name), IMAGES_PER_ROW) for name, pictures in rows.items()]
     if images is None:
         return "".join([*parts, f"<p>{html.escape(absent or 'The target images were not read.')}</p>"])
-    spread = torch.linspace(0, len(images) - 1, min(SAMPLES, len(images))).long().tolist()
+    spread = torch.linspace(0, len(images) - 1, min(IMAGES_PER_ROW, len(images))).long().tolist()
     some = [pixels(images.load(i)[None])[0] for i in spread]
-    return "".join([*parts, _picture(some, "Target: some of the images", SAMPLES)])
+    return "".join([*parts, _picture(some, "Target: some of the images", IMAGES_PER_ROW)])
 
 
-def said(run: RunFolder, source: str) -> str:
+def source_caption(run: RunFolder, source: str) -> str:
     """What a source of scenes is, in words."""
     if source == LEARNT and STRUCTURE in policies(run):
         return "Structure and parameters: all that was learnt"
@@ -200,8 +200,8 @@ def _sites(run: RunFolder) -> str:
     sites, values = record["sites"], scene_values(run)
     is_read = any(site["skill"] is not None or "read" in site for site in sites)
     head = ["site", "of", ""]
-    head += ["skill", "prior", "this fit", "floor", "read in renders and target, 0 to 1"] if is_read else []
-    head += [f"{name}: {', '.join(f'{q:.0%}' for q in SHOWN)}" for name in ("prior", "learnt")] if values else []
+    head += ["skill", "prior", "this fit", "noise floor", "read in renders and target, 0 to 1"] if is_read else []
+    head += [f"{name}: {', '.join(f'{q:.0%}' for q in QUANTILES)}" for name in ("prior", "learnt")] if values else []
     rows = []
     for site in sites:
         what = f"keeps the prior: {site['because']}"
@@ -224,27 +224,27 @@ def _sites(run: RunFolder) -> str:
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     kept = _not_kept(record) if any(site["learnt"] for site in sites) and record["kept"] != "learnt" else ""
     legend = f'<p class="legend">{_legend(OF_SITES)}</p>' if is_read else ""
-    said = " ".join([*([SITES] if is_read else []), *([VALUES] if values else [])])
-    return f'{kept}{legend}<div class="chart"><table><tr>{first}</tr>{body}</table></div><p class="soft">{said}</p>'
+    notes = " ".join([*([SITES] if is_read else []), *([VALUES] if values else [])])
+    return f'{kept}{legend}<div class="chart"><table><tr>{first}</tr>{body}</table></div><p class="soft">{notes}</p>'
 
 
 def scene_values(run: RunFolder) -> dict[str, tuple[list[float], list[float] | None]]:
-    """Of each site with one value a scene, quantiles ``SHOWN`` in scenes of the prior and of the fit; None where the
-    latter has the prior's parameters."""
+    """Of each site with one value a scene, quantiles ``QUANTILES`` in scenes of the prior and of the fit; None where
+    the latter has the prior's parameters."""
     sites = {site["name"] for site in run.parameters["sites"] if not site["kinds"]}
     found: list[dict[str, list[float]]] = []
     for policy in (run.model.prior, run.guide) if sites else ():
         if policy.suits is None and found:
             break
         with torch.no_grad(), threads(1), chunk_randomness(0, 0):
-            scenes = sample(run.model, policy, VALUES_OF, density=False)
+            scenes = sample(run.model, policy, QUANTILE_SCENES, density=False)
         values: dict[str, list[Tensor]] = {}
         for name, value in scenes.parameters.items():
             own, mask = site_name(run.model.grammar, name), scenes.site_mask[name]
             one = own in sites and value.shape == mask.shape and mask.any() and mask.sum(1).max() == 1
             if one and value.is_floating_point():
                 values.setdefault(own, []).append(value[mask])
-        at = torch.tensor(SHOWN)
+        at = torch.tensor(QUANTILES)
         found.append({name: torch.cat(some).float().quantile(at).tolist() for name, some in values.items()})
     after = found[1] if len(found) > 1 else {}
     return {name: (before, after.get(name)) for name, before in found[0].items()} if found else {}
@@ -295,7 +295,7 @@ def _nested(evaluation: Evaluation) -> str:
 def _figures(evaluation: Evaluation) -> str:
     """Every table of the evaluation that the charts do not hold."""
     parts = []
-    compared = *tables.apart(evaluation, spread=True), *tables.nested(evaluation, spread=True)
+    compared = *tables.distances(evaluation, spread=True), *tables.nested(evaluation, spread=True)
     for table in (*compared, *tables.errors(evaluation), *tables.likelihoods(evaluation), *tables.images(evaluation)):
         head = [str(column.header).replace(" *", "") for column in table.columns]
         rows = list(zip(*(column.cells for column in table.columns), strict=True))

@@ -2,23 +2,27 @@
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 
-from probscene.inference.judging.metrics import Histogram, histogram_interval, ranges
-from probscene.inference.judging.tally import Interval, Tally
+from probscene.inference.statistics.count_metrics import Histogram, Interval, Tally, bin_ranges, histogram_interval
 
 from ..evaluation.compare import Comparison, Row
 from ..evaluation.evaluate import Evaluation
+from ..evaluation.image_distances import caveat
 from ..evaluation.likelihood import Likelihood
-from ..evaluation.sources import ESTIMATE, FITTED, READ, Source
-from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, label
+from ..evaluation.sources import ESTIMATE, READ, SAMPLED_SOURCES, START, Source
+from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, group_label
 
-NAMES = {name: name for name in ("prior", "start", "learnt", "truth")} | {READ: "read *", ESTIMATE: "estimate *"}
+if TYPE_CHECKING:
+    from probscene.inference.statistics.image_metrics import ImageDistance  # torchmetrics takes seconds to import
+
+NAMES = {START: "initialisation", READ: "read *", ESTIMATE: "estimate *", "floor": "noise floor"}
+"""Sources whose names are others on the screen than in records."""
 FOOTNOTE = (
     "* An estimate without labels: what the feature network counts in the target's images, rounded; not the truth. It "
     "is compared with what the same network reads in renders."
@@ -26,19 +30,23 @@ FOOTNOTE = (
 LEGEND = "TV: total variation, 0 to 1. W-1: Wasserstein-1, in objects."
 
 ALL_OBJECTS, SHARES = "all objects", "class shares"
-WIDEST, ROOMY = 1000, 140  # characters; and so many that distances have room for their intervals
-WORDS = {"truth": "the truth", "estimate": "what the feature network sees *"}
-FLOOR = "The floor is what two halves of the target are apart. FID depends on the number of images, KID does not."
+MAX_WIDTH = 1000  # characters
+MIN_WIDTH_FOR_INTERVALS = 140  # characters
+REFERENCES = {"truth": "the truth", "estimate": "what the feature network reads *"}
+FLOOR = (
+    "The noise floor is the distance of two halves of the target. FID depends on the number of images, KID does not."
+)
 
 
 def show(evaluation: Evaluation, console: Console) -> None:
     """Print the distances, then the histograms in percent with half the width of their 95 % intervals."""
-    roomy = console.width >= ROOMY
-    more = (*errors(evaluation), *nested(evaluation, roomy), *likelihoods(evaluation), *images(evaluation))
-    for table in (*apart(evaluation, roomy), _numbers(evaluation), _classes(evaluation), *more):
+    spread = console.width >= MIN_WIDTH_FOR_INTERVALS
+    more = (*errors(evaluation), *nested(evaluation, spread), *likelihoods(evaluation), *images(evaluation))
+    for table in (*distances(evaluation, spread), _numbers(evaluation), _classes(evaluation), *more):
         _print(table, console)
         console.print()
-    notes = {figure.note for each in evaluation.images.values() for found in each.values() for figure in found} - {""}
+    distances_of_images = (one for of in evaluation.images.values() for found in of.values() for one in found)
+    caveats = {caveat(one) for one in distances_of_images} - {""}
     if "estimate" in evaluation.sources:
         console.print(FOOTNOTE, style="dim", soft_wrap=True)
     for line in evaluation.readings:
@@ -47,33 +55,33 @@ def show(evaluation: Evaluation, console: Console) -> None:
         console.print(FLOOR, style="dim", soft_wrap=True)
     for note in evaluation.notes:
         console.print(f"Note: {note}", style="dim", soft_wrap=True)
-    for note in sorted(notes):
+    for note in sorted(caveats):
         console.print(f"Mind: {note}.", style="dim", soft_wrap=True)
     for warning in (*evaluation.kept, *evaluation.warnings):
         console.print(warning, soft_wrap=True)
 
 
-def apart(evaluation: Evaluation, spread: bool = False) -> list[Table]:
-    """``distances`` with the means of every source."""
+def distances(evaluation: Evaluation, spread: bool = False) -> list[Table]:
+    """``distance_tables`` with the means of every source."""
     measured = evaluation.distances()
     means = {
         b: {
             name: {ALL_OBJECTS: float(source.total.mean())}
             | {kind: found.mean() for kind, found in zip(evaluation.classes, source.kinds, strict=True)}
-            for name, source in evaluation.beside(b).items()
+            for name, source in evaluation.compared_with(b).items()
         }
         for b in measured
     }
-    for each in means.get(ESTIMATE, {}).values():
-        each |= dict.fromkeys((ALL_OBJECTS, *evaluation.unread) if evaluation.unread else ())
-    return distances(measured, means, spread)
+    for of_source in means.get(ESTIMATE, {}).values():
+        of_source |= dict.fromkeys((ALL_OBJECTS, *evaluation.unread) if evaluation.unread else ())
+    return distance_tables(measured, means, spread)
 
 
-def distances(
+def distance_tables(
     measured: dict[str, Any], means: Mapping[str, Mapping[str, Mapping[str, Any]]] | None = None, spread: bool = False
 ) -> list[Table]:
-    """How far prior, start and learnt structures are from the truth and from the estimate: a table each, with a row for
-    all objects, one for each class's count, and one for the classes' shares.
+    """Distances of prior, initialisation and learnt structures from the truth and from the estimate: a table each, with
+    a row for all objects, one for each class's count, and one for the classes' shares.
 
     Args:
         measured: ``Evaluation.distances()``.
@@ -83,13 +91,13 @@ def distances(
     tables = []
     for b, found in measured.items():
         shown = () if means is None else (*found, b)
-        table = _distances(f"Distance to {WORDS[b]}", found, shown, "" if tables else LEGEND)
+        table = _distances(f"Distance to {REFERENCES[b]}", found, shown, "" if tables else LEGEND)
         kinds = {kind: [_both(each["kinds"][kind]) for each in found.values()] for kind in found["learnt"]["kinds"]}
         rows = {ALL_OBJECTS: [(each["number"], each["number_wasserstein"]) for each in found.values()]}
         if len(kinds) > 1:  # one class is all objects
             rows |= kinds | {SHARES: [(each["classes"], None) for each in found.values()]}
-        for words, values in rows.items():
-            _add(table, words, values, [means[b][name].get(words) for name in shown] if means else [], spread)
+        for label, values in rows.items():
+            _add(table, label, values, [means[b][name].get(label) for name in shown] if means else [], spread)
         tables.append(table)
     return tables
 
@@ -101,29 +109,30 @@ def _both(found: dict[str, Any] | None) -> tuple[Interval | None, Interval | Non
 
 def _distances(title: str, sources: Iterable[str], shown: Iterable[str], legend: str = "") -> Table:
     """A table with columns of both distances of some sources, and of the means of those that are shown."""
-    heads = [f"{what}\n{a}" for what in ("TV", "W-1") for a in sources]
-    table = _table(title, "", [*heads, *(f"mean\n{'seen *' if name == ESTIMATE else name}" for name in shown)])
+    heads = [f"{what}\n{NAMES.get(name, name)}" for what in ("TV", "W-1") for name in sources]
+    table = _table(title, "", [*heads, *(f"mean\n{NAMES.get(name, name)}" for name in shown)])
     if legend:
         table.caption, table.caption_justify = legend, "left"
     return table
 
 
-def _add(table: Table, words: str, values: list[tuple[Any, Any]], means: list[Any], spread: bool) -> None:
+def _add(table: Table, label: str, values: list[tuple[Any, Any]], means: list[Any], spread: bool) -> None:
     figures = [pair[i] for i in (0, 1) for pair in values]
-    table.add_row(words, *(_figure(x, 3, spread) for x in figures), *(_figure(x, 2, spread) for x in means))
+    table.add_row(label, *(_figure(x, 3, spread) for x in figures), *(_figure(x, 2, spread) for x in means))
 
 
 def _numbers(evaluation: Evaluation) -> Table:
     sources = evaluation.shown
-    table = _table("Images by number of objects, %", "objects", [NAMES[name] for name in sources])
-    rows = ranges(source.total for source in sources.values())
+    table = _table("Images by number of objects, %", "objects", [NAMES.get(name, name) for name in sources])
+    rows = bin_ranges(source.total for source in sources.values())
     firsts = [first for first, _ in rows]
-    each = [histogram_interval(np.searchsorted(firsts, s.total, "right") - 1, len(rows)) for s in sources.values()]
+    bins = [np.searchsorted(firsts, source.total, "right") - 1 for source in sources.values()]
+    histograms = [histogram_interval(found, len(rows)) for found in bins]
     for k, (first, last) in enumerate(rows):
-        words = str(first) if first == last else f"{first} to {last}"
+        label = str(first) if first == last else f"{first} to {last}"
         if first < last and k == len(rows) - 1:
-            words = f"{first} or more"
-        table.add_row(words, *(_percent(found, k) for found in each))
+            label = f"{first} or more"
+        table.add_row(label, *(_percent(found, k) for found in histograms))
     table.add_section()
     table.add_row("mean", *(f"{source.total.mean():.2f}" for source in sources.values()))
     return table
@@ -131,17 +140,17 @@ def _numbers(evaluation: Evaluation) -> Table:
 
 def _classes(evaluation: Evaluation) -> Table:
     sources = evaluation.shown
-    table = _table("Objects by class, %", "class", [NAMES[name] for name in sources])
-    each = [source.classes() for source in sources.values()]
+    table = _table("Objects by class, %", "class", [NAMES.get(name, name) for name in sources])
+    histograms = [source.classes() for source in sources.values()]
     for c, name in enumerate(evaluation.classes):
-        table.add_row(name, *(_percent(found, c) for found in each))
+        table.add_row(name, *(_percent(found, c) for found in histograms))
     return table
 
 
 def nested_counts(sources: Mapping[str, Source], classes: Sequence[str]) -> dict[str, dict[str, Tally]]:
-    """Where kinds nest, what is counted of them, in words, with the tallies of each source that has such nodes.
+    """Where kinds nest, the tallies of each source that has such nodes, by the label of what is counted.
 
-    What another row says is left out: how many parents there are, where they are a class or have been counted below
+    Duplicates are left out: how many parents there are, where they are a class or have been counted below
     their own one parent; the first parent, where no image has a second; the later ones, where there is one alone.
     """
     found: dict[str, dict[str, Tally]] = {}
@@ -154,7 +163,7 @@ def nested_counts(sources: Mapping[str, Source], classes: Sequence[str]) -> dict
             if not each or (group == PARENTS and relation[0] in classes):
                 continue
             if not any(_same(each, other) for other in before):
-                found.setdefault(label(relation, group), each)
+                found.setdefault(group_label(relation, group), each)
             before += [] if group == PARENTS else [each]
             whole += [(relation[1], each)] if group == ALL else []
     return found
@@ -167,37 +176,38 @@ def _same(each: dict[str, Tally], other: dict[str, Tally]) -> bool:
 
 
 def nested(evaluation: Evaluation, spread: bool = False) -> list[Table]:
-    """Where kinds nest: how far every kind of count is from the truth and from the estimate, and its means; without
+    """Where kinds nest: distances of every kind of count from the truth and from the estimate, and its means; without
     either, the means alone.
 
     Args:
         spread: also half the width of the 95 % intervals.
     """
     tables: list[Table] = []
-    title, fitted = "Counts by what they depend on", [name for name in FITTED if name in evaluation.sources]
-    for b in (name for name in evaluation.sources if name not in FITTED):
-        table = _distances(f"{title}, distance to {WORDS[b]}", fitted, (*fitted, b))
-        for words, each in nested_counts(evaluation.beside(b), evaluation.classes).items():
-            if b in each:
-                found = [each[a].distance(each[b]) if a in each else None for a in fitted]
-                _add(table, words, [x or (None, None) for x in found], [_mean(each, n) for n in (*fitted, b)], spread)
+    title, fitted = "Counts by what they depend on", [name for name in SAMPLED_SOURCES if name in evaluation.sources]
+    for b in (name for name in evaluation.sources if name not in SAMPLED_SOURCES):
+        table = _distances(f"{title}, distance to {REFERENCES[b]}", fitted, (*fitted, b))
+        for name, known in nested_counts(evaluation.compared_with(b), evaluation.classes).items():
+            if b in known:
+                found = [known[a].distance(known[b]) if a in known else None for a in fitted]
+                means = [_mean(known, source) for source in (*fitted, b)]
+                _add(table, name, [x or (None, None) for x in found], means, spread)
         if table.row_count:
             tables.append(table)
     rows = nested_counts(evaluation.sources, evaluation.classes)
     if rows and not tables:
-        table = _table(f"{title}, means", "", fitted)
-        for words, each in rows.items():
-            table.add_row(words, *(_figure(_mean(each, name), 2) for name in fitted))
+        table = _table(f"{title}, means", "", [NAMES.get(name, name) for name in fitted])
+        for label, known in rows.items():
+            table.add_row(label, *(_figure(_mean(known, name), 2) for name in fitted))
         tables.append(table)
     return tables
 
 
-def _mean(each: dict[str, Tally], name: str) -> Interval | None:
-    return each[name].mean() if name in each else None
+def _mean(tallies: dict[str, Tally], name: str) -> Interval | None:
+    return tallies[name].mean() if name in tallies else None
 
 
 def errors(evaluation: Evaluation) -> list[Table]:
-    """With labels, how far the counts read in each image are from them."""
+    """With labels, the errors of the counts read in each image."""
     if not evaluation.errors:
         return []
     table = _table("Counts read in each labelled image", "class", ["mean absolute error", "correlation", "images"])
@@ -211,7 +221,9 @@ def likelihoods(evaluation: Evaluation) -> list[Table]:
     """How likely prior and guide would have derived the truth's structures, where they are known."""
     if not evaluation.likelihoods:
         return []
-    table = _table("log q of the labelled structures, nats a scene", "", list(evaluation.likelihoods))
+    table = _table(
+        "log q of the labelled structures, nats a scene", "", [NAMES.get(name, name) for name in evaluation.likelihoods]
+    )
     table.add_row("mean", *map(_nats, evaluation.likelihoods.values()))
     return [table]
 
@@ -226,18 +238,26 @@ def _nats(found: Likelihood) -> str:
 def images(evaluation: Evaluation) -> list[Table]:
     """KID and FID, a table for each network, where they were measured."""
     tables = []
-    for name, each in evaluation.images.items():
-        table = _table(f"Distance of images in the features of {name}", "", list(each))
-        for figures in zip(*each.values(), strict=True):
-            title = f"{figures[0].name}, {figures[0].of_images}"
-            table.add_row(title, *(_short(figure, figures[0].of_images) for figure in figures))
+    for name, sources in evaluation.images.items():
+        heads = [NAMES.get(source, source) for source in sources]
+        table = _table(f"Distance of images in the features of {name}", "", heads)
+        for found in zip(*sources.values(), strict=True):
+            sizes = sample_sizes(found[0])
+            table.add_row(f"{found[0].name}, {sizes}", *(_image_distance(one, sizes) for one in found))
         tables.append(table)
     return tables
 
 
-def _short(figure: Any, of_images: str) -> str:
-    of = "" if figure.of_images == of_images else f" ({figure.of_images})"
-    return f"{figure.value:.4g} ± {(figure.high - figure.low) / 2:.2g}{of}"
+def sample_sizes(found: "ImageDistance") -> str:
+    """How many images a distance is of."""
+    if found.images == found.generated:
+        return f"{found.images} images a side"
+    return f"{found.images} real, {found.generated} generated images"
+
+
+def _image_distance(found: "ImageDistance", sizes: str) -> str:
+    own = sample_sizes(found)
+    return f"{found.value:.4g} ± {(found.high - found.low) / 2:.2g}{'' if own == sizes else f' ({own})'}"
 
 
 def _figure(found: Interval | float | None, digits: int, spread: bool = True) -> str:
@@ -267,7 +287,7 @@ def _print(table: Table, console: Console) -> None:
     for column in table.columns:
         if column.no_wrap:
             column.min_width = max(map(cell_len, (*str(column.header).split("\n"), *map(str, column.cells))))
-    whole = Console(width=WIDEST).measure(table).minimum
+    whole = Console(width=MAX_WIDTH).measure(table).minimum
     Console(file=console.file, width=max(console.width, whole), highlight=False).print(table)
 
 
@@ -283,8 +303,8 @@ def show_comparison(comparison: Comparison, console: Console) -> None:
 def comparison_table(comparison: Comparison) -> Table:
     """A column for each source; in each cell the distances to the reference, and the mean in brackets."""
     reference = comparison.reference
-    what = "Means" if reference is None else f"TV and W-1 to {WORDS[reference]}, and (means)"
-    table = Table(title=what, title_justify="left", title_style="bold")
+    title = "Means" if reference is None else f"TV and W-1 to {REFERENCES[reference]}, and (means)"
+    table = Table(title=title, title_justify="left", title_style="bold")
     if reference is not None:
         table.caption, table.caption_justify = LEGEND, "left"
     table.add_column("", no_wrap=True)
@@ -303,5 +323,5 @@ def comparison_table(comparison: Comparison) -> Table:
 
 
 def _compared(row: Row, name: str) -> str:
-    figures = [f"{found[name]:.3f}" for found in (row.apart, row.moved) if name in found]
+    figures = [f"{found[name]:.3f}" for found in (row.total_variation, row.wasserstein) if name in found]
     return " ".join(figures + ([f"({row.means[name]:.2f})"] if name in row.means else [])) or "-"

@@ -7,18 +7,18 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from probscene.inference.judging.trust import Trust
-from probscene.inference.judging.two_sample import Apart
-from probscene.inference.judging.verdict import Gap
+from probscene.inference.statistics.energy import EnergyTest
+from probscene.inference.statistics.verdict import StructureStatistics, Uncovered
 
-from ..evaluation.judge import Judged
-from ..judging.aspects import ABSENT
-from ..judging.looked import LEARNT, PRIOR, STRUCTURE
+from ..evaluation.components import ABSENT
+from ..evaluation.diagnose import FitDiagnostics
+from ..evaluation.explain import percent
+from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE
 
-HEAD = ("", "this fit", "the floor")
-FLOOR = "The floor is what chance alone leaves between two halves of the real images."
-PARTS = ("", "verdict", "this fit", "structure alone", "prior", "the floor")
-DISTANCES = (LEARNT, STRUCTURE, PRIOR, "floor")
+STATISTICS_HEAD = ("", "this fit", "noise floor")
+FLOOR = "The noise floor is the distance between two halves of the real images."
+PARTS_HEAD = ("", "verdict", "this fit", "structure alone", "prior", "noise floor")
+DISTANCES = (LEARNT, STRUCTURE, PRIOR)
 OVERALL = (
     "Energy distances from the target: of the run's features, of where objects stand in images with as many of them, "
     "and of EfficientNet's features; sizes are medians of boxes. The whole is as good as its worst part. "
@@ -26,72 +26,73 @@ OVERALL = (
 )
 
 
-def show(judged: Judged, console: Console) -> None:
+def show(found: FitDiagnostics, console: Console) -> None:
     """Print the verdict, why, what to do, its parts, what the labels say, and the figures of structure."""
-    record = judged.record()
+    record = found.record()
     show_parts(record, console)
-    if judged.trust is None:
+    if found.structure is None:
         return
-    for text in _sentences(judged):
+    for text in _sentences(found):
         console.print(text, soft_wrap=True)
-    table = Table(title="Can this structure be trusted? Without labels", title_justify="left", title_style="bold")
-    for name in HEAD:
+    table = Table(title="Statistics of structure, without labels", title_justify="left", title_style="bold")
+    for name in STATISTICS_HEAD:
         table.add_column(name, justify="right" if name else "left")
-    for row in rows(judged.trust):
+    for row in rows(found.structure.statistics):
         table.add_row(*row)
     console.print()
     console.print(table)
     console.print(FLOOR, style="dim", soft_wrap=True)
-    if judged.names:
-        console.print(f"Least like any generated scene: {', '.join(judged.names)}.", style="dim", soft_wrap=True)
+    if found.names:
+        console.print(f"Least like any generated scene: {', '.join(found.names)}.", style="dim", soft_wrap=True)
     console.print()
 
 
 def show_parts(record: dict[str, Any], console: Console) -> None:
-    """Print the verdict and its parts, of what ``Judged.record`` gives, as it was kept."""
+    """Print the verdict and its parts, of what ``FitDiagnostics.record`` gives, as it was kept."""
     if record["verdict"] is None:
         console.print(f"No verdict. {record['because']}", soft_wrap=True)
         console.print()
         return
     console.print(f"Verdict: {record['verdict']}.", style="bold", soft_wrap=True)
-    for text in (record["because"], record["remedy"], *judged_by(record)):
+    for text in (record["because"], record["remedy"], *basis(record)):
         console.print(text, soft_wrap=True)
     if "parts" not in record:  # of a run of before
         return
     table = Table(title="Structure, layout and looks", title_justify="left", title_style="bold")
-    for i, name in enumerate(PARTS):
+    for i, name in enumerate(PARTS_HEAD):
         table.add_column(name, justify="left" if i < 2 else "right", no_wrap=i != 1)
     for row in parts(record):
         table.add_row(*row)
     console.print()
     console.print(table)
     console.print(OVERALL, style="dim", soft_wrap=True)
-    for text in (*what_to_do(record), *by_class(record), *sites(record)):
+    for text in (*remedies(record), *by_class(record), *sites(record)):
         console.print(text, soft_wrap=True)
 
 
-def section(judged: Judged, real: str, generated: str) -> str:
+def section(found: FitDiagnostics, real: str, generated: str) -> str:
     """HTML for the report; ``real`` and ``generated`` are its pictures."""
-    record = judged.record()
-    if judged.trust is None or record["verdict"] is None:
-        return f"<p>No verdict. {html.escape(judged.absent)}</p>"
-    said = (record["because"], record["remedy"], *judged_by(record))
-    more = (*what_to_do(record), *by_class(record), *sites(record), *_sentences(judged))
+    record = found.record()
+    if found.structure is None or record["verdict"] is None:
+        return f"<p>No verdict. {html.escape(found.absent)}</p>"
+    head = (record["because"], record["remedy"], *basis(record))
+    more = (*remedies(record), *by_class(record), *sites(record), *_sentences(found))
+    statistics = _table(STATISTICS_HEAD, rows(found.structure.statistics))
     return (
-        f'<div class="card">Verdict<b>{html.escape(record["verdict"])}</b></div>{_paragraphs(said)}'
-        f'{_table(PARTS, parts(record))}<p class="soft">{OVERALL}</p>{_paragraphs(more)}'
-        f'<div class="row two">{real}{generated}</div><h3>Structure</h3>{_table(HEAD, rows(judged.trust))}'
+        f'<div class="card">Verdict<b>{html.escape(record["verdict"])}</b></div>{_paragraphs(head)}'
+        f'{_table(PARTS_HEAD, parts(record))}<p class="soft">{OVERALL}</p>{_paragraphs(more)}'
+        f'<div class="row two">{real}{generated}</div><h3>Structure</h3>{statistics}'
     )
 
 
-def judged_by(record: dict[str, Any]) -> list[str]:
-    """Which images a verdict is about; nothing for those of before."""
-    if not (basis := record.get("basis")):
+def basis(record: dict[str, Any]) -> list[str]:
+    """The images that a verdict is about; nothing in records of earlier versions."""
+    if not (known := record.get("basis")):
         return []
-    images, folder, scenes = basis["images"], basis["folder"], basis["scenes"]
+    images, folder, scenes = known["images"], known["folder"], known["scenes"]
     which = (
         f"the {images} images that it was fitted to"
-        if basis["fitted_to"]
+        if known["fitted_to"]
         else f"{images} images that it was not fitted to, in {folder}"
     )
     return [f"Judged by {which}, {scenes} scenes of the fit and as many of the prior."]
@@ -99,18 +100,18 @@ def judged_by(record: dict[str, Any]) -> list[str]:
 
 def parts(record: dict[str, Any]) -> list[tuple[str, ...]]:
     """A row for each part: what, its verdict, and distances from the target."""
-    found = []
+    rows = []
     for name, part in record["parts"].items():
         distances = part.get("distances", {})
-        each = (f"{distances[key]:.3g}" if key in distances else "-" for key in DISTANCES[:-1])
+        cells = (f"{distances[key]:.3g}" if key in distances else "-" for key in DISTANCES)
         floor = f"up to {distances['floor']:.3g}" if distances else "-"
-        found.append((name, part["verdict"], *each, floor))
-    return found
+        rows.append((name, part["verdict"], *cells, floor))
+    return rows
 
 
-def what_to_do(record: dict[str, Any]) -> list[str]:
-    """Of the parts that the verdict is not called by and that are not good: why, and what to do that was not said.
-    Structure, with the difference that would be seen, and sizes have their figures in any case."""
+def remedies(record: dict[str, Any]) -> list[str]:
+    """Of the parts that do not give the verdict and that are not good: why, and what else to do. Structure, with the
+    difference that would be detected, and sizes have their figures in any case."""
     return [
         f"{name.capitalize()}: {part['because']} {part['remedy'].removeprefix(record['remedy']).strip()}".strip()
         for name, part in record["parts"].items()
@@ -120,63 +121,63 @@ def what_to_do(record: dict[str, Any]) -> list[str]:
 
 def by_class(record: dict[str, Any]) -> list[str]:
     """For which classes counts and layout can be used, a sentence each; none for models of one class."""
-    classes, said = record["classes"], []
+    classes, sentences = record["classes"], []
     if len(classes) < 2:
         return []
     for what in ("counts", "layout"):
-        words: dict[str, list[str]] = {}
-        for name, each in classes.items():
-            words.setdefault(each[what], []).append(name)
-        if set(words) != {ABSENT}:
-            each = "; ".join(f"{word} for {', '.join(names)}" for word, names in words.items())
-            said.append(f"{what.capitalize()} by class: {each}.")
-    return said
+        by_grade: dict[str, list[str]] = {}
+        for name, grades in classes.items():
+            by_grade.setdefault(grades[what], []).append(name)
+        if set(by_grade) != {ABSENT}:
+            text = "; ".join(f"{grade} for {', '.join(names)}" for grade, names in by_grade.items())
+            sentences.append(f"{what.capitalize()} by class: {text}.")
+    return sentences
 
 
 def sites(record: dict[str, Any]) -> list[str]:
     """The sites that keep the prior, and why."""
-    whys: dict[str, list[str]] = {}
-    for name, because in record["sites_not_learnt"].items():
-        whys.setdefault(because, []).append(name)
-    each = "; ".join(f"{', '.join(names)}, as {because}" for because, names in whys.items())
-    return [f"Sites that keep the prior: {each}."] if each else []
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in record["sites_not_learnt"].items():
+        by_reason.setdefault(reason, []).append(name)
+    text = "; ".join(f"{', '.join(names)}, as {reason}" for reason, names in by_reason.items())
+    return [f"Sites that keep the prior: {text}."] if text else []
 
 
-def rows(found: Trust) -> list[tuple[str, ...]]:
-    """The figures of structure: what, of this fit, and the floor."""
-    x = found.figures
-    lost = x.modes.lost
-    shares = f"{int(lost.sum())} of {len(lost)}, {_percent(float(x.modes.real[lost].sum()))} of real"
-    looks = "looks" if x.by_appearance else "features"
+def rows(x: StructureStatistics) -> list[tuple[str, ...]]:
+    """The statistics of structure: name, of this fit, and the noise floor."""
+    collapsed = x.modes.collapsed
+    shares = f"{int(collapsed.sum())} of {len(collapsed)}, {percent(float(x.modes.real[collapsed].sum()))} of real"
+    looks = "looks" if x.by_patches else "features"
+    farthest = x.feature_names[x.marginal.feature]
     out = [
-        ("energy distance, all features", *_apart(x.joint)),
-        (f"energy distance, {x.names[x.single.worst]} (the farthest)", *_apart(x.single.largest, 1.0)),
+        ("energy distance, all features", *_energy(x.joint)),
+        (f"energy distance, {farthest} (the farthest)", *_energy(x.marginal.largest, 1.0)),
     ]
     if x.from_prior is not None:
-        out.append(("energy distance of generated and prior", *_apart(x.from_prior)))
+        out.append(("energy distance of generated and prior", *_energy(x.from_prior)))
     detectable = "-" if x.difference.detectable is None else f"{x.difference.detectable:.2f}"
     out += [
-        ("total variation of one feature that would be seen", detectable, ""),
+        ("detectable total variation of one feature", detectable, ""),
         ("p-value, all images", f"{x.p_value:.3f}", ""),
-        ("real like no generated", *_gap(x.real_unmatched)),
-        ("real like no generated or prior", *_gap(x.real_out_of_support)),
-        ("generated like no real", *_gap(x.generated_unmatched)),
-        ("clusters lost", shares, "0"),
-        (f"real of another domain, by {looks}", _percent(x.foreign), "50.0 %"),
-        ("effective sample size / N", f"{x.effective:.2f}", f"{x.effective_floor:.2f}"),
+        ("real like no generated", *_uncovered(x.real_uncovered)),
+        ("real like no generated or prior", *_uncovered(x.real_out_of_support)),
+        ("generated like no real", *_uncovered(x.generated_uncovered)),
+        ("collapsed clusters", shares, "0"),
+        (f"real images with a domain shift, by {looks}", percent(x.domain_shift_share), "50.0 %"),
+        ("effective sample size / N", f"{x.ess_fraction:.2f}", f"{x.ess_fraction_floor:.2f}"),
     ]
     for name in ("precision", "recall", "density", "coverage"):
         out.append((name, f"{getattr(x.fidelity, name):.2f}", f"{getattr(x.fidelity_floor, name):.2f}"))
     return out
 
 
-def _sentences(judged: Judged) -> list[str]:
+def _sentences(found: FitDiagnostics) -> list[str]:
     """What else is known: which classes can be read, what labels say, what the model is too narrow for."""
-    found = [judged.usable] if judged.usable else []
-    if judged.agreement is not None and judged.trust is not None:
-        said = judged.agreement.sentence(judged.trust.verdict)
-        found += [] if said.startswith(judged.record()["because"]) else [said]
-    return [*found, judged.walls] if judged.walls else found
+    sentences = [found.usable] if found.usable else []
+    if found.agreement is not None and found.structure is not None:
+        text = found.agreement.sentence(found.structure.verdict)
+        sentences += [] if text.startswith(found.record()["because"]) else [text]
+    return [*sentences, found.prior_warning] if found.prior_warning else sentences
 
 
 def _paragraphs(texts: Iterable[str]) -> str:
@@ -189,15 +190,11 @@ def _table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
     return f'<div class="chart"><table><tr>{first}</tr>{rest}</table></div>'
 
 
-def _apart(found: Apart, unit: float | None = None) -> tuple[str, str]:
+def _energy(found: EnergyTest, unit: float | None = None) -> tuple[str, str]:
     unit = unit or found.floor or 1.0
     return f"{found.distance / unit:.2f} floors", f"{found.low / unit:.2f} to {found.high / unit:.2f}"
 
 
-def _gap(found: Gap) -> tuple[str, str]:
+def _uncovered(found: Uncovered) -> tuple[str, str]:
     spread = 50 * (found.high - found.low)
-    return f"{100 * found.share:.1f} ± {spread:.1f} %", f"up to {_percent(found.floor)}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
+    return f"{100 * found.share:.1f} ± {spread:.1f} %", f"up to {percent(found.floor)}"

@@ -93,7 +93,7 @@ def _check_script() -> None:
     file = None if getattr(main, "__spec__", None) is not None else getattr(main, "__file__", None)
     if file is not None and not os.path.isfile(file):
         raise ProbsceneError(
-            f"Expected a script in a file, which worker processes import, actual one from {file}; save it in a file, "
+            f"expected a script in a file, which worker processes import, got one from {file}; save it in a file, "
             f"with the calls that start workers under '{GUARD}', or take one worker."
         )
 
@@ -114,11 +114,11 @@ def _ended(code: int, begun: bool) -> ProbsceneError:
     remedy = f"put the calls that start workers under '{GUARD}', or take one worker."
     if code == UNGUARDED:
         return ProbsceneError(
-            f"Expected a script with a main guard, as worker processes import it, actual one without; {remedy}"
+            f"expected a script with a main guard, as worker processes import it, got one without; {remedy}"
         )
     if code >= 0 and not begun:
         return ProbsceneError(
-            f"Expected a worker process to start, actual one that ended with code {code} while it imported the script; "
+            f"expected a worker process to start, got one that ended with code {code} while it imported the script; "
             f"what it printed stands above. Where the script has no main guard, {remedy}"
         )
     again = "Run the same command again: it goes on where it stopped"

@@ -7,7 +7,7 @@ row gets the ground and is labelled, shaded and cleared for the next scene.
 from ...engine import ti
 from ...kernels.lanes import LANES, floats, whole_lanes, words
 from ...kernels.tone import NOISE, TONED, develop, tone_of
-from .. import tables
+from ..tables import layout
 from . import shading
 from .geometry import draw_instance, lay_ground, unstamp
 from .raster import lay_row, strip_row
@@ -88,37 +88,37 @@ def render(
             some, share = Samples(), floats(0)
             scene = ti.atomic_add(queue[0], i32(1))
             while scene < scenes:
-                laid = ti.select(scene_table[scene * tables.SCENE + tables.GROUNDED] != 0, strips, 0)
+                laid = ti.select(scene_table[scene * layout.SCENE + layout.GROUNDED] != 0, strips, 0)
                 lay_ground(
                     scene, laid, record_base, mark_base, 0.5 * ti.cast(width, f64), 0.5 * ti.cast(height, f64),
                     scene_table, strip, tiles, records, marks,
                 )  # fmt: skip
                 base = seen_base + (scene * pixels & i32(LANES - 1))  # blocks begin where the images' do
-                texel = scene_table[scene * tables.SCENE + tables.TEXEL]
+                texel = scene_table[scene * layout.SCENE + layout.TEXEL]
                 last, stamped = laid, i32(-1)
                 for k in range(first[scene], first[scene + 1]):
-                    node = ti.cast(whole[k * tables.INTEGERS + tables.NODE], i32)
+                    node = ti.cast(whole[k * layout.INTEGERS + layout.NODE], i32)
                     target = ti.select(node < 0, i32(-1), scene * nodes + node)
                     if target != stamped:
                         if stamped >= 0:
                             unstamp(stamped, height, width, stamp_base, extent, stamp)
                         stamped = target
-                    if node >= 0 or whole[k * tables.INTEGERS + tables.SEEN] != 0:
+                    if node >= 0 or whole[k * layout.INTEGERS + layout.SEEN] != 0:
                         last, area = draw_instance(
                             k, last, target, height, width, ti.static(2 if fine else 1), base, seen_base + room,
                             stamp_base, corner_base, record_base, mark_base, texel, whole, real, positions, triangles,
                             faces, seen, shadow, stamp, corners, records, marks, extent,
                         )  # fmt: skip
                         if node >= 0:
-                            total = target * tables.RESULTS + tables.WHOLE
+                            total = target * layout.RESULTS + layout.WHOLE
                             result[total] = result[total] + area
                 if stamped >= 0:
                     unstamp(stamped, height, width, stamp_base, extent, stamp)
-                if scene_table[scene * tables.SCENE + tables.LIGHT + tables.SHADOWED] != 0:
+                if scene_table[scene * layout.SCENE + layout.LIGHT + layout.SHADOWED] != 0:
                     for k in range(first[scene], first[scene + 1]):
                         open_tiles(k, scene + 1, map_size, map_base, whole, shadow, shadow_words, opened)
                     for k in range(first[scene], first[scene + 1]):
-                        if whole[k * tables.INTEGERS + tables.CASTS] != 0:
+                        if whole[k * layout.INTEGERS + layout.CASTS] != 0:
                             cast_shadow(
                                 k, map_size, map_base, corner_base, whole, real, positions, triangles, seen, shadow,
                                 corners,

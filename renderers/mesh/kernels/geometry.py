@@ -8,7 +8,7 @@ clipping, only outlines do.
 
 from ...engine import ti
 from ...kernels.lanes import high, low
-from .. import atlas, tables
+from ..tables import atlas, layout
 from . import shading
 from .raster import fill, up
 from .vertices import CORNER, transform, vertex
@@ -21,20 +21,20 @@ i32, u64, f32, f64 = ti.i32, ti.u64, ti.f32, ti.f64
 @ti.func
 def at_near(inside, outside):
     """Where an edge meets the near plane; from the inside, so that both triangles find the same."""
-    share = (tables.NEAR - inside[2]) / (outside[2] - inside[2])
+    share = (layout.NEAR - inside[2]) / (outside[2] - inside[2])
     u, v = inside[0] + (outside[0] - inside[0]) * share, inside[1] + (outside[1] - inside[1]) * share
-    return u / tables.NEAR, v / tables.NEAR
+    return u / layout.NEAR, v / layout.NEAR
 
 
 @ti.func
 def cosines(n: i32, m: i32, real: ti.template(), faces: ti.template()):
     """A normal's cosines towards the sun and upward, in an instance that is turned and scaled."""
     x, y, z = faces[n], faces[n + 1], faces[n + 2]
-    a, b = x * ti.cast(real[m + tables.UNSCALE], f32), y * ti.cast(real[m + tables.UNSCALE + 1], f32)
-    c = z * ti.cast(real[m + tables.UNSCALE + 2], f32)
+    a, b = x * ti.cast(real[m + layout.UNSCALE], f32), y * ti.cast(real[m + layout.UNSCALE + 1], f32)
+    c = z * ti.cast(real[m + layout.UNSCALE + 2], f32)
     share = f32(1.0) / high(ti.sqrt(a * a + b * b + c * c), f32(1e-12))
-    sun = x * ti.cast(real[m + tables.TO_SUN], f32) + y * ti.cast(real[m + tables.TO_SUN + 1], f32)
-    sun += z * ti.cast(real[m + tables.TO_SUN + 2], f32)
+    sun = x * ti.cast(real[m + layout.TO_SUN], f32) + y * ti.cast(real[m + layout.TO_SUN + 1], f32)
+    sun += z * ti.cast(real[m + layout.TO_SUN + 2], f32)
     return sun * share, c * share
 
 
@@ -60,7 +60,7 @@ def record_triangle(
 
     Light finds it nearer to the sun by as much as it rises over a texel of the shadow map, lest it shade itself.
     """
-    s, w, texture = k * tables.REALS, p + q + o, ti.cast(whole[k * tables.INTEGERS + tables.TEXTURE], i32)
+    s, w, texture = k * layout.REALS, p + q + o, ti.cast(whole[k * layout.INTEGERS + layout.TEXTURE], i32)
     records[r + shading.FROM_U], records[r + shading.FROM_V] = ti.cast(from_u, f32), ti.cast(from_v, f32)
     records[r + shading.W_U], records[r + shading.W_V] = ti.cast(w[0], f32), ti.cast(w[1], f32)
     sun0, up0 = cosines(face + atlas.NORMAL, s, real, faces)
@@ -87,10 +87,10 @@ def record_triangle(
     for channel in ti.static(range(3)):
         colour = faces[face + atlas.COLOUR + channel]
         if faces[face + atlas.TINTED] != 0:
-            colour *= ti.cast(real[s + tables.TINT + channel], f32)
+            colour *= ti.cast(real[s + layout.TINT + channel], f32)
         records[r + shading.RGB + channel] = colour
-    marks[m + shading.LABEL] = ti.cast(whole[k * tables.INTEGERS + tables.NODE] + 1, i32)
-    marks[m + shading.CLASS] = ti.cast(whole[k * tables.INTEGERS + tables.SEMANTIC], i32)
+    marks[m + shading.LABEL] = ti.cast(whole[k * layout.INTEGERS + layout.NODE] + 1, i32)
+    marks[m + shading.CLASS] = ti.cast(whole[k * layout.INTEGERS + layout.SEMANTIC], i32)
     marks[m + shading.IMAGE], marks[m + shading.VARIES] = texture, ti.cast(varies, i32)
 
 
@@ -107,15 +107,15 @@ def draw_instance(
     ``zooms`` is 2 where there is a second buffer, at ``fine_base``, of twice as many columns and rows. Returns the last
     record, and how many pixels of the node were stamped.
     """
-    transform(k, tables.TO_IMAGE, 1, corner_base, whole, real, positions, corners)
-    first, last, area = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32), count, i32(0)
-    in_sight = whole[k * tables.INTEGERS + tables.SEEN] != 0
+    transform(k, layout.TO_IMAGE, 1, corner_base, whole, real, positions, corners)
+    first, last, area = ti.cast(whole[k * layout.INTEGERS + layout.TRIANGLE], i32), count, i32(0)
+    in_sight = whole[k * layout.INTEGERS + layout.SEEN] != 0
     low_u, low_v, high_u, high_v = f64(1e300), f64(1e300), f64(-1e300), f64(-1e300)
-    for t in range(first, first + ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLES], i32)):
+    for t in range(first, first + ti.cast(whole[k * layout.INTEGERS + layout.TRIANGLES], i32)):
         at0, at1 = corner_base + triangles[3 * t] * CORNER, corner_base + triangles[3 * t + 1] * CORNER
         at2 = corner_base + triangles[3 * t + 2] * CORNER
         z0, z1, z2 = corners[at0 + 2], corners[at1 + 2], corners[at2 + 2]
-        behind = ti.cast(z0 < tables.NEAR, i32) + ti.cast(z1 < tables.NEAR, i32) + ti.cast(z2 < tables.NEAR, i32)
+        behind = ti.cast(z0 < layout.NEAR, i32) + ti.cast(z1 < layout.NEAR, i32) + ti.cast(z2 < layout.NEAR, i32)
         u0, v0, u1, v1, u2, v2, u3, v3 = f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0), f64(0.0)
         front = False
         if behind == 0:
@@ -126,8 +126,8 @@ def draw_instance(
             a, b, c = vertex(at0, corners), vertex(at1, corners), vertex(at2, corners)
             front = a.dot(b.cross(c)) < 0
             if front:
-                odd_1 = (z1 < tables.NEAR) == (behind == 1)  # which corner is alone on its side of the plane
-                odd_2 = (z2 < tables.NEAR) == (behind == 1)
+                odd_1 = (z1 < layout.NEAR) == (behind == 1)  # which corner is alone on its side of the plane
+                odd_2 = (z2 < layout.NEAR) == (behind == 1)
                 if odd_1:
                     a, b, c = b, c, a
                 elif odd_2:
@@ -180,7 +180,7 @@ def draw_instance(
                         whole, real, faces, records, marks,
                     )  # fmt: skip
     if node >= 0 and low_u <= high_u:
-        e = node * tables.EXTENT
+        e = node * layout.EXTENT
         extent[e], extent[e + 1] = low(extent[e], low_u + 0.5), low(extent[e + 1], low_v + 0.5)
         extent[e + 2], extent[e + 3] = high(extent[e + 2], high_u + 0.5), high(extent[e + 3], high_v + 0.5)
     return last, area
@@ -189,7 +189,7 @@ def draw_instance(
 @ti.func
 def unstamp(node: i32, height: i32, width: i32, stamp_base: i32, extent: ti.template(), stamp: ti.template()):
     """Clear the stamps of a node, which lie within its extent."""
-    e, across = node * tables.EXTENT, (width + 63) >> 6
+    e, across = node * layout.EXTENT, (width + 63) >> 6
     left, right = up(extent[e] - 1, width) >> 6, (up(extent[e + 2], width) + i32(63)) >> 6
     for row in range(up(extent[e + 1] - 1, height), up(extent[e + 3], height)):
         for word in range(left, right):
@@ -208,11 +208,11 @@ def lay_ground(
     strip: ti.template(), tiles: ti.template(), records: ti.template(), marks: ti.template(),
 ):  # fmt: skip
     """The records of the strips, 1 to ``strips``: planes like any triangle's; record 0, the sky, has no label."""
-    s = scene * tables.SCENE
-    x, y = ray(s + tables.RAY, scenes), ray(s + tables.RAY + 3, scenes)
-    w = ray(s + tables.RAY + 6, scenes) / -scenes[s + tables.EYE + 2]
-    across = w * scenes[s + tables.EYE + 1] + y
-    along = w * (scenes[s + tables.EYE] - scenes[s + tables.OFFSET]) + x
+    s = scene * layout.SCENE
+    x, y = ray(s + layout.RAY, scenes), ray(s + layout.RAY + 3, scenes)
+    w = ray(s + layout.RAY + 6, scenes) / -scenes[s + layout.EYE + 2]
+    across = w * scenes[s + layout.EYE + 1] + y
+    along = w * (scenes[s + layout.EYE] - scenes[s + layout.OFFSET]) + x
     for i in ti.static(range(shading.MARKS)):
         marks[mark_base + i] = i32(0)
     for i in range(strips):
@@ -222,7 +222,7 @@ def lay_ground(
         records[r + shading.W_U], records[r + shading.W_V] = ti.cast(w[0], f32), ti.cast(w[1], f32)
         put_plane(r + shading.PLANE_S, across / -tiles[at + 1], middle_u, middle_v, records)
         put_plane(r + shading.PLANE_T, along / tiles[at], middle_u, middle_v, records)
-        put_number(r + shading.PLANE_SUN, ti.cast(scenes[s + tables.SUN_UP], f32), records)
+        put_number(r + shading.PLANE_SUN, ti.cast(scenes[s + layout.SUN_UP], f32), records)
         put_number(r + shading.PLANE_UP, 1.0, records)
         records[r + shading.LIFT] = f32(0.0)
         for channel in ti.static(range(3)):

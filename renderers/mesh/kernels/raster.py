@@ -7,9 +7,9 @@ The visibility buffer keeps the greatest of 64-bit words, the bits of 1/z above 
 
 from ...engine import ti
 from ...kernels.lanes import high, low, whole_lanes
-from .. import tables
+from ..tables import layout
 
-LEAST = 1e-9  # of 1/z, which rounding may not take to 0 or below
+MIN_INVERSE_DEPTH = 1e-9  # of 1/z, which rounding may not take to 0 or below
 
 i32, u32, u64, f32, f64 = ti.i32, ti.u32, ti.u64, ti.f32, ti.f64
 
@@ -25,7 +25,7 @@ def up(value: f64, most: i32):
 @ti.func
 def key(w: f32, record: i32):
     """A word of the visibility buffer."""
-    return (ti.cast(ti.bit_cast(high(w, f32(LEAST)), u32), u64) << 32) | ti.cast(record, u64)
+    return (ti.cast(ti.bit_cast(high(w, f32(MIN_INVERSE_DEPTH)), u32), u64) << 32) | ti.cast(record, u64)
 
 
 @ti.func
@@ -137,14 +137,14 @@ def strip_row(
     A column is in the strip above an edge where the ray's y is; that and 1/z, which is returned, are linear along a
     row.
     """
-    s = scene * tables.SCENE
-    eye_y, eye_z = scenes[s + tables.EYE + 1], scenes[s + tables.EYE + 2]
-    y_u, z_u = scenes[s + tables.RAY + 4] * zoom, scenes[s + tables.RAY + 7] * zoom
+    s = scene * layout.SCENE
+    eye_y, eye_z = scenes[s + layout.EYE + 1], scenes[s + layout.EYE + 2]
+    y_u, z_u = scenes[s + layout.RAY + 4] * zoom, scenes[s + layout.RAY + 7] * zoom
     v = origin + zoom * ti.cast(row, f64)
-    ray_y = scenes[s + tables.RAY + 3] + scenes[s + tables.RAY + 4] * origin + scenes[s + tables.RAY + 5] * v
-    ray_z = scenes[s + tables.RAY + 6] + scenes[s + tables.RAY + 7] * origin + scenes[s + tables.RAY + 8] * v
+    ray_y = scenes[s + layout.RAY + 3] + scenes[s + layout.RAY + 4] * origin + scenes[s + layout.RAY + 5] * v
+    ray_z = scenes[s + layout.RAY + 6] + scenes[s + layout.RAY + 7] * origin + scenes[s + layout.RAY + 8] * v
     left, right = beyond(0, width, -ray_z, -z_u)
-    left, right = beyond(left, right, eye_z / tables.NEAR + ray_z, z_u)
+    left, right = beyond(left, right, eye_z / layout.NEAR + ray_z, z_u)
     for strip in range(strips):
         a, b = left, right  # what lies above the edges so far
         if strip < strips - 1:

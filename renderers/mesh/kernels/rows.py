@@ -2,10 +2,10 @@
 
 from ...engine import ti
 from ...kernels.lanes import LANES, SHIFT, floats, high, whole, words
-from .. import tables
+from ..tables import layout
 from . import shading
-from .raster import LEAST
-from .shading import nearness, record_of
+from .raster import MIN_INVERSE_DEPTH
+from .shading import record_of, residual_ratio
 
 i32, u32, u64, f32 = ti.i32, ti.u32, ti.u64, ti.f32
 
@@ -20,7 +20,7 @@ def read_pixels(
     if count == LANES:
         block, drawn = seen_blocks[at >> SHIFT], u64(0)
         for i in range(i32(LANES)):
-            some.record[i], some.w[i] = record_of(block[i]), nearness(block[i])
+            some.record[i], some.w[i] = record_of(block[i]), residual_ratio(block[i])
         for i in range(i32(LANES)):
             drawn |= block[i]
         if drawn != 0:
@@ -28,7 +28,7 @@ def read_pixels(
     else:
         for i in range(i32(LANES)):
             word = seen[at + ti.min(i, count - 1)]
-            some.record[i], some.w[i] = record_of(word), nearness(word)
+            some.record[i], some.w[i] = record_of(word), residual_ratio(word)
         for i in range(count):
             seen[at + i] = u64(0)
 
@@ -43,7 +43,7 @@ def read_ground(
         if start < column + count and end > column:
             for i in range(i32(LANES)):
                 here = ti.min(column + i, column + count - 1)
-                near = high(w + w_u * ti.cast(here, f32), f32(LEAST))
+                near = high(w + w_u * ti.cast(here, f32), f32(MIN_INVERSE_DEPTH))
                 covers = (here >= start) & (here < end) & (near > some.w[i])
                 some.record[i] = ti.select(covers, ti.cast(strip + 1, i32), some.record[i])
                 some.w[i] = ti.select(covers, near, some.w[i])
@@ -68,12 +68,12 @@ def clear(at: i32, count: i32, seen: ti.template()):
 @ti.func
 def name_run(first: i32, last: i32, column: i32, row: i32, node: i32, result: ti.template()):
     """Pixels ``first`` to ``last`` from a column on are a node's."""
-    t = node * tables.RESULTS
-    result[t + tables.BOX] = ti.min(result[t + tables.BOX], column + first)
-    result[t + tables.BOX + 1] = ti.min(result[t + tables.BOX + 1], row)
-    result[t + tables.BOX + 2] = ti.max(result[t + tables.BOX + 2], column + last)
-    result[t + tables.BOX + 3] = row + i32(1)
-    result[t + tables.PIXELS] = result[t + tables.PIXELS] + last - first
+    t = node * layout.RESULTS
+    result[t + layout.BOX] = ti.min(result[t + layout.BOX], column + first)
+    result[t + layout.BOX + 1] = ti.min(result[t + layout.BOX + 1], row)
+    result[t + layout.BOX + 2] = ti.max(result[t + layout.BOX + 2], column + last)
+    result[t + layout.BOX + 3] = row + i32(1)
+    result[t + layout.PIXELS] = result[t + layout.PIXELS] + last - first
 
 
 @ti.func
@@ -153,14 +153,14 @@ def add_samples(
     last, word, at = filled, seen[line + column], fine + 2 * column
     if even(word, at, width, seen):
         some.u[last], some.v[last], share[last] = ti.cast(column, f32), ti.cast(row, f32), f32(1.0)
-        some.record[last], some.w[last] = record_of(word), nearness(word)
+        some.record[last], some.w[last] = record_of(word), residual_ratio(word)
         last += i32(1)
     else:
         for down, across in ti.static(ti.ndrange(2, 2)):
             word = seen[at + across + down * 2 * width]
             some.u[last], share[last] = ti.cast(column, f32) + f32(0.5 * across - 0.25), f32(0.25)
             some.v[last] = ti.cast(row, f32) + f32(0.5 * down - 0.25)
-            some.record[last], some.w[last] = record_of(word), nearness(word)
+            some.record[last], some.w[last] = record_of(word), residual_ratio(word)
             last += i32(1)
     return last
 

@@ -6,8 +6,8 @@ the sky's: all of it if it faces upward, three quarters if upright, half if it f
 
 from ...engine import ti
 from ...kernels.lanes import LANES, floats, high
-from ..tables import AMBIENT, CLIMB, HAZE, HORIZON, LENS, LIGHT, LIGHTS, MORE, SCENE, SHADOWED, SUN
-from ..texture_atlas import COLUMNS, HEIGHT, WIDTH
+from ..tables.layout import AMBIENT, CLIMB, HAZE, HORIZON, LENS, LIGHT, LIGHTS, MORE, SCENE, SHADOWED, SUN
+from ..tables.texture_atlas import COLUMNS, HEIGHT, WIDTH
 from .shadows import sunlit
 from .textures import texture_samples
 
@@ -35,7 +35,7 @@ def record_of(word: u64):
 
 
 @ti.func
-def nearness(word: u64):
+def residual_ratio(word: u64):
     """1/z in a word of the visibility buffer."""
     return ti.bit_cast(ti.cast(word >> 32, u32), f32)
 

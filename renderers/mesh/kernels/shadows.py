@@ -5,8 +5,8 @@ The map is cleared, written and read in tiles of 16 x 16, and only those that so
 
 from ...engine import ti
 from ...kernels.lanes import LANES, floats, high, low, whole
-from .. import tables
-from ..tables import ON_MAP
+from ..tables import layout
+from ..tables.layout import ON_MAP
 from .raster import by_height, columns, draw_span, up
 from .vertices import CORNER, transform, vertex
 
@@ -31,7 +31,7 @@ def open_tiles(k: i32, mark: i32, size: i32, base: i32, whole: ti.template(), sh
 
     Where no tile is opened nothing casts a shadow, and the map is never read.
     """
-    at = k * tables.INTEGERS + tables.MAP_BOX
+    at = k * layout.INTEGERS + layout.MAP_BOX
     nothing = ti.cast(ti.bit_cast(f32(NOTHING), ti.u32), ti.u64)
     two = (nothing << 32) | nothing
     left, top = ti.cast(whole[at], i32) >> TILE, ti.cast(whole[at + 1], i32) >> TILE
@@ -73,10 +73,10 @@ def cast_shadow(
     corners: ti.template(),
 ):  # fmt: skip
     """Draw an instance on the shadow map; of a closed mesh the triangles that face the sun will do."""
-    transform(k, tables.TO_MAP, 0, corner_base, whole, real, positions, corners)
-    first = ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLE], i32)
-    closed = whole[k * tables.INTEGERS + tables.CLOSED] != 0
-    for t in range(first, first + ti.cast(whole[k * tables.INTEGERS + tables.TRIANGLES], i32)):
+    transform(k, layout.TO_MAP, 0, corner_base, whole, real, positions, corners)
+    first = ti.cast(whole[k * layout.INTEGERS + layout.TRIANGLE], i32)
+    closed = whole[k * layout.INTEGERS + layout.CLOSED] != 0
+    for t in range(first, first + ti.cast(whole[k * layout.INTEGERS + layout.TRIANGLES], i32)):
         a = vertex(corner_base + triangles[3 * t] * CORNER, corners)
         b = vertex(corner_base + triangles[3 * t + 1] * CORNER, corners)
         c = vertex(corner_base + triangles[3 * t + 2] * CORNER, corners)

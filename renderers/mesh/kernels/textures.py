@@ -2,7 +2,7 @@
 
 from ...engine import ti
 from ...kernels.lanes import LANES, high, low, natural, whole
-from ..texture_atlas import AT, LEVELS
+from ..tables.texture_atlas import AT, LEVELS
 
 i32, u32, f32 = ti.i32, ti.u32, ti.f32
 PAIR = 0x00FF00FF  # red and blue of a texel

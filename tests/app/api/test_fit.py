@@ -11,6 +11,8 @@ from PIL import Image
 from safetensors.torch import load_file
 
 import probscene as ps
+from probscene.app.api.calls import display
+from probscene.app.targets import open_images
 from probscene.inference.features import pretrained
 
 FILES = ("features.safetensors", "guide.safetensors", "log.jsonl")
@@ -55,21 +57,33 @@ def sources(files):
     }
 
 
-def test_the_same_images_from_everywhere_give_the_same_fit(quick, discs, target, python_run):
-    files = sorted(target.images.glob("*.png"))
-    for name, images in sources(files).items():
-        assert learnt(quick(discs.file, images)) == learnt(python_run), name
+@pytest.mark.parametrize("channels", [3, 1])
+def test_the_same_images_from_everywhere_are_read_as_the_same(discs, tmp_path, channels):
+    model = replace(ps.load_model(discs.file), channels=channels)
+    ps.generate(model, 8, tmp_path, format="images", progress=False)
+    files = sorted((tmp_path / "images").glob("*.png"))
+    images = sources(files)
+    if channels == 1:
+        assert images["array"].shape == (8, 64, 64)
+        images["one channel"] = images["array"][..., None]
+    with display(False) as show:
+        folder, *others = (open_images(each, model, False, show) for each in (tmp_path / "images", *images.values()))
+    for name, other in zip(images, others, strict=True):
+        assert len(other) == len(folder) == 8, name
+        assert all(torch.equal(other.load(i, v), folder.load(i, v)) for i in range(8) for v in (0, 1)), name
+
+
+@pytest.mark.parametrize("source", ["list", "array"])
+def test_they_give_the_same_fit(quick, discs, target, python_run, source):
+    images = sources(sorted(target.images.glob("*.png")))[source]
+    assert learnt(quick(discs.file, images)) == learnt(python_run)
 
 
 def test_so_they_do_in_grey(quick, discs, tmp_path):
     model = replace(ps.load_model(discs.file), channels=1)
     ps.generate(model, 40, tmp_path, format="images", progress=False)
-    folder = quick(model, tmp_path / "images")
-    files = sorted((tmp_path / "images").glob("*.png"))
-    grey = sources(files) | {"one channel": np.stack([np.asarray(Image.open(file)) for file in files])[..., None]}
-    assert grey["array"].shape == (40, 64, 64)
-    for name, images in grey.items():
-        assert learnt(quick(model, images)) == learnt(folder), name
+    images = sources(sorted((tmp_path / "images").glob("*.png")))["array"]
+    assert learnt(quick(model, images)) == learnt(quick(model, tmp_path / "images"))
 
 
 def test_the_command_line_does_the_same(python_run, fitted):
@@ -157,8 +171,8 @@ def test_a_pretrained_network_is_built_once_a_fit(quick, discs, target, monkeypa
     built = []
     monkeypatch.setattr(pretrained, "pretrained", lambda choice: built.append(choice) or Means())
     monkeypatch.setattr(pretrained, "weights_file", lambda choice: None)
-    few = {key: value for key, value in discs.short.items() if not key.startswith(("count", "width", "parameters"))}
-    few |= {"pairs": 60, "directions": 2}
+    few = {key: value for key, value in discs.short.items() if not key.startswith(("features", "parameters"))}
+    few |= {"features.pairs": 60, "features.directions": 2}
     run = quick(discs.file, target.images, features="efficientnet", settings=few)
     run.evaluate(num=50, progress=False)
     run.sample(2)
@@ -171,22 +185,20 @@ def test_resuming_takes_what_the_run_was_begun_with(quick, discs, target, python
     for other in ({"seed": 1}, {"preset": "street"}, {"guide": "pcfg"}, {"threads": 2}, {"skip_bad": True}):
         with pytest.raises(ps.RunError, match="that the run in .* was begun with"):
             quick(discs.file, target.images, out=python_run.path, resume=True, **other)
-    with pytest.raises(ps.RunError, match="Expected the target that the run"):
+    with pytest.raises(ps.RunError, match="expected the target that the run"):
         quick(discs.file, np.zeros((40, 64, 64, 3), np.uint8), out=python_run.path, resume=True)
-    with pytest.raises(ps.RunError, match="Expected the model that the run"):
+    with pytest.raises(ps.RunError, match="expected the model that the run"):
         quick("multi_mnist", target.images, out=python_run.path, resume=True)
-    with pytest.raises(ps.RunError, match="Expected a new folder"):
+    with pytest.raises(ps.RunError, match="expected a new folder"):
         quick(discs.file, target.images, out=python_run.path)
 
 
-def test_resuming_does_not_ask_for_settings_that_nothing_reads(quick, discs, target, python_run):
-    assert python_run.preset.parameter_method == "likelihood"
-    begun, out = python_run.preset, python_run.path
-    other = replace(begun, tilting=replace(begun.tilting, rounds=begun.tilting.rounds + 1))
-    again = quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
+def test_resuming_names_the_setting_that_differs(quick, discs, target, python_run):
+    out, begun = python_run.path, python_run.config
+    again = quick(discs.file, target.images, preset=begun, settings=(), out=out, resume=True)
     assert learnt(again) == learnt(python_run)
-    other = replace(begun, parameters=replace(begun.parameters, rounds=begun.parameters.rounds + 1))
-    with pytest.raises(ps.RunError, match="Expected the parameters that the run"):
+    other = begun.set({"features.schedule.steps": begun.features.schedule.steps + 1})
+    with pytest.raises(ps.RunError, match="expected the features.schedule.steps that the run"):
         quick(discs.file, target.images, preset=other, settings=(), out=out, resume=True)
 
 
@@ -196,7 +208,7 @@ def test_a_fit_of_objects_goes_on_with_them(quick, discs, target, tmp_path, monk
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
         patch.setattr(
-            "probscene.app.fitting.learnt.structure.pretrain", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt)
+            "probscene.app.fitting.structure_stage.pretrain", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt)
         )
         with pytest.raises(KeyboardInterrupt):
             quick(model, images, features=Means(), out=out)

@@ -73,16 +73,16 @@ def test_it_is_saved_where_nothing_is_yet(python_run, tmp_path):
     (tmp_path / "empty").mkdir()
     assert files_of(python_run.save(str(tmp_path / "empty")).path) == files_of(python_run.path)
     for taken in (saved.path, tmp_path):
-        with pytest.raises(ps.RunError, match="Expected a new"):
+        with pytest.raises(ps.RunError, match="expected a new"):
             python_run.save(taken)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ps.DataError, match="Expected a folder"):
+    with pytest.raises(ps.DataError, match="expected a folder"):
         python_run.save(tmp_path / "file" / "run")
 
 
 def test_scenes_are_a_positive_number(python_run):
     for wrong in (lambda: python_run.sample(0), lambda: python_run.render(-1), lambda: python_run.sample(2, seed=-1)):
-        with pytest.raises(ps.ProbsceneError, match="^Expected a "):
+        with pytest.raises(ps.ProbsceneError, match="^expected a "):
             wrong()
 
 
@@ -133,7 +133,7 @@ def test_objects_are_asked_for_again(of_objects, tmp_path):
     assert (
         whole.evaluate(images, num=50, progress=False).record() == run.evaluate(images, num=50, progress=False).record()
     )
-    with pytest.raises(ps.RunError, match="Expected the images .* in memory"):
+    with pytest.raises(ps.RunError, match="expected the images .* in memory"):
         whole.evaluate(num=50, progress=False)
     assert whole.report(tmp_path / "page.html", num=50, scenes=0, progress=False).is_file()
     saved = whole.save(tmp_path / "saved")
@@ -160,7 +160,7 @@ def test_the_command_line_says_in_one_line_what_a_folder_lacks(of_objects, call,
 
 def test_a_run_of_objects_is_generated_in_one_process(of_objects, tmp_path):
     run, objects, _ = of_objects
-    with pytest.raises(ps.ProbsceneError, match="one worker .*model, features, divergence, guide.* actual 2"):
+    with pytest.raises(ps.ProbsceneError, match="one worker .*model, features, divergence, guide.* got 2"):
         run.generate(3, tmp_path / "dataset", workers=2, progress=False)
     with pytest.raises(ps.ProbsceneError, match="one worker"):
         ps.generate(objects["model"], 3, tmp_path / "dataset", workers=2, progress=False)

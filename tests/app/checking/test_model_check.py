@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from probscene.app.checking.model_check import QUICK, check_model
-from probscene.app.checking.randomness import beside_sites
+from probscene.app.checking.randomness import hidden_randomness
 from probscene.app.loading import load_model
 from probscene.drawing import Sprites
 from probscene.generator import Command
 from probscene.grammar import Grammar
 from probscene.model import Groups, scene_model
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.request import Objects
 from probscene.sampling import sample
 from probscene.structure import StructurePrior, counts
@@ -61,7 +61,7 @@ FAULTS = {
         ("Site 'z' is NaN or infinite in",),
     ),
     "shorter inside": ("max_steps=12", "max_steps=9", ("derives with max_steps = 9", "says max_steps = 12")),
-    "a negative radius": ("radius=6.0", "radius=-6.0", ("Expected a positive scale", "actual -")),
+    "a negative radius": ("radius=6.0", "radius=-6.0", ("expected a positive scale", "got -")),
 }
 
 
@@ -84,7 +84,7 @@ def test_a_fault_of_the_program_is_found_before_anything_is_written(fault, call,
     before, after, parts = FAULTS[fault]
     file = written(tmp_path, before, after)
     checked = call("check", file)
-    assert "1; mend them first" in one_line(checked)
+    assert "1; fix them first" in one_line(checked)
     (told,) = [line for line in checked.out.splitlines() if line.startswith("Fault: ")]
     fitted = one_line(call("fit", file, "--target", target.images, "--out", tmp_path / "run"))
     assert not (tmp_path / "run").exists()
@@ -92,7 +92,7 @@ def test_a_fault_of_the_program_is_found_before_anything_is_written(fault, call,
         assert part in told and part in fitted, (told, fitted)
 
 
-TWICE, RECORDED = "actual other ones where it runs twice with the same seed", "where its sites have the recorded values"
+TWICE, RECORDED = "got other ones where it runs twice with the same seed", "where its sites have the recorded values"
 RANDOM = {  # beside pyro.sample: how far a disc is moved, what says so, and whether one seed still gives one drawing
     "torch": ("torch.rand(x.shape)", False),
     "torch's own generator": ("torch.rand(x.shape, generator=OWN)", True),
@@ -128,7 +128,7 @@ def test_so_is_what_is_drawn_when_the_file_is_imported(seed, tmp_path, call):
     file = written(tmp_path, 'Sprites.disc("red", x,', 'Sprites.disc("red", x + 20 * SHIFT,')
     file.write_text(f"import random\nSHIFT = random.Random({seed}).random()\n" + file.read_text())
     done = call("check", file)
-    assert ("actual other ones where its file is imported again:" in done.out) == (not seed) == (done.code != 0)
+    assert ("got other ones where its file is imported again:" in done.out) == (not seed) == (done.code != 0)
 
 
 def noisy(canvas, threads):
@@ -157,7 +157,7 @@ def asks_for(chance):
 def test_so_is_what_a_renderer_draws_and_what_a_generator_is_asked_for(who, random):
     model = asks_for(random) if who == "request" else load_model(str(DISCS))
     render = noisy(model.canvas, 1) if random else SpriteRenderer(model.canvas, 1)
-    faults = beside_sites(model, sample(model, model.prior, 4).derivation, render)
+    faults = hidden_randomness(model, sample(model, model.prior, 4).derivation, render)
     assert [RECORDED in fault for fault in faults] == [True] * random
     assert [TWICE in fault for fault in faults] == [who == "renderer"] * random
 
@@ -287,7 +287,7 @@ def test_each_scenario_is_checked_and_named(discs):
     good = load_model(str(discs.file))
     bad = replace(good, program=lambda num_scenes, structure: good.program(num_scenes, structure) and None)
     (fault,) = check_model(join("both", {"one": good, "other": bad})).faults
-    assert fault.startswith("Scenario 'other': Expected the program") and "NoneType" in fault
+    assert fault.startswith("Scenario 'other': expected the program") and "NoneType" in fault
 
 
 def test_a_renderer_that_crashes_is_named(discs):
@@ -318,7 +318,7 @@ def test_it_leaves_no_trace(discs):
 
 @pytest.mark.parametrize("name", ["multi_mnist", "aerial2d"])
 def test_built_in_models_have_nothing_to_mend(name):
-    assert str(check_model(load_model(name), 64, 16)).endswith("Nothing to mend.")
+    assert str(check_model(load_model(name), 64, 16)).endswith("Nothing to fix.")
 
 
 @pytest.mark.parametrize(("channels", "told"), [(1, True), (3, False)])

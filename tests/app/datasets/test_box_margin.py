@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from faster_coco_eval import mask as rle
 
-from probscene.app.datasets.generate import generate, generate_scenes
+from probscene.app.datasets.generate import DatasetOptions, generate, generate_scenes
 from probscene.app.datasets.scene_dataset import SceneDataset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
@@ -29,7 +29,9 @@ def drawn(request, tmp_path_factory) -> SimpleNamespace:
     model, folder = load_model(str(FILES[request.param])), tmp_path_factory.mktemp("margin")
     formats = FORMATS[request.param]
     for margin in (0, MARGIN):
-        generate_scenes(model, model.prior, NUM, folder / str(margin), 1, formats, box_margin=margin)
+        generate_scenes(
+            model, model.prior, NUM, folder / str(margin), 1, formats, options=DatasetOptions(box_margin=margin)
+        )
     return SimpleNamespace(file=FILES[request.param], model=model, formats=formats, of=lambda m: folder / str(m))
 
 
@@ -83,15 +85,23 @@ def test_images_and_structures_stay_and_provenance_names_the_margin(drawn):
 
 def test_another_margin_is_another_data_set(drawn):
     for begun, other in ((0, MARGIN), (MARGIN, 0), (MARGIN, 2)):
-        with pytest.raises(DataError, match=f"begun with .*box_margin {begun}.*, actual box_margin {other}"):
-            generate_scenes(drawn.model, drawn.model.prior, NUM, drawn.of(begun), 1, drawn.formats, box_margin=other)
+        with pytest.raises(DataError, match=f"begun with .*box_margin {begun}.*, got box_margin {other}"):
+            generate_scenes(
+                drawn.model,
+                drawn.model.prior,
+                NUM,
+                drawn.of(begun),
+                1,
+                drawn.formats,
+                options=DatasetOptions(box_margin=other),
+            )
 
 
 @pytest.mark.parametrize("wrong", [-1, 0.5, float("nan")])
 def test_a_margin_that_is_none_is_named(tmp_path, wrong):
     model = load_model(str(FILES["plates"]))
     with pytest.raises(ProbsceneError, match="whole number of pixels, 0 or more"):
-        generate_scenes(model, model.prior, 1, tmp_path / "out", box_margin=wrong)
+        generate_scenes(model, model.prior, 1, tmp_path / "out", options=DatasetOptions(box_margin=wrong))
     with pytest.raises(ProbsceneError, match="whole number of pixels, 0 or more"):
         SceneDataset(model, 1, box_margin=wrong)
     assert not (tmp_path / "out").exists()
@@ -100,12 +110,14 @@ def test_a_margin_that_is_none_is_named(tmp_path, wrong):
 def test_kitti_boxes_of_whole_silhouettes_have_none(tmp_path):
     model = load_model(str(FILES["lots"]))
     with pytest.raises(ProbsceneError, match="no box_margin in KITTI's labels of the 3D model"):
-        generate_scenes(model, model.prior, 1, tmp_path / "out", format="kitti", box_margin=MARGIN)
+        generate_scenes(
+            model, model.prior, 1, tmp_path / "out", format="kitti", options=DatasetOptions(box_margin=MARGIN)
+        )
     assert not (tmp_path / "out").exists()
 
 
-def test_workers_and_the_command_line_take_it(fitted, call, tmp_path):
-    generate(RunFolder.at(fitted), 70, tmp_path / "one", box_margin=3)
-    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--box-margin", 3, "--workers", 2)
+def test_the_command_line_takes_it(fitted, call, tmp_path):
+    generate(RunFolder.at(fitted), 70, tmp_path / "one", options=DatasetOptions(box_margin=3))
+    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--box-margin", 3)
     assert done.code == 0, done.err
     assert contents(tmp_path / "one") == contents(tmp_path / "two")

@@ -82,7 +82,7 @@ def test_a_generators_depth_is_written_where_it_has_some(boxes, tmp_path):
     assert sorted(path.name for path in (tmp_path / "far").iterdir()) == ["depth", "images", "provenance.jsonl"]
     assert (read((tmp_path / "far" / "depth" / "000001.png").read_bytes()) == 7.5).all()
     flat = replace(boxes, generator=with_depth(None))
-    with pytest.raises(ProbsceneError, match="of model 'boxes' to have depth, for format depth, actual none; choose"):
+    with pytest.raises(ProbsceneError, match="of model 'boxes' to have depth, for format depth, got none; choose"):
         generate_scenes(flat, flat.prior, 2, tmp_path / "flat", format="coco,depth")
     assert not (tmp_path / "flat").exists()
     assert all("depth" not in target for _, target in SceneDataset(flat, num=2))

@@ -255,7 +255,7 @@ def test_damaged_files_of_any_format_are_made_again(model, tmp_path, monkeypatch
 def test_other_formats_leave_a_dataset_as_it_is(model, out):
     before = contents(out)
     for format in (*ALL, "images", "coco,yolo,kitti"):
-        with pytest.raises(DataError, match=f"coco,yolo,kitti,webdataset.*actual format {format}; .*left as it is"):
+        with pytest.raises(DataError, match=f"coco,yolo,kitti,webdataset.*got format {format}; .*left as it is"):
             generate_scenes(model, model.prior, NUM, out, seed=1, format=format)
     assert generate_scenes(model, model.prior, NUM, out, seed=1, format=(*reversed(ALL), "images")).made == 0
     assert contents(out) == before
@@ -264,7 +264,7 @@ def test_other_formats_leave_a_dataset_as_it_is(model, out):
 @pytest.mark.parametrize("format", ["voc", ("coco", "voc"), "coco,voc", "", "coco,", ()])
 def test_an_unknown_format_is_one_error_that_names_them(model, tmp_path, format):
     names = "coco, panoptic, yolo, yolo-seg, yolo-obb, yolo-pose, kitti, webdataset, depth, images"
-    with pytest.raises(ProbsceneError, match=f"among {names}, actual ('(voc)?'|none)"):
+    with pytest.raises(ProbsceneError, match=f"among {names}, got ('(voc)?'|none)"):
         generate_scenes(model, model.prior, 1, tmp_path / "out", format=format)
     assert not (tmp_path / "out").exists()
 
@@ -320,7 +320,7 @@ def test_as_many_objects_as_kittis_masks_can_number_and_no_more(tmp_path):
     generate_scenes(most, most.prior, 1, tmp_path / "most", format="kitti")
     png = cv2.imread(str(tmp_path / "most" / TRAINING / "instance" / "000000.png"), cv2.IMREAD_UNCHANGED)
     assert set(np.unique(png)) == {0, *range(257, 512)}
-    with pytest.raises(ProbsceneError, match="at most 255 objects.*actual 256 of class 'dot' in image 0"):
+    with pytest.raises(ProbsceneError, match="at most 255 objects.*got 256 of class 'dot' in image 0"):
         generate_scenes(more, more.prior, 1, tmp_path / "more", format="kitti,coco")
     assert not list((tmp_path / "more").glob("[!.]*"))
     generate_scenes(more, more.prior, 1, tmp_path / "coco", format="coco")

@@ -16,7 +16,7 @@ from pycocotools.coco import COCO
 
 import probscene
 from probscene.app.chunks import png
-from probscene.app.datasets.generate import generate, generate_scenes
+from probscene.app.datasets.generate import DatasetOptions, generate, generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
@@ -125,7 +125,7 @@ def test_a_line_that_is_not_the_models_is_refused(run, undisturbed):
         {**line, "parameters": {site: v for site, v in line["parameters"].items() if site != "plate.x"}},
     ]
     for bad in wrong:
-        with pytest.raises(DataError, match="Expected"):
+        with pytest.raises(DataError, match="expected"):
             remake(run.model, bad)
 
 
@@ -195,11 +195,11 @@ def test_folders_that_cannot_take_a_dataset(run, tmp_path):
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ({"num": 0}, "positive number of images, actual 0"),
-        ({"num": -3}, "positive number of images, actual -3"),
-        ({"workers": 0}, "positive number of workers, actual 0"),
-        ({"seed": -1}, "seed of 0 or more, actual -1"),
-        ({"format": "voc"}, "formats among coco, panoptic, yolo, .*, images, actual 'voc'"),
+        ({"num": 0}, "positive number of images, got 0"),
+        ({"num": -3}, "positive number of images, got -3"),
+        ({"workers": 0}, "positive number of workers, got 0"),
+        ({"seed": -1}, "seed of 0 or more, got -1"),
+        ({"format": "voc"}, "formats among coco, panoptic, yolo, .*, images, got 'voc'"),
     ],
 )
 def test_wrong_numbers(run, tmp_path, wrong, message):
@@ -223,12 +223,12 @@ def test_memory_is_flat(model, tmp_path):
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_many_images_share_folders_of_a_thousand_unless_one_is_asked_for(run, tmp_path, monkeypatch, flat):
-    monkeypatch.setattr("probscene.app.datasets.folder.FLAT", 100)
+    monkeypatch.setattr("probscene.app.datasets.folder.MAX_FLAT_IMAGES", 100)
     monkeypatch.setattr("probscene.app.datasets.provenance.SHARED", 50)
     out = tmp_path / "out"
     formats = "coco,yolo,webdataset"
-    generate(run, 130, out, seed=3, format=formats, flat=flat)
-    assert generate(run, 130, out, seed=3, format=formats, flat=flat).made == 0
+    generate(run, 130, out, seed=3, format=formats, options=DatasetOptions(flat=flat))
+    assert generate(run, 130, out, seed=3, format=formats, options=DatasetOptions(flat=flat)).made == 0
     names = [f"{i:06d}" if flat else f"{i // 50:04d}/{i:06d}" for i in range(130)]
     found = {file.relative_to(out / "images").with_suffix("").as_posix() for file in (out / "images").rglob("*.png")}
     assert found == set(names)
@@ -239,8 +239,8 @@ def test_many_images_share_folders_of_a_thousand_unless_one_is_asked_for(run, tm
     lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
     assert [line["image"] for line in lines] == [f"images/{name}.png" for name in names]
     with pytest.raises(DataError, match=rf"begun with \(flat {flat}\)"):
-        generate(run, 130, out, seed=3, format=formats, flat=not flat)
-    monkeypatch.setattr("probscene.app.datasets.folder.FLAT", 1000)
+        generate(run, 130, out, seed=3, format=formats, options=DatasetOptions(flat=not flat))
+    monkeypatch.setattr("probscene.app.datasets.folder.MAX_FLAT_IMAGES", 1000)
     generate(run, 130, tmp_path / "usual", seed=3, format=formats)
     for name in names:
         usual = tmp_path / "usual" / "images" / f"{name.rpartition('/')[2]}.png"
@@ -248,7 +248,7 @@ def test_many_images_share_folders_of_a_thousand_unless_one_is_asked_for(run, tm
 
 
 def test_a_models_images_are_in_one_folder_where_that_is_asked_for(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("probscene.app.datasets.folder.FLAT", 3)
+    monkeypatch.setattr("probscene.app.datasets.folder.MAX_FLAT_IMAGES", 3)
     for flat in (False, True):
         probscene.generate(run.model, 4, tmp_path / str(flat), format="images", progress=False, flat=flat)
         assert (tmp_path / str(flat) / "images" / "000003.png").exists() == flat

@@ -200,7 +200,7 @@ def test_an_unfinished_dataset_is_of_its_own_settings(run, tmp_path, monkeypatch
     monkeypatch.setattr(coco, "write", cut)
     with pytest.raises(Cut):
         generate(run, 3, tmp_path / "out", seed=3)
-    with pytest.raises(DataError, match=r"begun with \(seed 3, num 3\), actual seed 4, num 5; give the same"):
+    with pytest.raises(DataError, match=r"begun with \(seed 3, num 3\), got seed 4, num 5; give the same"):
         generate(run, 5, tmp_path / "out", seed=4)
     other = a_run(tmp_path / "other", 0.2)
     with pytest.raises(DataError, match=r"begun with \(guide "):

@@ -16,7 +16,7 @@ def test_a_joint_batch_shows_what_each_scenarios_own_model_shows():
     batch, seen = renderer_for(joint, 1)(scenes.drawing), set()
     for i, number in enumerate(joint.grammar.scenario(scenes.derivation).tolist()):
         name, model = joint.scenarios[number]
-        own = Derivation.of(model.grammar, joint.grammar.own(scenes.derivation[i : i + 1], number).rules)
+        own = Derivation.from_rules(model.grammar, joint.grammar.own(scenes.derivation[i : i + 1], number).rules)
         M = own.kind.shape[1]
         sites = {site: value for site, value in scenes.parameters.items() if site.startswith(f"{name}/")}
         values = {site.split("/")[1]: value[i : i + 1, :M] for site, value in sites.items()}

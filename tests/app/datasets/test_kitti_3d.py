@@ -18,9 +18,9 @@ from PIL import Image
 from probscene.app.chunks import CHUNK
 from probscene.app.datasets import coco, kitti
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.labelling.boxes import read_boxes
+from probscene.app.labels.boxes import read_boxes
 from probscene.app.loading import load_model
-from probscene.batch import RenderBatch, Space
+from probscene.batch import RenderBatch, SceneGeometry
 from probscene.dataset import ImageFolder
 
 HEIGHT, WIDTH = 94, 310
@@ -62,7 +62,7 @@ def rendered(objects) -> RenderBatch:
         if len(rows):
             visible_box[k] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
     box = torch.tensor([[box for _, box, _ in objects]], dtype=torch.float32)
-    space = Space(
+    space = SceneGeometry(
         depth=torch.ones(1, HEIGHT, WIDTH),
         semantic=torch.zeros(1, HEIGHT, WIDTH, dtype=torch.uint8),
         names=("sky",),

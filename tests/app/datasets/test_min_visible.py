@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from probscene.app.datasets.generate import generate, generate_scenes
+from probscene.app.datasets.generate import DatasetOptions, generate, generate_scenes
 from probscene.app.datasets.scene_dataset import SceneDataset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
@@ -30,7 +30,9 @@ def drawn(request, tmp_path_factory) -> SimpleNamespace:
     file = Path(__file__).parents[1] / f"{request.param}.py"
     model, folder = load_model(str(file)), tmp_path_factory.mktemp("visible")
     for least in (0.0, *LEAST):
-        generate_scenes(model, model.prior, NUM, folder / str(least), seed=1, format=ALL, min_visible=least)
+        generate_scenes(
+            model, model.prior, NUM, folder / str(least), seed=1, format=ALL, options=DatasetOptions(min_visible=least)
+        )
     return SimpleNamespace(file=file, model=model, of=lambda least: folder / str(least))
 
 
@@ -107,11 +109,15 @@ def test_the_torch_dataset_has_the_same_labels_with_whole_boxes_and_visible_frac
 def test_another_fraction_is_another_data_set(drawn, tmp_path):
     for begun, other in ((0.0, 0.25), (0.25, 0.0), (0.25, 0.6)):
         before = contents(drawn.of(begun))
-        message = f"begun with .*min_visible {begun}.*, actual min_visible {other}"
+        message = f"begun with .*min_visible {begun}.*, got min_visible {other}"
         with pytest.raises(DataError, match=message):
-            generate_scenes(drawn.model, drawn.model.prior, NUM, drawn.of(begun), 1, ALL, min_visible=other)
+            generate_scenes(
+                drawn.model, drawn.model.prior, NUM, drawn.of(begun), 1, ALL, options=DatasetOptions(min_visible=other)
+            )
         assert contents(drawn.of(begun)) == before
-        again = generate_scenes(drawn.model, drawn.model.prior, NUM, drawn.of(begun), 1, ALL, min_visible=begun)
+        again = generate_scenes(
+            drawn.model, drawn.model.prior, NUM, drawn.of(begun), 1, ALL, options=DatasetOptions(min_visible=begun)
+        )
         assert again.made == 0
 
         def interrupted(done, of):
@@ -120,10 +126,12 @@ def test_another_fraction_is_another_data_set(drawn, tmp_path):
 
         out = tmp_path / f"{begun} {other}"
         with pytest.raises(KeyboardInterrupt):
-            generate_scenes(drawn.model, drawn.model.prior, NUM, out, 1, ALL, interrupted, begun)
+            generate_scenes(
+                drawn.model, drawn.model.prior, NUM, out, 1, ALL, interrupted, DatasetOptions(min_visible=begun)
+            )
         with pytest.raises(DataError, match=message):
-            generate_scenes(drawn.model, drawn.model.prior, NUM, out, 1, ALL, min_visible=other)
-        generate_scenes(drawn.model, drawn.model.prior, NUM, out, 1, ALL, min_visible=begun)
+            generate_scenes(drawn.model, drawn.model.prior, NUM, out, 1, ALL, options=DatasetOptions(min_visible=other))
+        generate_scenes(drawn.model, drawn.model.prior, NUM, out, 1, ALL, options=DatasetOptions(min_visible=begun))
         assert contents(out) == before
 
 
@@ -136,13 +144,13 @@ def test_the_default_leaves_no_trace(drawn, tmp_path):
 @pytest.mark.parametrize("wrong", [-0.1, 1.5, float("nan")])
 def test_what_is_no_fraction_is_refused(drawn, tmp_path, wrong):
     with pytest.raises(ProbsceneError, match="min_visible from 0 to 1"):
-        generate_scenes(drawn.model, drawn.model.prior, 1, tmp_path / "out", min_visible=wrong)
+        generate_scenes(drawn.model, drawn.model.prior, 1, tmp_path / "out", options=DatasetOptions(min_visible=wrong))
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_and_worker_processes_leave_out_the_same(call, fitted, tmp_path):
-    generate(RunFolder.at(fitted), 70, tmp_path / "one", min_visible=0.9)
-    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--min-visible", 0.9, "--workers", 2)
+def test_the_command_leaves_out_the_same(call, fitted, tmp_path):
+    generate(RunFolder.at(fitted), 70, tmp_path / "one", options=DatasetOptions(min_visible=0.9))
+    done = call("generate", fitted, "--num", 70, "--out", tmp_path / "two", "--min-visible", 0.9)
     assert done.code == 0, done.err
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     refused = call("generate", fitted, "--num", 70, "--out", tmp_path / "two")

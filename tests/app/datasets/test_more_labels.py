@@ -27,17 +27,17 @@ from reference.sprites import ReferenceRenderer
 
 from probscene.app.chunks import draw_chunk
 from probscene.app.datasets import coco
-from probscene.app.datasets.generate import generate, generate_scenes
+from probscene.app.datasets.generate import DatasetOptions, generate, generate_scenes
 from probscene.app.datasets.polygons import polygon
 from probscene.app.datasets.scene_dataset import SceneDataset
 from probscene.app.datasets.yolo import around
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model, renderer_for
+from probscene.camera_effects import CameraEffects
 from probscene.derive import derive
 from probscene.drawing import Atlas, Drawing, Sprites, resolve
 from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.photo import Photo
 from probscene.request import Objects
 from probscene.scenarios import join
 from probscene.scene import SceneGraph
@@ -54,7 +54,9 @@ def drawn(request, tmp_path_factory) -> SimpleNamespace:
     """Flat or 3D scenes: their drawing, their render, their data set, its annotations, and the nodes of these."""
     model, out = load_model(str(FILES[request.param])), tmp_path_factory.mktemp("labels")
     values = VALUES if request.param == "cars" else ()
-    generate_scenes(model, model.prior, NUM, out / "out", 1, FORMATS, amodal=True, values=values)
+    generate_scenes(
+        model, model.prior, NUM, out / "out", 1, FORMATS, options=DatasetOptions(amodal=True, values=values)
+    )
     scenes = draw_chunk(model, model.prior, 1, 0)
     drawing = scenes.drawing[:NUM]
     annotations = json.loads((out / "out" / "annotations.json").read_text())["annotations"]
@@ -92,7 +94,7 @@ def test_every_pixel_is_in_the_segment_of_what_it_shows(drawn, tmp_path, least):
     out, model, batch = drawn.out, drawn.model, drawn.batch
     if least:
         out = tmp_path / "out"
-        generate_scenes(model, model.prior, NUM, out, 1, "panoptic,coco", min_visible=least)
+        generate_scenes(model, model.prior, NUM, out, 1, "panoptic,coco", options=DatasetOptions(min_visible=least))
     found = json.loads((out / "panoptic.json").read_text())
     names = {category["id"]: category["name"] for category in found["categories"]}
     assert {c["name"] for c in found["categories"] if c["isthing"]} == {*model.classes} - {*model.stuff}
@@ -148,7 +150,7 @@ def only(drawing, i: int, node: int):
             present = torch.zeros_like(layer.present)
             present[0, node] = layer.present[0, node]
             layers.append(replace(layer, present=present))
-    more = {} if isinstance(drawing, Drawing) else {"ground": None, "photo": resolve_scene(Photo(), 1)}
+    more = {} if isinstance(drawing, Drawing) else {"ground": None, "photo": resolve_scene(CameraEffects(), 1)}
     return replace(drawing[i : i + 1], layers=tuple(layers), **more)
 
 
@@ -395,20 +397,24 @@ ALL = {"format": "coco,panoptic,yolo,yolo-seg,yolo-obb,yolo-pose,webdataset", "a
 
 
 def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path, monkeypatch):
+    """With every option, those of other files too."""
+    options = DatasetOptions(amodal=True, values=ALL["values"], min_visible=0.3, box_margin=3)
+    every = {"format": ALL["format"], "options": options}
     torch.manual_seed(0)
     run = RunFolder.create(tmp_path / "run", str(FILES["cars"]), {"guide": {"hidden": 8}})
     run.write_tensors("guide", LSTMGuide(run.model.grammar, run.model.max_steps, hidden=8).state_dict())
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr(coco, "write", lambda *_: 1 / 0)
-        generate(run, 70, tmp_path / "one", **ALL)
-    assert generate(run, 70, tmp_path / "one", **ALL).made == 0
-    words = ("--format", ALL["format"], "--amodal", "--values", "car.x", "--values", "light", "--workers", 2)
+        generate(run, 70, tmp_path / "one", **every)
+    assert generate(run, 70, tmp_path / "one", **every).made == 0
+    words = ("--format", ALL["format"], "--amodal", "--values", "car.x", "--values", "light")
+    words += ("--min-visible", 0.3, "--box-margin", 3, "--workers", 2)
     done = call("generate", run.path, "--num", 70, "--out", tmp_path / "two", *words)
     assert done.code == 0, done.err
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
-    assert generate(run, 70, tmp_path / "one", **ALL).made == 0  # it is seen to be finished
-    with pytest.raises(ProbsceneError, match=r"begun with \(amodal True\), actual amodal False"):
-        generate(run, 70, tmp_path / "one", **ALL | {"amodal": False})
+    assert generate(run, 70, tmp_path / "one", **every).made == 0  # it is seen to be finished
+    with pytest.raises(ProbsceneError, match=r"begun with \(amodal True\), got amodal False"):
+        generate(run, 70, tmp_path / "one", **every | {"options": replace(options, amodal=False)})
     found = json.loads((tmp_path / "one" / "annotations.json").read_text())
     assert found["info"]["values"] == "car.x,light" and found["info"]["amodal"] is True
     sharded = []
@@ -424,7 +430,7 @@ def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path,
 
 def test_scenarios_keep_keypoints_and_values(cars, tmp_path):
     both = join("both", {"one": cars.model, "other": cars.model})
-    generate_scenes(both, both.prior, 30, tmp_path, values="one/car.x,one/light")
+    generate_scenes(both, both.prior, 30, tmp_path, options=DatasetOptions(values="one/car.x,one/light"))
     entries = json.loads((tmp_path / "annotations.json").read_text())["annotations"]
     entries = [one for one in entries if one["category_id"] == 1]
     assert {tuple(one["attributes"]) for one in entries} == {(), ("one/car.x", "one/light")}
@@ -444,7 +450,7 @@ def test_names_of_keypoints_that_change_are_one_error(cars, tmp_path):
         return replace(drawing, layers=tuple(layers))
 
     changing = replace(cars.model, program=program)
-    with pytest.raises(ModelError, match="name the same keypoints whatever it draws, actual .*'a'.* and .*'b'"):
+    with pytest.raises(ModelError, match="name the same keypoints whatever it draws, got .*'a'.* and .*'b'"):
         generate_scenes(changing, changing.prior, 65, tmp_path)
     assert not (tmp_path / "annotations.json").exists()
 
@@ -452,19 +458,19 @@ def test_names_of_keypoints_that_change_are_one_error(cars, tmp_path):
 def test_what_a_model_does_not_have_is_one_error(cars, tmp_path, call):
     def message(**asked) -> str:
         with pytest.raises(ProbsceneError) as error:
-            model = asked.pop("model", cars.model)
-            generate_scenes(model, model.prior, 1, tmp_path / "out", **asked)
+            model, formats = asked.pop("model", cars.model), asked.pop("format", "coco")
+            generate_scenes(model, model.prior, 1, tmp_path / "out", 0, formats, options=DatasetOptions(**asked))
         assert not (tmp_path / "out").exists()
         return str(error.value)
 
-    assert "sites of model 'cars' (light, x, y, car.turn, car.far, car.scale, car.x), actual 'car.z'" in message(
+    assert "sites of model 'cars' (light, x, y, car.turn, car.far, car.scale, car.x), got 'car.z'" in message(
         values="car.x,car.z"
     )
     for asked in ({"amodal": True}, {"values": "x"}):
-        assert "Expected coco or webdataset among the formats" in message(format="yolo,panoptic", **asked)
+        assert "expected coco or webdataset among the formats" in message(format="yolo,panoptic", **asked)
     assert "to have depth" in message(format="coco,depth")
     plain = load_model(str(FILES["lots"]))
-    assert "sprites of model 'lots' with keypoints, for format yolo-pose, actual none" in message(
+    assert "sprites of model 'lots' with keypoints, for format yolo-pose, got none" in message(
         model=plain, format="yolo-pose"
     )
 
@@ -474,7 +480,7 @@ def test_what_a_model_does_not_have_is_one_error(cars, tmp_path, call):
             return scene.request(Objects("car", x=1.0))
 
     generated = replace(cars.model, program=request, generator=lambda scene: 1 / 0)
-    assert "sprites or meshes for amodal masks, actual 'cars'" in message(model=generated, amodal=True)
+    assert "sprites or meshes for amodal masks, got 'cars'" in message(model=generated, amodal=True)
     with pytest.raises(ProbsceneError, match="sprites or meshes for amodal masks"):
         next(iter(SceneDataset(generated, 1, amodal=True)))
 

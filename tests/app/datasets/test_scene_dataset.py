@@ -243,12 +243,12 @@ def test_a_detector_takes_the_samples(samples):
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ({"num": 0}, "positive number of images, actual 0"),
+        ({"num": 0}, "positive number of images, got 0"),
         ({"batch_size": 0}, "positive number of images of a batch"),
         ({"seed": -1}, "seed of 0 or more"),
         ({"min_visible": 1.5}, "min_visible from 0 to 1"),
         ({"min_visible": float("nan")}, "min_visible from 0 to 1"),
-        ({"source": "mnist"}, "Expected a built-in model"),
+        ({"source": "mnist"}, "expected a built-in model"),
     ],
 )
 def test_wrong_arguments(wrong, message):

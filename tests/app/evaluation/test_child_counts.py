@@ -15,7 +15,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import counts_of_dataset, read_labels
 from probscene.app.evaluation.likelihood import likelihood
-from probscene.app.evaluation.structure_counts import label
+from probscene.app.evaluation.structure_counts import group_label
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.views.report import report, write
@@ -118,7 +118,7 @@ def test_distances_below_parents_are_those_of_the_counts(found):
 def test_labels_that_are_structures_tell_what_a_policy_makes_of_them(plates, found):
     model = plates.run.model
     rules = [json.loads(line)["rules"] for line in plates.lines.read_text(encoding="utf-8").splitlines()]
-    each = [Derivation.of(model.grammar, torch.tensor([row])) for row in rules]
+    each = [Derivation.from_rules(model.grammar, torch.tensor([row])) for row in rules]
     for name, policy in (("prior", model.prior), ("learnt", plates.run.guide)):
         with torch.no_grad():
             logp = np.array([policy.log_prob(one).item() for one in each])
@@ -146,7 +146,7 @@ def test_the_command_shows_what_depends_on_context(call, plates, found, tmp_path
     assert json.loads((tmp_path / "e.json").read_text()) == json.loads(json.dumps(found.record()))
     for group in ("all", "first", "others"):
         value = found.distance("prior", "truth")["children"]["mug per plate"][group]["total_variation"]["value"]
-        name = label(PAIR, group)[:12]  # a long name goes on in the line below
+        name = group_label(PAIR, group)[:12]  # a long name goes on in the line below
         assert any(name in line and f"{value:.3f}" in line for line in shown.out.splitlines())
     assert "impossible" in shown.out and "log q" in shown.out
     plain = call(*words)
@@ -158,14 +158,14 @@ def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
     lines = [line for line in shown.out.splitlines() if not line.startswith("Warning: ")]
     titles = [line.strip() for line in lines if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
-        "Distance to the truth", "TV: total variation", "Distance to what the feature network sees *",
+        "Distance to the truth", "TV: total variation", "Distance to what the feature network reads *",
         "Images by number of objects", "Objects by class", "Counts read in each labelled image"]  # fmt: skip
 
 
 def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_path):
     text = write(plates.run, found, plates.opened, tmp_path / "r.html").read_text(encoding="utf-8")
     for group in ("all", "first", "second", "others"):
-        assert text.count(label(PAIR, group)) >= 2  # a chart and a table
+        assert text.count(group_label(PAIR, group)) >= 2  # a chart and a table
     assert "log q of the labelled structures" in text and "impossible" in text
     from probscene.app.progress import Display
 
@@ -217,7 +217,7 @@ def test_wrong_lines_of_provenance(fault, plates, tmp_path):
     change, *parts = LINES[fault]
     lines = change(plates.lines.read_text(encoding="utf-8").splitlines())
     (tmp_path / "p.jsonl").write_text("\n".join(lines), encoding="utf-8")
-    with pytest.raises(DataError, match="^Expected ") as refused:
+    with pytest.raises(DataError, match="^expected ") as refused:
         read_labels(tmp_path / "p.jsonl", plates.run.model, plates.opened)
     assert all(part in str(refused.value) for part in parts), refused.value
 

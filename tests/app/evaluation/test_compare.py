@@ -1,6 +1,5 @@
 """Runs side by side: the figures are those of evaluate and of plain loops, and the picture shows them."""
 
-import dataclasses
 import json
 import re
 import shutil
@@ -14,10 +13,10 @@ from PIL import Image
 from probscene.app.evaluation.compare import compare, open_runs
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import Labels
-from probscene.app.evaluation.structure_counts import StructureCounts, count, sampled
+from probscene.app.evaluation.structure_counts import StructureCounts, count_structures, sample_counts
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
-from probscene.app.views.comparison import picture, shown
+from probscene.app.views.comparison import picture, picture_rows
 from probscene.dataset import ImageFolder
 from probscene.derivation import Derivation
 from probscene.derive import derive_complete
@@ -42,7 +41,7 @@ def two(call, discs, fitted, target, tmp_path_factory) -> list[Path]:
 
 def untrained(folder: Path, model: str, seed: int, target: str = "images", assets: Path | None = None) -> Path:
     """A run whose guide learnt nothing, and which has seen no image."""
-    record = {"guide": QUICK.guide_settings(), "preset": dataclasses.asdict(QUICK), "target": target, "seed": seed}
+    record = {"config": QUICK.for_renders().to_record(), "target": target, "seed": seed}
     run = RunFolder.create(folder, model, record, assets)
     torch.manual_seed(seed)
     guide = run.new_guide()
@@ -60,7 +59,7 @@ def nested(tmp_path_factory) -> dict[str, RunFolder]:
 def truth_of(run: RunFolder, num: int = 300) -> Labels:
     torch.manual_seed(9)
     derivation, _ = derive_complete(run.model.grammar, run.model.prior, num, run.model.max_steps)
-    return Labels(count(run.model, derivation), derivation)
+    return Labels(count_structures(run.model, derivation), derivation)
 
 
 def test_each_run_is_as_far_from_the_truth_as_evaluate_says(two, target):
@@ -91,8 +90,8 @@ def test_rows_are_plain_histograms(two, target):
             share[name] = np.bincount(of(source.counts), minlength=20) / len(source.counts)
             assert np.allclose(row.shares[name], share[name][: len(row.shares[name])])
             assert row.means[name] == pytest.approx(of(source.counts).mean())
-        assert set(row.apart) == {"prior", "lstm", "pcfg"}
-        for name, apart in row.apart.items():
+        assert set(row.total_variation) == {"prior", "lstm", "pcfg"}
+        for name, apart in row.total_variation.items():
             assert apart == pytest.approx(np.abs(share[name] - share["truth"]).sum() / 2)
 
 
@@ -117,8 +116,8 @@ def test_where_kinds_nest_children_are_compared_by_rank(nested):
         share = np.bincount(expected) / len(expected)
         assert np.allclose(rows[words].shares["truth"][: len(share)], share)
         assert rows[words].means["truth"] == pytest.approx(np.mean(expected))
-        assert 0 < rows[words].apart["a"] < 1
-    structures = sampled(first.model, nested["b"].guide, 300, 0)
+        assert 0 < rows[words].total_variation["a"] < 1
+    structures = sample_counts(first.model, nested["b"].guide, 300, 0)
     assert np.array_equal(found.sources["b"].counts, structures.counts)
     assert set(found.likelihoods) == {"prior", "a", "b"}
     assert found.likelihoods["b"].nats.value == pytest.approx(
@@ -129,7 +128,7 @@ def test_where_kinds_nest_children_are_compared_by_rank(nested):
 def test_without_truth_and_estimate_there_are_means_alone(nested, call, tmp_path):
     found = compare(nested, None, None, quiet, num=200)
     assert found.reference is None and found.distances() == {}
-    assert all(not row.apart for row in found.rows())
+    assert all(not row.total_variation for row in found.rows())
     json.dumps(found.record(), allow_nan=False)
     paths = [run.path for run in nested.values()]
     done = call("compare", *paths, "--out", tmp_path / "c.png", "--num", 200)
@@ -139,7 +138,7 @@ def test_without_truth_and_estimate_there_are_means_alone(nested, call, tmp_path
 
 def test_the_picture_has_a_bar_for_every_share(nested):
     found = compare(nested, None, truth_of(nested["a"]), quiet, num=300)
-    rows, names = shown(found), list(found.sources)
+    rows, names = picture_rows(found), list(found.sources)
     labels = [row.label for row in rows]
     assert labels[:3] == ["objects per image", "mug per image", "plate per image"]
     assert "mug per first plate" in labels and "mug per plate" not in labels
@@ -151,16 +150,16 @@ def test_the_picture_has_a_bar_for_every_share(nested):
             heights = [bar.get_height() for container in cell.containers for bar in container]
             share = row.shares.get(name, np.zeros(0))
             assert np.allclose(heights, share[: len(heights)]) and share[len(heights) :].sum() < 0.05
-            if name in row.apart:
-                assert f"TV {row.apart[name]:.3f}" in cell.get_title(loc="right")
+            if name in row.total_variation:
+                assert f"TV {row.total_variation[name]:.3f}" in cell.get_title(loc="right")
     assert [text.get_text() for cell in axes[: len(names)] for text in cell.texts] == names
 
 
 def test_many_classes_share_one_row(tmp_path):
     runs = open_runs([untrained(tmp_path / "run", "multi_mnist", 0)])
     found = compare(runs, None, truth_of(runs["run"], 100), quiet, num=100)
-    assert [row.label for row in shown(found)] == ["objects per image", "class of an object"]
-    (_, row), ticks = shown(found), picture(found).axes[-1].get_xticklabels()
+    assert [row.label for row in picture_rows(found)] == ["objects per image", "class of an object"]
+    (_, row), ticks = picture_rows(found), picture(found).axes[-1].get_xticklabels()
     assert row.shares["truth"].sum() == pytest.approx(1) and [t.get_text() for t in ticks] == list("0123456789")
     assert len(found.rows()) == 1 + 10
 
@@ -176,7 +175,9 @@ def test_the_command_draws_prints_and_writes_the_same(call, two, target, tmp_pat
     assert record == json.loads(json.dumps(expected.record()))
     assert record["runs"]["pcfg"]["guide"] == {"kind": "pcfg"} and record["reference"] == "truth"
     for row in expected.rows():
-        figures = ((row.apart[name], row.moved[name], row.means[name]) for name in ("prior", "lstm", "pcfg"))
+        figures = (
+            (row.total_variation[name], row.wasserstein[name], row.means[name]) for name in ("prior", "lstm", "pcfg")
+        )
         cells = r"\D+".join(f"{apart:.3f} {moved:.3f} \\({mean:.2f}\\)" for apart, moved, mean in figures)
         assert re.search(rf"{row.label}\D+{cells}", done.out), row.label
     assert "TV and W-1 to the truth" in done.out and "…" not in done.out
@@ -189,7 +190,7 @@ def test_the_command_draws_prints_and_writes_the_same(call, two, target, tmp_pat
 
 def test_the_runs_own_target_is_taken_where_none_is_named(call, two, target, tmp_path):
     done = call("compare", *two, "--num", 100, "--out", tmp_path / "c.png")
-    assert done.code == 0 and "what the feature network sees" in done.out and "An estimate without labels" in done.out
+    assert done.code == 0 and "what the feature network reads" in done.out and "An estimate without labels" in done.out
     done = call("compare", *two, "--labels", target.labels, "--num", 100, "--out", tmp_path / "c.png")
     assert done.code == 0 and "TV and W-1 to the truth" in done.out
 
@@ -218,16 +219,16 @@ def test_what_cannot_be_compared(call, two, nested, target, tmp_path):
     record = json.loads((elsewhere / "run.json").read_text())
     (elsewhere / "run.json").write_text(json.dumps(record | {"target": "other"}))
     for paths, *parts in (
-        ([lstm, nested["a"].path], "Expected runs of one model", "discs.py", "plates.py"),
+        ([lstm, nested["a"].path], "expected runs of one model", "discs.py", "plates.py"),
         ([lstm, tmp_path / "more" / "lstm"], "different names", "another 'lstm'"),
         ([tmp_path / "prior"], "none of them prior"),
-        ([lstm, tmp_path / "unfinished"], "Expected a finished fit", "--resume"),
-        ([lstm, tmp_path / "none"], "Expected a run folder"),
+        ([lstm, tmp_path / "unfinished"], "expected a finished fit", "--resume"),
+        ([lstm, tmp_path / "none"], "expected a run folder"),
         ([lstm, elsewhere], "fitted to the same images", "--target"),
     ):
         done = call("compare", *paths, *out)
         last = done.err.splitlines()[-1]
-        assert done.code == 2 and last.startswith("probscene: Expected"), done.err
+        assert done.code == 2 and last.startswith("probscene: expected"), done.err
         assert all(part in last for part in parts), last
     done = call("compare", lstm, "--out", tmp_path)
     assert done.code == 2 and "name a file in it" in done.err

@@ -20,9 +20,9 @@ from probscene.app.evaluation.count_errors import count_errors
 from probscene.app.evaluation.evaluate import evaluate, network_counts
 from probscene.app.evaluation.labels import Labels, counts_of_dataset
 from probscene.app.evaluation.sources import Source
-from probscene.app.evaluation.structure_counts import StructureCounts, sampled
+from probscene.app.evaluation.structure_counts import StructureCounts, sample_counts
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.counts import read_table, write_counts
+from probscene.app.labels.counts import read_table, write_counts
 from probscene.app.loading import load_model
 from probscene.app.views.comparison import draw
 from probscene.app.views.tables import show
@@ -37,7 +37,7 @@ def quiet(*_):
 
 
 def structure_counts(model, policy, num, seed, each=None):
-    return sampled(model, policy, num, seed, each).counts
+    return sample_counts(model, policy, num, seed, each).counts
 
 
 def labels(counts) -> Labels:
@@ -138,7 +138,7 @@ def test_what_was_read_of_each_image_is_held_against_its_labels(fitted, target):
     table = found_table(found)
     assert "Counts read in each labelled image" in table and f"{found.errors['red'].mean_absolute.value:.2f}" in table
     assert not evaluate(run, opened(target.images), None, quiet, num=20).errors
-    paper = RunFolder(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
+    paper = RunFolder(run.path, run.record | {"config": run.config.with_features("presence").to_record()})
     without = evaluate(paper, opened(target.images), labels(target.counts), quiet, num=20)
     assert without.errors == dict.fromkeys(CLASSES) and re.search(r"red +│ +- │ +- │ +- ", found_table(without))
 
@@ -191,7 +191,7 @@ def test_readings_are_compared_with_readings_so_that_the_networks_errors_cancel(
 
 def test_a_network_that_does_not_count_gives_no_estimate(fitted, target):
     run = RunFolder.at(fitted)
-    paper = RunFolder(run.path, run.record | {"preset": run.record["preset"] | {"features": "presence"}})
+    paper = RunFolder(run.path, run.record | {"config": run.config.with_features("presence").to_record()})
     assert network_counts(paper, opened(target.images), quiet) is None
     assert list(evaluate(paper, None, None, quiet, num=20).sources) == ["prior", "learnt"]
 
@@ -208,7 +208,7 @@ def test_where_fits_set_out_from_another_policy_it_is_a_source(fitted, target, t
     json.dumps(found.record())
     console = Console(width=200, file=io.StringIO())
     show(found, console)
-    assert console.file.getvalue().count("start") >= 4
+    assert console.file.getvalue().count("initialisation") >= 4
     several = compare({"one": run}, opened(target.images), None, quiet, num=50)
     assert list(several.sources) == ["prior", "start", "one", "estimate"]
     assert list(several.distances()["estimate"]) == ["prior", "start", "one"]
@@ -262,8 +262,8 @@ LABELS = {
     "another case": (changed(0, "image,red,Blue"), "'Blue'", "did you mean 'blue'"),
     "no image column": (changed(0, "name,red,blue"), "image,red,blue"),
     "no header": (changed(0, None), "image,red,blue"),
-    "nothing": (lambda lines: [], "actual none"),
-    "short row": (changed(3, "000002.png,1"), "3 fields in line 4", "actual 2"),
+    "nothing": (lambda lines: [], "got none"),
+    "short row": (changed(3, "000002.png,1"), "3 fields in line 4", "got 2"),
     "unknown image": (changed(3, "x.png,1,0"), "line 4", "'x.png'"),
     "twice": (changed(3, "000001.png,1,0"), "second one of 000001.png in line 4"),
     "missing": (lambda lines: lines[:-2], "000038.png and 1 more"),
@@ -285,7 +285,7 @@ def test_wrong_labels(fault, call, fitted, target, tmp_path):
     result = call("evaluate", fitted, *words)
     assert result.code == 2 and not (tmp_path / "e.json").exists()
     last = result.err.splitlines()[-1]
-    assert last.startswith("probscene: Expected ")
+    assert last.startswith("probscene: expected ")
     assert all(part in last for part in parts), last
 
 
@@ -295,7 +295,7 @@ def test_labels_that_are_no_text_or_not_there(target, tmp_path):
     with pytest.raises(DataError, match="UTF-8"):
         read_table(tmp_path / "c.csv", CLASSES, images)
     for path in (tmp_path, tmp_path / "none.csv"):
-        with pytest.raises(DataError, match="Expected a file of labels"):
+        with pytest.raises(DataError, match="expected a file of labels"):
             read_table(path, CLASSES, images)
 
 
@@ -308,9 +308,9 @@ def test_rows_of_bad_files_are_passed_over(target, tmp_path):
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=30))
 def test_a_sources_histograms_are_shares(rows):
-    source = Source.of(np.array(rows))
+    source = Source.from_counts(np.array(rows))
     assert source.total.tolist() == [a + b for a, b in rows]
     assert source.number().share.sum() == pytest.approx(1)
     assert source.classes().share.sum() == pytest.approx(1 if any(map(any, rows)) else 0)
     random.Random(0).shuffle(rows)
-    assert np.allclose(Source.of(np.array(rows)).number().share, source.number().share)
+    assert np.allclose(Source.from_counts(np.array(rows)).number().share, source.number().share)

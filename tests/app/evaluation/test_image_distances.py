@@ -6,12 +6,13 @@ import math
 import pytest
 import torch
 
-from probscene.app.evaluation.image_distances import as_of, image_distances
+from probscene.app.evaluation.image_distances import caveat, extrapolate, image_distances
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import features_in, features_of, own_net
+from probscene.app.views.tables import sample_sizes
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.judging.image_metrics import fid, kid
+from probscene.inference.statistics.image_metrics import fid, kid
 
 
 @pytest.fixture(scope="module")
@@ -57,14 +58,14 @@ def test_all_images_where_asked(run, images):
     halves = [distance(real[:20], real[20:], "run", seed=2) for distance in (kid, fid)]
     assert floor.value == pytest.approx(halves[0].value, rel=1e-3, abs=1e-6) and floor.images == 20
     assert biased.value == pytest.approx(halves[1].value / 2, rel=1e-3) and biased.images == 40
-    assert "estimated from 20 images" in biased.note
+    assert "estimated from 20 images" in caveat(biased)
 
 
 def test_fid_of_two_samples_of_one_distribution_falls_as_one_over_their_number():
     sampled = torch.randn(4, 2000, 6, generator=torch.Generator().manual_seed(0))
     few = [fid(one[:400], one[400:800], "noise", size=2) for one in sampled]
     many = sum(fid(one[:1000], one[1000:], "noise", size=2).value for one in sampled) / 4
-    assert sum(as_of(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
+    assert sum(extrapolate(figure, 1000).value for figure in few) / 4 == pytest.approx(many, rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_fid_takes_no_more_than_half_of_the_target_and_kid_all_that_is_asked_for
     assert numbers.pop("floor") == [(20, 20), (a_side, a_side)]
     assert list(numbers.values()) == 2 * [[(real, generated), (a_side, a_side)]]
     said = f"{real} images a side" if real == generated else f"{real} real, {generated} generated images"
-    assert [figure.of_images for figure in found["prior"]] == [said, f"{a_side} images a side"]
+    assert [sample_sizes(figure) for figure in found["prior"]] == [said, f"{a_side} images a side"]
 
 
 def test_faults_come_before_any_work(run, images, target, tmp_path):
@@ -86,14 +87,14 @@ def test_faults_come_before_any_work(run, images, target, tmp_path):
         raise AssertionError
 
     assert image_distances(run, images, [], never) == {}
-    with pytest.raises(ProbsceneError, match="run, efficientnet, .* or resnet50=FILE, actual 'vgg'"):
+    with pytest.raises(ProbsceneError, match="run, efficientnet, .* or resnet50=FILE, got 'vgg'"):
         image_distances(run, images, ["run", "vgg"], never)
-    with pytest.raises(ProbsceneError, match="at least 2 images to compare, actual 1"):
+    with pytest.raises(ProbsceneError, match="at least 2 images to compare, got 1"):
         image_distances(run, images, ["run"], never, 1)
     for name in ("000000.png", "000001.png", "000002.png"):
         (tmp_path / name).write_bytes((target.images / name).read_bytes())
     few = ImageFolder(tmp_path, run.model.canvas, run.model.channels)
-    with pytest.raises(DataError, match="at least 4 images .* actual 3"):
+    with pytest.raises(DataError, match="at least 4 images .* got 3"):
         image_distances(run, few, ["run"], never)
 
 
@@ -112,7 +113,7 @@ def test_the_command_prints_and_writes_them(call, fitted, target, tmp_path):
     said = "".join(shown.out.split())  # a title may be wider than its table
     assert "inthefeaturesofefficientnet-lite0" in said and shown.out.index("KID, 10") < shown.out.index("FID, 10")
     refused = call(*words[:-4], "--images", "many", "--features", "run")
-    assert refused.code == 2 and "number of images to compare, or all, actual 'many'" in refused.err
+    assert refused.code == 2 and "number of images to compare, or all, got 'many'" in refused.err
     assert "FID of 10 images in 1280 dimensions" in shown.out and "two halves of the target" in shown.out
     wrong = call(*words, "--features", "resnet", "--json", tmp_path / "f.json")
-    assert wrong.code == 2 and "actual 'resnet'" in wrong.err and not (tmp_path / "f.json").exists()
+    assert wrong.code == 2 and "got 'resnet'" in wrong.err and not (tmp_path / "f.json").exists()

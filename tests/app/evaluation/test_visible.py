@@ -13,13 +13,20 @@ from hypothesis import strategies as st
 from probscene.app.chunks import draw_chunk
 from probscene.app.evaluation.evaluate import evaluate
 from probscene.app.evaluation.labels import read_labels
-from probscene.app.evaluation.structure_counts import sampled
-from probscene.app.evaluation.visible import Seen, hidden, seen_by, shown, visible_shares, whole_note
+from probscene.app.evaluation.structure_counts import sample_counts
+from probscene.app.evaluation.visible import (
+    Visibility,
+    count_visible,
+    hidden_note,
+    hidden_shares,
+    visibility,
+    visible_shares,
+)
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model, renderer_for
 from probscene.dataset import ImageFolder
 from probscene.errors import ProbsceneError, RunError
-from probscene.inference.judging.metrics import histogram, total_variation, wasserstein
+from probscene.inference.statistics.count_metrics import histogram, total_variation, wasserstein
 
 CLASSES = ("red", "blue")
 
@@ -40,7 +47,7 @@ shares = st.floats(0, 1) | st.sampled_from([0.0, 0.25, 1.0])
 
 @given(st.fixed_dictionaries({}, optional={name: shares for name in CLASSES}), st.floats(0, 30), st.integers(1, 20))
 def test_objects_count_that_are_seen_well_enough(model, drawn, least, height, num):
-    counts = shown(model, model.prior, num, 3, Seen(height, least))
+    counts = count_visible(model, model.prior, num, 3, Visibility(height, least))
     expected = np.zeros((num, 2), np.int64)
     for n in range(num):
         for m, kind in enumerate(drawn.kind[n].tolist()):
@@ -56,8 +63,10 @@ def test_objects_count_that_are_seen_well_enough(model, drawn, least, height, nu
 @given(shares, shares)
 def test_fewer_count_where_more_must_be_seen(model, one, other):
     low, high = sorted((one, other))
-    each = [shown(model, model.prior, 10, 0, Seen(0, visible_shares(share, CLASSES))) for share in (low, high)]
-    assert (each[0] >= each[1]).all() and (each[0] <= sampled(model, model.prior, 64, 0).counts.max()).all()
+    each = [
+        count_visible(model, model.prior, 10, 0, Visibility(0, visible_shares(share, CLASSES))) for share in (low, high)
+    ]
+    assert (each[0] >= each[1]).all() and (each[0] <= sample_counts(model, model.prior, 64, 0).counts.max()).all()
 
 
 def test_shares_in_numbers_and_in_words():
@@ -71,18 +80,18 @@ def test_shares_in_numbers_and_in_words():
     ("given", "part"),
     [
         (1.5, "1.5"), (-0.1, "-0.1"), (float("nan"), "nan"), (["x"], "'x'"), (["red="], "''"), (["red=1.1"], "1.1"),
-        (["Red=0.5"], "'Red'"), (["red=0", "red=1"], "red, actual two"), (["0", "1"], "all classes, actual two"),
-        ({"green": 0.5}, "red, blue, actual 'green'"), ({"red": "a"}, "'a'"), ({"red": True}, "True"),
+        (["Red=0.5"], "'Red'"), (["red=0", "red=1"], "red, got two"), (["0", "1"], "all classes, got two"),
+        ({"green": 0.5}, "red, blue, got 'green'"), ({"red": "a"}, "'a'"), ({"red": True}, "True"),
     ],
 )  # fmt: skip
 def test_shares_that_are_none(given, part):
-    with pytest.raises(ProbsceneError, match="^Expected .*visible share") as error:
+    with pytest.raises(ProbsceneError, match="^expected .*visible share") as error:
         visible_shares(given, CLASSES)
     assert part in str(error.value)
 
 
 def test_the_hidden_are_what_is_hardly_seen(model, drawn):
-    found = hidden(model, model.prior, [1], 3)
+    found = hidden_shares(model, model.prior, [1], 3)
     batches = [drawn, renderer_for(model)(draw_chunk(model, model.prior, 3, 1).drawing)]
     blue = [float(v) for b in batches for v in b.visible[b.kind == model.grammar.kind("blue")]]
     assert found == {"blue": pytest.approx(sum(v < 0.25 for v in blue) / len(blue))}
@@ -101,21 +110,23 @@ def test_a_run_knows_what_labels_count(run, fitted, target):
     model = run.model
     assert run.visible_shares() == {"red": 0.5} and RunFolder.at(fitted).visible_shares() == {}
     truth = read_labels(target.labels, model, ImageFolder(target.images, model.canvas, model.channels))
-    assert seen_by(model, RunFolder.at(fitted), truth, None) == (None, ())
-    seen, (note,) = seen_by(model, run, truth, None)
-    assert seen == Seen(0.0, {"red": 0.5}) and "red 50 %, as the run's labels were read" in note
-    assert seen_by(model, run, truth._replace(min_height=9.0), 0.25)[0] == Seen(9.0, {"red": 0.25, "blue": 0.25})
+    assert visibility(model, RunFolder.at(fitted), truth, None) == (None, ())
+    seen, (note,) = visibility(model, run, truth, None)
+    assert seen == Visibility(0.0, {"red": 0.5}) and "red 50 %, as the run's labels were read" in note
+    assert visibility(model, run, truth._replace(min_height=9.0), 0.25)[0] == Visibility(
+        9.0, {"red": 0.25, "blue": 0.25}
+    )
     structures = truth._replace(derivation=SimpleNamespace())
-    assert seen_by(model, run, structures, None) == (None, ())
-    with pytest.raises(ProbsceneError, match="actual whole structures"):
-        seen_by(model, run, structures, 0.25)
+    assert visibility(model, run, structures, None) == (None, ())
+    with pytest.raises(ProbsceneError, match="got whole structures"):
+        visibility(model, run, structures, 0.25)
     for text in ("{", "[]", '{"classes": {"red": {"visible": "much"}}}'):
         (run.path / "readings.json").write_text(text)
         with pytest.raises(RunError, match="readings.json"):
             run.visible_shares()
     (run.path / "readings.json").write_text('{"classes": {"red": {"visible": 2}}}')
     with pytest.raises(RunError, match="visible shares"):
-        seen_by(model, run, truth, None)
+        visibility(model, run, truth, None)
 
 
 def test_shares_are_said_to_be_read_by_what_they_were_read_by(run):
@@ -123,7 +134,7 @@ def test_shares_are_said_to_be_read_by_what_they_were_read_by(run):
     for red, blue in itertools.product(how, how):
         read = {"red": {"visible": 0.5, "by": red}, "blue": {"visible": 0.25, "by": blue}}
         (run.path / "readings.json").write_text(json.dumps({"classes": read}))
-        _, (note,) = seen_by(run.model, run, None, None)
+        _, (note,) = visibility(run.model, run, None, None)
         groups = note.partition("visible: ")[2].split("; ")
         assert len(groups) == len({how[red], how[blue]})
         for name, by in (("red 50 %", red), ("blue 25 %", blue)):
@@ -133,15 +144,15 @@ def test_shares_are_said_to_be_read_by_what_they_were_read_by(run):
 
 def test_a_note_says_where_it_matters(monkeypatch, model, target):
     truth = read_labels(target.labels, model, ImageFolder(target.images, model.canvas, model.channels))
-    here = "probscene.app.evaluation.visible.hidden"
+    here = "probscene.app.evaluation.visible.hidden_shares"
     monkeypatch.setattr(here, lambda *_: {"red": 0.021, "blue": 0.02})
-    (note,) = whole_note(model, model.prior, truth, None)
+    (note,) = hidden_note(model, model.prior, truth, None)
     assert "2 % of red" in note and "blue" not in note and "--visible 0.25" in note
     monkeypatch.setattr(here, lambda *_: {"red": 0.01})
-    assert whole_note(model, model.prior, truth, None) == ()
+    assert hidden_note(model, model.prior, truth, None) == ()
     monkeypatch.setattr(here, lambda *_: pytest.fail("nothing to look at"))
-    for labels, seen in ((None, None), (truth, Seen()), (truth._replace(derivation=SimpleNamespace()), None)):
-        assert whole_note(model, model.prior, labels, seen) == ()
+    for labels, seen in ((None, None), (truth, Visibility()), (truth._replace(derivation=SimpleNamespace()), None)):
+        assert hidden_note(model, model.prior, labels, seen) == ()
 
 
 def test_every_command_counts_what_can_be_seen(call, fitted, target, tmp_path):
@@ -150,7 +161,7 @@ def test_every_command_counts_what_can_be_seen(call, fitted, target, tmp_path):
     assert done.code == 0 and "red 90 %, blue 100 %" in done.out, done.err
     found = json.loads((tmp_path / "e.json").read_text())
     run = RunFolder.at(fitted)
-    counts = shown(run.model, run.guide, 64, 0, Seen(0, {"red": 0.9, "blue": 1.0}))
+    counts = count_visible(run.model, run.guide, 64, 0, Visibility(0, {"red": 0.9, "blue": 1.0}))
     assert found["sources"]["learnt"]["means"] == dict(zip(CLASSES, counts.mean(0).tolist(), strict=True))
     for c, name in enumerate(CLASSES):
         one, other = histogram(counts[:, c]), histogram(target.counts[:, c])
@@ -177,12 +188,12 @@ def test_every_command_counts_what_can_be_seen(call, fitted, target, tmp_path):
     done = call("compare", fitted, *words, "--out", tmp_path / "c.png", "--some-labels")
     assert done.code == 0 and f"({target.counts[:5, 0].mean():.2f})" in done.out, done.err
     done = call("evaluate", fitted, "--target", target.images, "--visible", "green=0.5")
-    assert done.code == 2 and "red, blue, actual 'green'" in done.err
+    assert done.code == 2 and "red, blue, got 'green'" in done.err
 
 
 def test_a_share_holds_without_labels(fitted, target):
     run = RunFolder.at(fitted)
     images = ImageFolder(target.images, run.model.canvas, run.model.channels)
     found = evaluate(run, images, None, lambda *_: None, 64, visible={"red": 1.0})
-    expected = shown(run.model, run.guide, 64, 0, Seen(0, {"red": 1.0}))
+    expected = count_visible(run.model, run.guide, 64, 0, Visibility(0, {"red": 1.0}))
     assert np.array_equal(found.sources["learnt"].counts, expected)

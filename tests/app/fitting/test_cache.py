@@ -60,29 +60,32 @@ def test_the_second_fit_takes_it_and_has_the_same_bytes(fit, discs, whole, fitte
 
 
 def test_python_takes_it_too(discs, target, whole, fitted, capsys):
-    options = {"settings": discs.short, "threads": 1, "cache": whole}
-    run = ps.fit(discs.file, target.images, "quick", **options)
+    config, execution = (
+        ps.preset("quick").set("features=count", "parameters=none", discs.short),
+        ps.Execution(threads=1, cache=whole),
+    )
+    run = ps.fit(discs.file, target.images, config, execution=execution)
     assert "was trained before" in " ".join(capsys.readouterr().err.split()) and same(run, fitted)
 
 
 def test_what_learns_from_it_does_not_matter(fit, discs, whole):
-    for more in (["--guide", "pcfg"], ["--objective", "witness"], ["--set", "batches=2"]):
+    for more in (["--guide", "pcfg"], ["--divergence", "witness"], ["--set", "structure.batches=2"]):
         assert fit(discs.file, *more)[1], more
 
 
 OTHERS = {
     "seed": ["--seed", "1"],
-    "schedule": ["--set", "count.steps=40"],
-    "size": ["--set", "width=4,4,8"],
+    "schedule": ["--set", "features.schedule.steps=40"],
+    "size": ["--set", "features.width=4,4,8"],
     "threads": ["--threads", "2"],
-    "network": ["--features", "presence", "--set", "presence_images=40", "--set", "presence_epochs=1"],
+    "network": ["--features", "presence", "--set", "features.images=40", "--set", "features.epochs=1"],
 }
 
 
 @pytest.mark.parametrize("what", OTHERS)
 def test_another_one_is_another_entry(fit, discs, whole, what):
-    unread = ("count", "width") if what == "network" else ()
-    words = [word for word in discs.without(*unread) if word != "--no-cache"]
+    unread = ("features",) if what == "network" else ()
+    words = [word for word in discs.without("parameters", *unread) if word != "--no-cache"] + ["--learn", "structure"]
     assert not fit(discs.file, *OTHERS[what], words=words)[1]
     assert fit(discs.file, *OTHERS[what], words=words)[1]
     assert len(list((whole / "features").glob("*.safetensors"))) == 2
@@ -122,11 +125,13 @@ def test_features_in_a_file_are_known_by_its_bytes_and_their_weights(fit, discs,
     part.write_text(PART.format(weights=str(weights)))
     weights.write_text("0.5")
     own = ["--features", f"{part}:Own"]
-    assert not fit(discs.file, *own)[1] and fit(discs.file, *own)[1]
+    words = [word for word in discs.without("features", "parameters") if word != "--no-cache"]
+    words += ["--learn", "structure"]
+    assert not fit(discs.file, *own, words=words)[1] and fit(discs.file, *own, words=words)[1]
     weights.write_text("0.25")  # as where pretrained ones are another version's
-    assert not fit(discs.file, *own)[1]
+    assert not fit(discs.file, *own, words=words)[1]
     part.write_text(part.read_text() + "\n# changed\n")
-    assert not fit(discs.file, *own)[1]
+    assert not fit(discs.file, *own, words=words)[1]
 
 
 def test_other_assets_are_another_entry(whole, python_of, tmp_path):
@@ -207,8 +212,13 @@ def test_a_cache_that_cannot_be_written_does_no_harm(fit, discs, fitted, tmp_pat
 
 def test_models_and_features_in_memory_are_not_kept(discs, target, tmp_path):
     model = replace(ps.load_model(discs.file), name="in memory")
-    options = {"settings": discs.short, "threads": 1, "progress": False, "cache": tmp_path / "cache"}
-    ps.fit(model, target.images, "quick", **options)
+    execution = ps.Execution(threads=1, progress=False, cache=tmp_path / "cache")
+    ps.fit(
+        model,
+        target.images,
+        ps.preset("quick").set("features=count", "parameters=none", discs.short),
+        execution=execution,
+    )
     assert not (tmp_path / "cache").exists()
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from probscene.app.fitting.presets import takers_of_labels
+from probscene.app.fitting.config import takers_of_labels
 from probscene.app.fitting.run import RunFolder
 
 PARTS = """
@@ -53,7 +53,7 @@ def few(target, tmp_path):
 
 
 def words(discs, target, out, *more):
-    return ["fit", discs.file, "--target", target.images, "--out", out, *discs.settings, *more]
+    return ["fit", discs.file, "--target", target.images, "--out", out, *discs.without("features"), *more]
 
 
 def test_a_network_is_given_what_is_labelled(call, discs, target, parts, few, tmp_path):
@@ -74,13 +74,13 @@ def test_labels_are_checked_before_anything_is_written(call, discs, target, part
     out = tmp_path / "run"
     done = call(*words(discs, target, out, "--labels", few, "--features", "count"))
     assert done.code == 2 and not out.exists()
-    assert "Expected features that labels can calibrate, actual 'count'" in done.err
+    assert "expected features that labels can calibrate, got 'count'" in done.err
     assert all(f"--features {name}" in done.err for name in takers_of_labels())
     few.write_text(few.read_text().replace("000001.png,", "000001.png,x"))
     done = call(*words(discs, target, out, "--features", parts, "--labels", few))
     assert done.code == 2 and not out.exists() and "of 000001.png" in done.err
     done = call(*words(discs, target, out, "--features", parts, "--labels", tmp_path / "none.csv"))
-    assert done.code == 2 and not out.exists() and "none.csv, actual none" in done.err
+    assert done.code == 2 and not out.exists() and "none.csv, got none" in done.err
 
 
 def test_a_run_goes_on_with_the_labels_it_was_begun_with(call, discs, target, parts, few, tmp_path):

@@ -6,6 +6,8 @@ import torch
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import preset
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.model import SceneModel, scene_model
@@ -46,12 +48,19 @@ def both(lit: bool) -> SceneModel:
 def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
     truth, model = both(True), both(False)
     generate_scenes(truth, truth.prior, 200, tmp_path / "target", format="images")
-    settings = {"count.steps": 150, "count.images": 8, "width": "8,16,32", "batches": 4, "num_scenes": 60}
-    settings |= {"pretrain_derivations": 300, "parameters.reader_steps": 150, "parameters.steps": 150}
+    settings = {
+        "features.schedule.steps": 150,
+        "features.schedule.images": 8,
+        "features.width": "8,16,32",
+        "structure.batches": 4,
+        "structure.num_scenes": 60,
+    }
+    settings |= {"pretrain.derivations": 300, "parameters.reader_steps": 150, "parameters.steps": 150}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 40, "parameters.round_steps": 60}
     settings |= {"parameters.energy_steps": 5, "parameters.energy_scenes": 40}
-    learn = {"learn": "structure,parameters", "features": "count", "threads": 1, "cache": False, "progress": False}
-    run = fit(model, tmp_path / "target" / "images", "quick", settings=settings, out=tmp_path / "run", **learn)
+    config = preset("quick").set("features=count", settings)
+    execution = Execution(1, cache=False, progress=False)
+    run = fit(model, tmp_path / "target" / "images", config, out=tmp_path / "run", execution=execution)
     record = run.parameters
     assert [(site["name"], site["kinds"]) for site in record["sites"]] == [
         ("lamp.light", []),
@@ -60,7 +69,7 @@ def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
     ]
     assert all(site["learnt"] for site in record["sites"]) and record["kept"] == "learnt"
 
-    def beside(policy):
+    def prefixed(policy):
         seed_everything(0)
         scenes = sample(run.model, policy, 300)
         values = [(scenes.parameters[name], scenes.site_mask[name]) for name in scenes.parameters]
@@ -70,6 +79,6 @@ def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
             for name in NUMBERS
         }
 
-    prior, learnt = beside(run.model.prior), beside(run.guide)
+    prior, learnt = prefixed(run.model.prior), prefixed(run.guide)
     for name in NUMBERS:
         assert learnt[name][0] < 0.3 * prior[name][0] and learnt[name][1] > 0.8 > 0.7 > prior[name][1], name

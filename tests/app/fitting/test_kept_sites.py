@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from probscene.app.fitting.learnt import judged
+from probscene.app.fitting import site_selection as select_sites
 
 
 def rows(mean, number):
@@ -17,7 +17,7 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
     """Of ``x`` learnt renders are nearer, of ``w`` farther; of ``z`` nothing is read in the target."""
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset("u"))
+        calibrated = SimpleNamespace(low_skill_sites=frozenset("u"))
 
         def site_rows(self, images):
             assert set(images) == {"learnt", "prior", "target"}
@@ -33,8 +33,8 @@ def test_sites_keep_the_prior_by_what_is_read_of_them():
             }
 
     images = dict.fromkeys(("learnt", "prior", "target"), torch.zeros(0))
-    assert judged.passed(Learning(), Learning().site_rows(images), careful=True) == {"y", "z", "w"}
-    assert judged.passed(Learning(), Learning().site_rows(images), careful=False) == {"w"}
+    assert select_sites.sites_to_reset(Learning(), Learning().site_rows(images), careful=True) == {"y", "z", "w"}
+    assert select_sites.sites_to_reset(Learning(), Learning().site_rows(images), careful=False) == {"w"}
 
 
 class Renders:
@@ -43,11 +43,13 @@ class Renders:
 
     def __init__(self, learnt: dict[str, float], moves: dict[str, float], of_scenes: tuple[str, ...] = ()):
         self.learnt, self.moves, self.seed = learnt, moves, 0
-        self.tried = SimpleNamespace(unclear=frozenset(learnt), lost=lambda renders: {"lost": 0.1})
+        self.calibrated = SimpleNamespace(
+            low_skill_sites=frozenset(learnt), unidentifiable_sites=lambda renders: {"lost": 0.1}
+        )
         self.scene_sites = [SimpleNamespace(name=name) for name in of_scenes]
         self.asked = []
 
-    def own_scenes(self, kept):
+    def guide_scenes(self, kept):
         self.asked.append(kept)
         values = {name: value * (name not in kept) for name, value in self.learnt.items()}
         u = torch.linspace(0, 0.5, 50)[:, None] + torch.tensor([0.1 * values[s.name] for s in self.scene_sites])
@@ -69,25 +71,28 @@ class Renders:
 def test_unclear_sites_are_learnt_where_renders_without_them_are_farther():
     """``u`` and ``v`` are as the target has them; ``w`` is not, nor ``lost``, which would be nearer."""
     learning = Renders({"u": 1.0, "v": 1.0, "w": -1.0, "lost": 1.0}, {})
-    kept, because = judged.of_unclear(learning, torch.zeros(400), frozenset("k"))
+    kept, because = select_sites.reset_low_skill_sites(learning, torch.zeros(400), frozenset("k"))
     assert kept == {"w", "lost"}
     assert because == {"lost": "in renders that look like the target 10% of its variance can be read"}
     assert all("k" in each for each in learning.asked) and len(learning.asked) == 5
     nothing = Renders({"w": -1.0, "lost": 1.0}, {})
-    assert judged.of_unclear(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"} and len(nothing.asked) == 2
+    assert (
+        select_sites.reset_low_skill_sites(nothing, torch.zeros(400), frozenset())[0] == {"w", "lost"}
+        and len(nothing.asked) == 2
+    )
 
 
 def test_an_unclear_site_of_scenes_that_hardly_moves_keeps_its_prior():
     """As ``u`` does, and as ``v`` does not; ``w`` moves as little, but is of objects."""
     learning = Renders({"u": 0.9, "v": 1.1, "w": 0.9}, {}, of_scenes=("v", "u"))
-    kept, because = judged.of_unclear(learning, torch.zeros(400), frozenset())
+    kept, because = select_sites.reset_low_skill_sites(learning, torch.zeros(400), frozenset())
     assert kept == {"u"} and because["u"] == "it would be 0.09 of u from its prior, no farther than it may be misread"
 
 
 def test_what_is_learnt_wrongly_is_not_in_the_way_of_the_others():
     """What is read of ``u`` is moved by ``w``, which is learnt wrongly: with it ``u`` comes hardly nearer."""
     learning = Renders({"u": 1.0, "w": -1.0}, {"w": 0.4})
-    assert judged.of_unclear(learning, torch.zeros(400), frozenset())[0] == {"w"}
+    assert select_sites.reset_low_skill_sites(learning, torch.zeros(400), frozenset())[0] == {"w"}
     assert learning.asked[-1] == {"w"}
 
 
@@ -95,7 +100,7 @@ def test_of_many_sites_none_is_learnt_by_chance():
     """Of forty learnt renders are as far away as the prior's; of one they are nearer, which is seen all the same."""
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset())
+        calibrated = SimpleNamespace(low_skill_sites=frozenset())
 
         def site_rows(self, images):
             torch.manual_seed(0)
@@ -104,7 +109,9 @@ def test_of_many_sites_none_is_learnt_by_chance():
             return nothing | {"x": {name: rows(float(name == "prior"), 120) for name in images}}
 
     images = {name: torch.zeros(0) for name in ("learnt", "prior", "target")}
-    assert judged.passed(Learning(), Learning().site_rows(images), careful=True) == {f"n{i}" for i in range(40)}
+    assert select_sites.sites_to_reset(Learning(), Learning().site_rows(images), careful=True) == {
+        f"n{i}" for i in range(40)
+    }
 
 
 @pytest.mark.parametrize(
@@ -130,8 +137,8 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
         return real + learnt * ways + 2.0 * (needed in without)
 
     class Learning:
-        tried = SimpleNamespace(unclear=frozenset("u"), state=lambda: {"reader": read_by})
-        guide = SimpleNamespace(suited=lambda model: "learnt", net=torch.nn.Linear(2, 2))
+        calibrated = SimpleNamespace(low_skill_sites=frozenset("u"), state=lambda: {"reader": read_by})
+        guide = SimpleNamespace(with_parameters=lambda model: "learnt", net=torch.nn.Linear(2, 2))
         best = SimpleNamespace(held=SimpleNamespace(looks=looks, real=real))
 
         def site_rows(self, images):
@@ -149,13 +156,12 @@ def test_sites_are_settled_by_how_renders_look_and_by_what_is_read(sure, learnt,
         drawn.append((model, number))
         return torch.randn(number, 4) + {"prior": 1.0, "learnt": learnt}[model]
 
-    monkeypatch.setattr(judged, "_renders", renders)
-    monkeypatch.setattr(judged, "_embed", lambda: lambda images: images.double().numpy())
-    preset = SimpleNamespace(parameters=SimpleNamespace(sure=sure))
-    run = SimpleNamespace(record={"seed": 0}, preset=preset, model="prior")
+    monkeypatch.setattr(select_sites, "_renders", renders)
+    monkeypatch.setattr(select_sites, "_embed", lambda: lambda images: images.double().numpy())
+    run = SimpleNamespace(record={"seed": 0}, model="prior")
     torch.manual_seed(0)
     target = torch.randn(150, 4)
-    settle = judged.settling(run, None, lambda many: target[: 150 if many else 140])
+    settle = select_sites.prior_site_selector(run, None, lambda many: target[: 150 if many else 140], sure)
     learning, found = Learning(), []
     first = learning.guide.net.weight.data
     for last in (False, False, True):
@@ -179,11 +185,11 @@ def test_what_a_guide_looks_like_is_drawn_once_until_its_weights_change(monkeypa
         drawn.append(model)
         return torch.rand(number, 2)
 
-    monkeypatch.setattr(judged, "_renders", renders)
-    monkeypatch.setattr(judged, "_embed", lambda: lambda images: images.double().numpy())
-    held = judged.held_out(SimpleNamespace(record={"seed": 0}, model=None), None, torch.zeros(5, 2))
-    guide = SimpleNamespace(net=torch.nn.Linear(2, 2), passed=frozenset())
-    guide.suited = lambda model: (float(guide.net.weight.data.sum()), guide.passed)
+    monkeypatch.setattr(select_sites, "_renders", renders)
+    monkeypatch.setattr(select_sites, "_embed", lambda: lambda images: images.double().numpy())
+    held = select_sites.held_out(SimpleNamespace(record={"seed": 0}, model=None), None, torch.zeros(5, 2))
+    guide = SimpleNamespace(net=torch.nn.Linear(2, 2), prior_sites=frozenset())
+    guide.with_parameters = lambda model: (float(guide.net.weight.data.sum()), guide.prior_sites)
     sets = [frozenset(), frozenset("a"), frozenset(), frozenset("a")]
     looks = [held.looks(guide, passed) for passed in sets]
     assert [passed for _, passed in drawn] == sets[:2]

@@ -6,22 +6,22 @@ from pathlib import Path
 import pytest
 import torch
 
-from probscene.app.fitting import storage
-from probscene.app.fitting.learnt import judged
-from probscene.app.fitting.preset import Preset
+from probscene.app.datasets.generate import generate_scenes
+from probscene.app.fitting import site_selection as select_sites
+from probscene.app.fitting import store as storage
 from probscene.app.fitting.run import RunFolder
-from probscene.inference.judging.farther import Farther
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
+from probscene.inference.statistics.energy import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"steps": 4, "scenes": 6, "values": 10, "rate": 0.05, "feature_size": 96, "images": 20, "hidden": 8}
-SETTINGS = [word for key, value in SCHEDULE.items() for word in ("--set", f"meta_sim.{key}={value}")]
-LEARN = ("--learn", "structure,parameters", "--parameters", "meta-sim", "--set", "batches_again=2", *SETTINGS)
+SETTINGS = [word for key, value in SCHEDULE.items() for word in ("--set", f"parameters.{key}={value}")]
+LEARN = ("--learn", "structure,parameters", "--parameters", "meta-sim", "--set", "refine.batches=2", *SETTINGS)
 
 
 def it_is_kept(patch):
-    patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
+    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +38,10 @@ def fitted(tmp_path_factory, call, discs, target) -> Path:
 
 def test_a_run_keeps_what_it_has_learnt(fitted):
     run = RunFolder.at(fitted)
-    assert run.preset.parameter_method == run.parameters["method"] == "meta-sim"
+    assert run.config.parameter_method == run.parameters["method"] == "meta-sim"
     assert [(site["name"], site["learnt"]) for site in run.parameters["sites"]] == [("x", True), ("y", True)]
     assert run.parameters["kept"] == "learnt" and run.guide.suits is not None
-    assert Preset.of(run.record["preset"]).meta_sim.steps == 4
+    assert run.config.parameters.steps == 4
     log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in log if line["stage"] == "parameters"] == [1, 2, 3, 4]
 
@@ -54,11 +54,11 @@ def test_all_that_draws_takes_them(fitted, call, tmp_path):
     run.guide.suits = None
     seed_everything(0)
     assert not torch.equal(moved, sample(run.model, run.guide, 40).parameters["x"])
-    for workers in (1, 2):
-        done = call("generate", run.path, "--num", 70, "--out", tmp_path / f"{workers}", "--workers", workers)
-        assert done.code == 0, done.err
-    one, two = (sorted((tmp_path / name).rglob("*.png")) for name in "12")
-    assert [file.read_bytes() for file in one] == [file.read_bytes() for file in two] and len(one) >= 70
+    done = call("generate", run.path, "--num", 70, "--out", tmp_path / "command")
+    assert done.code == 0, done.err
+    generate_scenes(run.model, RunFolder.at(fitted).guide, 70, tmp_path / "here", format="images")
+    one, two = (sorted((tmp_path / name / "images").iterdir()) for name in ("command", "here"))
+    assert [file.read_bytes() for file in one] == [file.read_bytes() for file in two] and len(one) == 70
     assert call("preview", run.path, "--out", tmp_path / "p.png").code == 0
 
 
@@ -77,9 +77,9 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, discs, target, tmp_path, 
     it_is_kept(monkeypatch)
     run = MetaSimLearning.run
 
-    def interrupted(self, each=None):
+    def interrupted(self, callback=None):
         def heard(training, line):
-            each(training, line)
+            callback(training, line)
             if training.done == 2:
                 raise KeyboardInterrupt
 
@@ -94,7 +94,7 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, discs, target, tmp_path, 
     assert (tmp_path / "run" / "guide.safetensors").read_bytes() == (fitted / "guide.safetensors").read_bytes()
     other = ["likelihood" if word == "meta-sim" else word for word in LEARN[: -len(SETTINGS)]]
     again = call("fit", "--resume", "--out", tmp_path / "run", *discs.without("parameters"), *other)
-    assert again.code != 0 and "parameter_method" in again.err
+    assert again.code != 0 and "the parameters.kind" in again.err
 
 
 def test_another_word_is_named(call, discs, target, tmp_path):

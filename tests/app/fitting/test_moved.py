@@ -55,7 +55,7 @@ def test_a_folder_of_assets_may_lie_elsewhere_if_it_holds_the_same(call, fitted,
     assert done.code == 2 and f"probscene fit --assets FOLDER --out {out} --resume" in done.err
     done = call("fit", "--out", out, "--resume", "--assets", here / "inks")
     if ink == "red":
-        assert done.code == 2 and "Expected the assets_folder that the run" in done.err
+        assert done.code == 2 and "expected the assets_folder that the run" in done.err
         return
     assert done.code == 0, done.err
     record = json.loads((out / "run.json").read_text())
@@ -67,7 +67,7 @@ def test_it_says_what_to_name(call, moved):
     here, out = moved
     before = recorded(out)
     done = call("fit", "--out", out, "--resume")
-    assert done.code == 2 and "Expected the images of the run" in done.err and "--target" in done.err
+    assert done.code == 2 and "expected the images of the run" in done.err and "--target" in done.err
     done = call("fit", "--target", here / "images", "--out", out, "--resume")
     assert done.code == 2 and f"probscene fit FILE --out {out} --resume" in done.err
     assert recorded(out) == before
@@ -82,7 +82,7 @@ def test_other_files_are_refused(call, moved, other):
     else:
         next((here / "images").glob("*.png")).unlink()
     done = call("fit", here / "model.py", "--target", here / "images", "--out", out, "--resume")
-    assert done.code == 2 and f"Expected the {other} that the run in {out} was begun with" in done.err
+    assert done.code == 2 and f"expected the {other} that the run in {out} was begun with" in done.err
     assert recorded(out) == before
 
 

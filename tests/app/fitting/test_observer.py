@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.app.loading import load_model
 from probscene.dataset import ImageFolder
 from probscene.sampling import sample, seed_everything
@@ -27,7 +27,7 @@ def test_a_grey_models_coloured_renders_are_read_as_its_files_are(discs, tmp_pat
     model = replace(load_model(str(discs.file)), channels=1)
     generate_scenes(model, model.prior, 8, tmp_path / "drawn", format="images")
     files = ImageFolder(tmp_path / "drawn" / "images", model.canvas, 1)
-    view, net = Observer(model, threads=1), Seen()
+    view, net = RenderedFeatures(model, threads=1), Seen()
     seed_everything(3)
     scenes = sample(model, model.prior, 8)
     view.observe(net)(scenes)
@@ -40,7 +40,7 @@ def test_a_grey_models_coloured_renders_are_read_as_its_files_are(discs, tmp_pat
 
 def watched(model):
     """A view that keeps what it renders, and a network that keeps what it is shown."""
-    view, rendered = Observer(model, threads=1), []
+    view, rendered = RenderedFeatures(model, threads=1), []
     render = view.render
     view.render = lambda drawing: rendered.append(render(drawing)) or rendered[-1]
     return view, Seen(), rendered
@@ -49,9 +49,9 @@ def watched(model):
 class Labels(Seen):
     """A feature network that keeps the labelled renders that it is given."""
 
-    by_labels = True
+    uses_labels = True
 
-    def embed_drawn(self, drawn):
+    def embed_from_labels(self, drawn):
         self.drawn = drawn
         return drawn.visible.sum(1, keepdim=True)
 
@@ -61,8 +61,8 @@ def test_who_looks_at_labels_alone_is_given_those_of_the_pictures(name):
     model, net = load_model(name), Labels()
     seed_everything(1)
     scenes = sample(model, model.prior, 4)
-    Observer(model, threads=1).observe(net)(scenes)
-    whole = Observer(model, threads=1).labelled(scenes)
+    RenderedFeatures(model, threads=1).observe(net)(scenes)
+    whole = RenderedFeatures(model, threads=1).labelled(scenes)
     assert all(torch.equal(a, b) for a, b in zip(net.drawn[1:], whole[1:], strict=True))
     assert net.drawn.image.shape == whole.image.shape
 

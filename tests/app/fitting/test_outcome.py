@@ -5,8 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fitting.learnt.outcome import _said, _worse_said, moved, worse_than_labels
-from probscene.app.labelling.few import FewLabels
+from probscene.app.fitting.outcome import _said, _worse_said, moved, worse_than_labels
+from probscene.app.labels.partial_labels import PartialLabels
 
 N = 500
 
@@ -46,7 +46,7 @@ def test_what_was_learnt_is_held_against_the_labels_histogram(seed):
     """As many as the labels have are as good, whatever the labels; five more an image are worse. A class without
     labels is left out."""
     drawn = counts([1.0, 2.0, 1.0], seed)
-    labels = FewLabels(torch.arange(10), drawn[:10, :2].long(), ("dead", "live"), None, ())
+    labels = PartialLabels(torch.arange(10), drawn[:10, :2].long(), ("dead", "live"), None, ())
     learnt = dict(zip(("dead", "live", "other"), drawn.T.numpy(), strict=True))
     assert worse_than_labels(labels, learnt) == {} and _worse_said({}) == ""
     found = worse_than_labels(labels, learnt | {"dead": learnt["dead"] + 5})

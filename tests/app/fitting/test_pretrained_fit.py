@@ -8,19 +8,28 @@ import safetensors.torch
 import torch
 from torchvision.models import inception_v3
 
-from probscene.app.evaluation.judge import judge
+from probscene.app.evaluation.explain import structure_remedy
 from probscene.app.fitting.presets import QUICK, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import own_net
 from probscene.dataset import ImageFolder
 from probscene.errors import RunError
+from probscene.inference.divergence import SELF_SHARE
 from probscene.inference.features.base import embed_all
 from probscene.inference.features.photographs import readability
-from probscene.inference.features.projection import SHARE
+from probscene.inference.features.photographs.net import PretrainedCountNet
+from probscene.inference.statistics.verdict import Verdict
 
-FEW = {"batches": 2, "num_scenes": 25, "pretrain_derivations": 50, "pretrain_epochs": 1}
+FEW = {"structure.batches": 2, "structure.num_scenes": 25, "pretrain.derivations": 50, "pretrain.epochs": 1}
 WORDS = ["--preset", "quick", "--threads", "1", "--no-verdict"]
 WORDS += [word for key, value in FEW.items() for word in ("--set", f"{key}={value}")]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_images_enter_the_heads():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PretrainedCountNet.__init__, "__defaults__", ((), 150, (128, 128)))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +43,8 @@ def run(call, discs, target, tmp_path_factory):
 
 def test_the_network_is_recorded_and_only_its_projection_kept(run, target):
     run, _ = run
-    assert run.record["preset"]["features"] == "efficientnet" and run.record["preset"]["marginal_variance"] is None
+    config = run.config
+    assert config.features.network == "efficientnet" and config.divergence.marginal_variance is None
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     assert (run.path / "features.safetensors").stat().st_size < 40_000
     seen = net.embed(torch.stack([images.load(i) for i in range(9)]))
@@ -45,7 +55,7 @@ def test_the_network_is_recorded_and_only_its_projection_kept(run, target):
 def test_the_log_says_how_the_projection_came_out(run):
     first, *rest = map(json.loads, (run[0].path / "log.jsonl").read_text().splitlines())
     assert first["stage"] == "projection" and first["ratio"] == sorted(first["ratio"], reverse=True)
-    assert first["self_share"] == pytest.approx(SHARE, rel=0.05) and first["ratio"][0] > 2
+    assert first["self_share"] == pytest.approx(SELF_SHARE, rel=0.05) and first["ratio"][0] > 2
     assert [line["stage"] for line in rest] == ["structure"] * 2
 
 
@@ -59,7 +69,7 @@ def test_it_goes_on_to_the_same_result(run, call, tmp_path, discs, target):
     for name in ("guide", "real"):
         (again / f"{name}.safetensors").unlink()
     done = call("fit", "--out", again, "--resume", "--features", "count", *WORDS)
-    assert done.code == 2 and "features" in done.err and "efficientnet" in done.err
+    assert done.code == 2 and "the features.kind" in done.err and "(ProjectedFeatures)" in done.err
     done = call("fit", "--out", again, "--resume", "--no-verdict")
     assert done.code == 0, done.err
     assert (again / "guide.safetensors").read_bytes() == guide
@@ -82,9 +92,9 @@ def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
     done = call("evaluate", run.path, *words)
     assert done.code == 0, done.err
     found = json.loads((tmp_path / "e.json").read_text())
-    judged = judge(run, ImageFolder(target.images, run.model.canvas, run.model.channels), lambda *_: None, 40).trust
     structure = found["trust"]["parts"]["structure"]
-    assert judged.pretrained and structure["remedy"] == judged.remedy  # not to take what it has
+    remedies = [structure_remedy(run, verdict) for verdict in Verdict]
+    assert structure["remedy"] in remedies and not any("pretrained" in remedy for remedy in remedies)  # it has them
     assert "estimate" not in found["sources"] and "truth" in found["sources"]  # a direction is no count
     assert call("report", run.path, "--num", 200, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
 
@@ -92,7 +102,7 @@ def test_a_finished_run_is_evaluated_and_reported(run, call, target, tmp_path):
 def test_further_views_of_the_target_are_learnt_from_and_not_judged(run, call, target, tmp_path):
     run, words = run
     again = tmp_path / "again"
-    assert call(*[again if word == run.path else word for word in words], "--set", "views=3").code == 0
+    assert call(*[again if word == run.path else word for word in words], "--set", "num_crops=3").code == 0
     one, other = run.read_tensors("real"), RunFolder.at(again).read_tensors("real")
     assert torch.equal(one["features"], other["features"]) and other["views"].shape == (80, 3) and "views" not in one
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
@@ -121,9 +131,9 @@ def test_another_network_is_refused_before_a_folder_is_made(features, part, call
 
 def test_a_trained_network_keeps_the_presets_scenes():
     for name in ("quick", "paper"):
-        assert preset(name).with_features("count").num_scenes == preset(name).num_scenes
-    assert QUICK.with_features("presence").features == "presence"
-    assert QUICK.with_features("efficientnet").num_scenes < QUICK.num_scenes
+        assert preset(name).with_features("count").structure == preset(name).structure
+    assert QUICK.with_features("presence").make_features().name == "presence"
+    assert QUICK.with_features("efficientnet").structure.num_scenes < QUICK.structure.num_scenes
 
 
 def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_path):
@@ -141,9 +151,9 @@ def test_weights_of_inception_are_those_that_the_run_was_begun_with(run, tmp_pat
         net.load_state_dict(state)
 
 
-PROJECTED = ["--features", "efficientnet", "--set", "pairs=40", "--set", "directions=3"]
+PROJECTED = ["--features", "efficientnet", "--set", "features.pairs=40", "--set", "features.directions=3"]
 ALONE = ["--learn", "structure", "--features", "count=efficientnet"]
-COUNTING = [*ALONE, "--set", "pairs=60", "--set", "head_epochs=12"]
+COUNTING = [*ALONE, "--set", "features.pairs=60", "--set", "features.epochs=12"]
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +168,7 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(count
     run, said = counting
     assert "Looking at images" in said and "Readings" in said and "epochs" in said
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
-    seen = net.embed_photographs(torch.stack([images.load(i) for i in range(9)]))
+    seen = net.embed_real(torch.stack([images.load(i) for i in range(9)]))
     assert net.names == run.model.classes
     assert torch.allclose(seen, run.read_tensors("real")["features"][:9], atol=1e-3)
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
@@ -193,9 +203,11 @@ def test_labels_choose_how_classes_are_read(counting, call, discs, target, tmp_p
 
 def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs, target, tmp_path, monkeypatch):
     """No heads are good enough; parameters are learnt as well."""
-    monkeypatch.setattr(readability, "SKILL", 1.1)
-    few = {"pairs": 12, "head_epochs": 1, "batches_again": 2} | {f"tilting.{k}": 20 for k in ("first", "scenes")}
-    chosen = [word for key, value in (few | {"tilting.rounds": 1}).items() for word in ("--set", f"{key}={value}")]
+    monkeypatch.setattr(readability, "MIN_CORRELATION", 1.1)
+    few = {"features.pairs": 12, "features.epochs": 1, "refine.batches": 2} | {
+        f"parameters.{k}": 20 for k in ("first", "scenes")
+    }
+    chosen = [word for key, value in (few | {"parameters.rounds": 1}).items() for word in ("--set", f"{key}={value}")]
     words = [*WORDS, "--features", "count=efficientnet", *chosen]
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *words)
     assert done.code == 0 and done.err.count("not readable") == 2 and "the prior is kept" in done.err, done.err
@@ -210,7 +222,7 @@ def test_a_target_in_which_nothing_can_be_read_gives_the_prior_back(call, discs,
 def test_readings_are_of_the_runs_images(call, discs, target, tmp_path):
     images = tmp_path / "images"
     shutil.copytree(target.images, images)
-    words = [*WORDS, *ALONE, "--set", "pairs=12", "--set", "head_epochs=1"]
+    words = [*WORDS, *ALONE, "--set", "features.pairs=12", "--set", "features.epochs=1"]
     assert call("fit", discs.file, "--target", images, "--out", tmp_path / "run", *words).code == 0
     for name in ("guide", "real"):
         (tmp_path / f"run/{name}.safetensors").unlink()

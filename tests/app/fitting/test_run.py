@@ -9,7 +9,7 @@ import torch
 
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
-from probscene.app.fitting.storage import check_free
+from probscene.app.fitting.store import check_free
 from probscene.errors import DataError, MachineError, RunError
 from probscene.inference.guides.lstm import GUIDES, make_guide
 
@@ -66,7 +66,7 @@ def test_a_run_is_bound_to_the_digits_it_was_begun_with(tmp_path, monkeypatch, i
 @pytest.mark.parametrize("kind", [*GUIDES, None])
 def test_the_guide_is_rebuilt_from_the_record(tmp_path, kind):
     """A record that names no kind is of a version that had LSTMs alone."""
-    settings = QUICK.with_guide(kind or "lstm").guide_settings()
+    settings = QUICK.with_guide(kind or "lstm").guide_record()
     if kind is None:
         del settings["kind"]
     run = RunFolder.create(tmp_path / "run", str(DISCS), {"guide": settings})
@@ -76,5 +76,5 @@ def test_the_guide_is_rebuilt_from_the_record(tmp_path, kind):
     assert type(again) is type(made)
     assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), made.state_dict().values(), strict=True))
     other = RunFolder(run.path, run.record | {"guide": {"kind": "pcfg" if kind != "pcfg" else "lstm"}})
-    with pytest.raises(RunError, match="Expected a guide for model discs"):
+    with pytest.raises(RunError, match="expected a guide for model discs"):
         _ = other.guide

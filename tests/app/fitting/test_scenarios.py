@@ -11,7 +11,7 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.evaluation.labels import counts_of_dataset
 from probscene.app.fitting.run import RunFolder
-from probscene.app.labelling.counts import write_counts
+from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 from probscene.errors import ModelError
 from probscene.inference.guides.scenario import ScenarioGuide
@@ -43,14 +43,14 @@ def test_a_reference_names_all_scenarios_some_or_one():
     both = load_model(f"{STREETS}:yard,row")
     assert [name for name, _ in both.scenarios] == ["yard", "row"] and both.name == "streets-yard-row"
     assert load_model(f"{STREETS}:yard").name == "yard" and not load_model(f"{STREETS}:yard").scenarios
-    with pytest.raises(ModelError, match="among row, yard, each once, actual row,lawn; name them"):
+    with pytest.raises(ModelError, match="among row, yard, each once, got row,lawn; name them"):
         load_model(f"{STREETS}:row,lawn")
     with pytest.raises(ModelError, match="each once"):
         load_model(f"{STREETS}:row,row")
-    with pytest.raises(ModelError, match="SCENARIOS in multi_mnist, from which a are chosen, actual none; name no"):
+    with pytest.raises(ModelError, match="SCENARIOS in multi_mnist, from which a are chosen, got none; name no"):
         load_model("multi_mnist:a")
     for names, said in (("", "''"), ("row,", "row,''"), ("row;yard", "'row;yard'")):
-        with pytest.raises(ModelError, match=f"each once, actual {said}; name them with commas"):
+        with pytest.raises(ModelError, match=f"each once, got {said}; name them with commas"):
             load_model(f"{STREETS}:{names}")
 
 
@@ -70,7 +70,7 @@ def test_a_run_goes_on_to_the_same_bits(tmp_path, call, discs, joint_target, joi
     one, other = (RunFolder.at(path).guide.state_dict() for path in (joint_run, tmp_path / "run"))
     assert all(torch.equal(one[key], other[key]) for key in one)
     another = call("fit", STREETS, "--scenarios", "row", "--out", tmp_path / "run", "--resume")
-    assert another.code == 2 and "streets.py:row,yard), actual" in another.err
+    assert another.code == 2 and "streets.py:row,yard), got" in another.err
 
 
 def test_datasets_hold_scenes_of_every_scenario(tmp_path, call, joint_run):
@@ -105,4 +105,4 @@ def test_scenarios_that_there_are_not(tmp_path, call, joint_target):
     done = call("fit", STREETS, "--scenarios", "row,lawn", "--target", target, "--out", tmp_path / "run")
     assert done.code == 2 and "among row, yard" in done.err and not (tmp_path / "run").exists()
     twice = call("fit", f"{STREETS}:row", "--scenarios", "yard", "--target", target, "--out", tmp_path / "run")
-    assert twice.code == 2 and "Expected scenarios once" in twice.err and not (tmp_path / "run").exists()
+    assert twice.code == 2 and "expected scenarios once" in twice.err and not (tmp_path / "run").exists()

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from probscene.app.evaluation.labels import read_labels
-from probscene.app.evaluation.structure_counts import sampled
+from probscene.app.evaluation.structure_counts import sample_counts
 from probscene.app.fitting.run import RunFolder
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
-from probscene.inference.judging.metrics import histogram, total_variation
+from probscene.inference.statistics.count_metrics import histogram, total_variation
 
 RED, BLUE = 0, 1
 
@@ -34,7 +34,7 @@ def test_only_what_is_labelled_is_compared(labels, call, fitted, target, tmp_pat
     assert found["classes"] == [name]
     assert found["sources"]["truth"]["mean_number"] == target.counts[:, which].mean()
     for source, policy in (("prior", run.model.prior), ("learnt", run.guide)):
-        counts = sampled(run.model, policy, 500, 0).counts[:, which]
+        counts = sample_counts(run.model, policy, 500, 0).counts[:, which]
         assert found["sources"][source]["mean_number"] == counts.mean()
         expected = total_variation(histogram(counts), histogram(target.counts[:, which]))
         apart = found["distances"]["truth"][source]
@@ -63,5 +63,5 @@ def test_columns_that_are_no_classes_are_refused(labels, fitted, target):
         ("image", "red,blue"),
     ):
         file.write_text("\n".join([columns, *rows]))
-        with pytest.raises(DataError, match=rf"^Expected the columns image,.*{part}"):
+        with pytest.raises(DataError, match=rf"^expected the columns image,.*{part}"):
             read_labels(file, model, images)

@@ -6,19 +6,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from probscene.app.fitting import storage
-from probscene.app.fitting.learnt import judged
-from probscene.app.fitting.preset import Preset
+from probscene.app.fitting import site_selection as select_sites
+from probscene.app.fitting import store as storage
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
-from probscene.inference.judging.farther import Farther
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.tilting import learning
+from probscene.inference.statistics.energy import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
 SCHEDULE = {"rounds": 3, "first": 50, "scenes": 20, "steps": 4, "images": 20}
-SETTINGS = [word for key, value in SCHEDULE.items() for word in ("--set", f"tilting.{key}={value}")]
-LEARN = ("--learn", "structure,parameters", "--parameters", "tilting", "--set", "batches_again=2", *SETTINGS)
+SETTINGS = [word for key, value in SCHEDULE.items() for word in ("--set", f"parameters.{key}={value}")]
+LEARN = ("--learn", "structure,parameters", "--parameters", "tilting", "--set", "refine.batches=2", *SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +35,8 @@ def lit(tmp_path_factory, discs) -> Path:
 
 
 def it_is_kept(patch):
-    patch.setattr(judged, "farther", lambda *_: Farther(0.0, 1.0, 0.0))
-    patch.setattr(learning, "CHANCE", 1.1)  # of so few scenes, whatever they say
+    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(learning, "FALSE_DISCOVERY_RATE", 1.1)  # of so few scenes, whatever they say
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +53,14 @@ def fitted(tmp_path_factory, call, lit, discs, target) -> Path:
 
 def test_a_run_keeps_what_it_has_learnt(fitted):
     run = RunFolder.at(fitted)
-    assert run.preset.parameter_method == run.parameters["method"] == "tilting"
+    assert run.config.parameter_method == run.parameters["method"] == "tilting"
     assert [(site["name"], site["learnt"], site["because"]) for site in run.parameters["sites"]] == [
         ("x", False, "it is not of the whole scene"),
         ("y", False, "it is not of the whole scene"),
         ("light", True, ""),
     ]
     assert run.parameters["kept"] == "learnt" and isinstance(run.guide.suits.__self__, ParameterGuide)
-    assert Preset.of(run.record["preset"]).tilting.rounds == 3
+    assert run.config.parameters.rounds == 3
     log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in log if line["stage"] == "parameters"] == [1, 2, 3]
 
@@ -84,9 +83,9 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, lit, discs, target, tmp_p
     monkeypatch.setattr(storage, "SAVE_EVERY", 0)
     run, out = learning.TiltingLearning.run, tmp_path / "run"
 
-    def interrupted(self, each=None):
+    def interrupted(self, callback=None):
         def heard(training, line):
-            each(training, line)
+            callback(training, line)
             if training.done == 2:
                 raise KeyboardInterrupt
 
@@ -104,7 +103,7 @@ def test_a_fit_goes_on_to_the_same_bytes(fitted, call, lit, discs, target, tmp_p
 
 
 def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tmp_path, monkeypatch):
-    monkeypatch.setattr(learning, "CHANCE", 0.0)
+    monkeypatch.setattr(learning, "FALSE_DISCOVERY_RATE", 0.0)
     out = tmp_path / "run"
     done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
     assert done.code == 0, done.err
@@ -117,5 +116,5 @@ def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tm
 
 def test_it_is_the_way_for_photographs():
     street = preset("street").with_features("count=efficientnet")
-    assert (street.learn, street.parameter_method) == ("structure,parameters", "tilting")
+    assert street.parameter_method == "tilting"
     assert preset("street").with_features("count").parameter_method == "likelihood"

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from probscene.app.loading import load_model
-from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import close_pools
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.sampling import sample, seed_everything
 
 

@@ -17,8 +17,8 @@ import torch
 
 from probscene.errors import GeneratorError, MachineError
 from probscene.generator import Command
-from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import pool_for
+from probscene.renderers.generator.renderer import GeneratedRenderer
 
 SCENES = 24
 
@@ -129,9 +129,9 @@ def test_a_scene_that_always_fails_is_named_with_what_was_raised_and_printed(dra
         ("gone", {"attempts": 1}, "serve; run its argv by hand\nThe end of what it printed:\nno licence"),
         ("silent", {"attempts": 1, "start_timeout": 1.0}, "serve 1 seconds after it was started; raise start_timeout="),
         ("hang", {"attempts": 1, "timeout": 1.0}, "nothing after 1 seconds; raise timeout= of its Command where"),
-        ("garbage", {"attempts": 1}, r"expected image as uint8 \(32, 40, 3\), actual uint8 \(1,\)"),
+        ("garbage", {"attempts": 1}, r"expected image as uint8 \(32, 40, 3\), got uint8 \(1,\)"),
         ("crash", {"attempts": 1}, "was ended by SIGABRT"),
-        ("", {"version": "2"}, "version '2' of the generator draw_boxes.py, actual ''"),
+        ("", {"version": "2"}, "version '2' of the generator draw_boxes.py, got ''"),
     ],
 )
 def test_what_goes_wrong_is_said(drawn, request_of, fault, name, settings, said):
@@ -142,14 +142,14 @@ def test_what_goes_wrong_is_said(drawn, request_of, fault, name, settings, said)
 
 def test_a_program_that_is_not_there_or_speaks_otherwise(request_of, tmp_path):
     request = request_of(1)
-    with pytest.raises(GeneratorError, match="start the generator nowhere, actual No such file"):
+    with pytest.raises(GeneratorError, match="start the generator nowhere, got No such file"):
         GeneratedRenderer(Command(["/nowhere"]), (32, 40))(request)
     stranger = tmp_path / "stranger.py"
     stranger.write_text(
         "import os, socket, time\nwire = socket.socket(socket.AF_UNIX)\nwire.connect(os.environ['PROBSCENE_SOCKET'])\n"
         "wire.sendall(b'HTTP/1.1 200 OK\\r\\n\\r\\n')\ntime.sleep(60)\n"
     )
-    with pytest.raises(GeneratorError, match="speak protocol 1 of probscene, actual something else; let it import"):
+    with pytest.raises(GeneratorError, match="speak protocol 1 of probscene, got something else; let it import"):
         GeneratedRenderer(Command([sys.executable, str(stranger)]), (32, 40))(request)
 
 
@@ -229,7 +229,7 @@ def test_where_temporary_files_find_no_room(command):
     pool = pool_for(command(attempts=1), 0)
     shutil.rmtree(pool.folder)
     pool.grow(1)
-    with pytest.raises(MachineError, match="temporary files for the generator draw_boxes.py, actual .*; make room, or"):
+    with pytest.raises(MachineError, match="temporary files for the generator draw_boxes.py, got .*; make room, or"):
         pool.draw([{"height": 4, "width": 4, "seed": 1, "values": {}, "nodes": []}])
 
 

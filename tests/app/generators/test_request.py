@@ -15,7 +15,7 @@ from probscene.app.loading import load_model, renderer_for
 from probscene.derive import derive_complete
 from probscene.errors import ModelError
 from probscene.model import scene_model
-from probscene.renderers.generated import GeneratedRenderer
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.request import Objects
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.scenarios import join
@@ -108,19 +108,19 @@ def test_arrays_of_other_kinds_are_the_same(model, request_of):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda d: None, "return a dict with 'image' and 'instance', actual NoneType"),
-        (lambda d: {"image": d["image"]}, r"return a dict with 'image' and 'instance', actual \['image'\]"),
-        (lambda d: d | {"image": d["image"] / 255}, r"image as uint8 \(32, 40, 3\), actual float64"),
+        (lambda d: None, "return a dict with 'image' and 'instance', got NoneType"),
+        (lambda d: {"image": d["image"]}, r"return a dict with 'image' and 'instance', got \['image'\]"),
+        (lambda d: d | {"image": d["image"] / 255}, r"image as uint8 \(32, 40, 3\), got float64"),
         (lambda d: d | {"image": np.dstack([d["image"], d["image"][..., :1]])}, "leave its alpha out"),
-        (lambda d: d | {"image": d["image"][:-1]}, r"actual uint8 \(31, 40, 3\)"),
-        (lambda d: d | {"image": "red"}, "'image' as an array of numpy's or as bytes, actual str"),
+        (lambda d: d | {"image": d["image"][:-1]}, r"got uint8 \(31, 40, 3\)"),
+        (lambda d: d | {"image": "red"}, "'image' as an array of numpy's or as bytes, got str"),
         (lambda d: d | {"instance": d["instance"] + 0.5}, "instance as integers"),
-        (lambda d: d | {"instance": d["instance"] + 99}, "instance, 0 to .*, actual 99 to"),
-        (lambda d: d | {"instance": d["instance"] - 1}, "actual -1 to"),
+        (lambda d: d | {"instance": d["instance"] + 99}, "instance, 0 to .*, got 99 to"),
+        (lambda d: d | {"instance": d["instance"] - 1}, "got -1 to"),
         (lambda d: d | {"depth": np.full((32, 40), np.nan, np.float32)}, "depth without NaN"),
         (lambda d: d | {"amodal_box": {1: (5, 0, 4, 1)}}, "x0 <= x1"),
         (lambda d: d | {"amodal_box": {99: (0, 0, 4, 1)}}, "99"),
-        (lambda d: d | {"amodal_box": {}}, "each node that instance shows.*actual none of node"),
+        (lambda d: d | {"amodal_box": {}}, "each node that instance shows.*got none of node"),
         (lambda d: d | {"amodal_box": dict.fromkeys(np.unique(d["instance"])[1:], (2, 2, 2, 5))}, "larger than 0"),
     ],
 )
@@ -139,7 +139,7 @@ def test_an_id_of_a_node_that_is_none_is_named(model, request_of):
     request = replace(
         request, kind=torch.tensor([[0, -1, 1]]), parent=torch.tensor([[-1, -1, 0]]), objects=(), scene=()
     )
-    with pytest.raises(ModelError, match="actual 2, which is of none"):
+    with pytest.raises(ModelError, match="got 2, which is of none"):
         batch_of(model, lambda scene: painted(scene) | {"instance": np.full((32, 40), 2)}, request)
     assert batch_of(model, painted, request).pixels.tolist() == [[10, 0, 10]]
 
@@ -148,7 +148,7 @@ def test_an_error_in_this_process_names_the_line(model, request_of):
     def broken(scene):
         return scene.values["fog"]
 
-    with pytest.raises(ModelError, match=r"the generator to run, actual KeyError in .*test_request.py, line \d+"):
+    with pytest.raises(ModelError, match=r"the generator to run, got KeyError in .*test_request.py, line \d+"):
         batch_of(model, broken, request_of(1))
 
 
@@ -160,11 +160,11 @@ def test_values_are_checked(model):
 
         return sample(probe, probe.prior, 4)
 
-    with pytest.raises(ModelError, match=r"x of Objects\('plate'\) as a number or a tensor, actual 'far'"):
+    with pytest.raises(ModelError, match=r"x of Objects\('plate'\) as a number or a tensor, got 'far'"):
         asked(x="far")
     with pytest.raises(ModelError, match="x of .* to broadcast"):
         asked(x=torch.zeros(3, 7))
-    with pytest.raises(ModelError, match="finite numbers or lists of them, actual NaN"):
+    with pytest.raises(ModelError, match="finite numbers or lists of them, got NaN"):
         asked(x=float("nan"))
     record = asked(x=2, colour=torch.rand(4, 1, 3)).drawing.records((8, 8))[0]
     assert all(n["values"] == {} for n in record["nodes"] if n["kind"] == "mug")
@@ -184,15 +184,15 @@ def test_a_request_is_made_outside_the_plate_of_nodes(model):
 
 
 def test_a_model_with_a_generator_returns_a_request(model):
-    with pytest.raises(ModelError, match="generator of model 'boxes' as a function .* or a Command, actual str"):
+    with pytest.raises(ModelError, match="generator of model 'boxes' as a function .* or a Command, got str"):
         replace(model, generator="python draw.py")
     other = load_model("multi_mnist")
-    with pytest.raises(ModelError, match=r"return scene.request\(...\), actual Drawing"):
+    with pytest.raises(ModelError, match=r"return scene.request\(...\), got Drawing"):
         GeneratedRenderer(painted, (32, 40))(sample(other, other.prior, 1).drawing)
 
 
 def test_a_request_needs_a_generator(model):
-    with pytest.raises(ModelError, match="Expected a generator of a model whose program returns scene.request"):
+    with pytest.raises(ModelError, match="expected a generator of a model whose program returns scene.request"):
         renderer_for(replace(model, generator=None))(sample(model, model.prior, 1).drawing)
 
 

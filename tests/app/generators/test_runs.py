@@ -15,17 +15,17 @@ import torch
 
 from probscene.app.api.fit import fit
 from probscene.app.checking.generator_check import check_generator, cost
-from probscene.app.datasets.generate import generate, generate_scenes
+from probscene.app.datasets.generate import DatasetOptions, generate, generate_scenes
 from probscene.app.datasets.provenance import remake
 from probscene.app.datasets.scene_dataset import SceneDataset
-from probscene.app.fitting.overrides import override
-from probscene.app.fitting.presets import PRESETS, preset
+from probscene.app.fitting.pipeline import Execution
+from probscene.app.fitting.presets import PRESETS, images_drawn, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.errors import DataError, GeneratorError, ModelError, ProbsceneError, RunError
 from probscene.generator import Command
-from probscene.renderers.generated import GeneratedRenderer
 from probscene.renderers.generator.pool import pool_for
+from probscene.renderers.generator.renderer import GeneratedRenderer
 from probscene.sampling import sample
 
 HERE = Path(__file__).parent
@@ -82,7 +82,7 @@ def test_what_the_generator_does_not_know_is_not_in_the_labels(model, tmp_path, 
         assert len(lines) == len(plain) and all(line[2] == "3" for line in lines)
         assert all(line[1] == "-1" if name == "plain" else 0 <= float(line[1]) <= 1 for line in lines)
     with pytest.raises(ProbsceneError, match="no min_visible with model 'boxes'"):
-        generate_scenes(model, model.prior, 20, tmp_path / "least", min_visible=0.25)
+        generate_scenes(model, model.prior, 20, tmp_path / "least", options=DatasetOptions(min_visible=0.25))
 
 
 def test_a_dataset_in_memory_leaves_them_out_too(model):
@@ -122,7 +122,7 @@ def test_the_fingerprint_goes_by_bytes_words_and_version(tmp_path):
     assert len({of("a"), *others}) == 4
     (tmp_path / "a" / "cup.obj").write_text("v 1 0 0")
     assert of("a", files=mesh) != others[-1]
-    with pytest.raises(ProbsceneError, match="Expected to read .*gone.obj, of which the generator draw.py is made"):
+    with pytest.raises(ProbsceneError, match="expected to read .*gone.obj, of which the generator draw.py is made"):
         of("a", files=(tmp_path / "gone.obj",))
 
 
@@ -142,7 +142,7 @@ def test_a_command_is_checked(settings, said):
 
 
 def test_the_check_draws_again_in_another_order(model, call):
-    report = check_generator(model)
+    report = check_generator(model, images_drawn())
     assert report.differs == () and not report.fault and report.seconds > 0
     told = call("check", HERE / "boxes.py", "--render")
     assert told.code == 0 and "by fresh processes and in another order: the same bytes" in told.out
@@ -152,21 +152,21 @@ def test_the_check_draws_again_in_another_order(model, call):
         drawn.append(scene)
         return {"image": np.full((32, 40, 3), len(drawn), np.uint8), "instance": np.zeros((32, 40), int)}
 
-    assert "another image" in check_generator(replace(model, generator=counting)).fault
-    with pytest.raises(ModelError, match="Expected a model with a generator, actual 'multi_mnist'"):
-        check_generator(load_model("multi_mnist"))
+    assert "another image" in check_generator(replace(model, generator=counting), images_drawn()).fault
+    with pytest.raises(ModelError, match="expected a model with a generator, got 'multi_mnist'"):
+        check_generator(load_model("multi_mnist"), images_drawn())
     assert all(f"{name} " in str(report) for name in PRESETS)
     command = replace(model.generator, files=(HERE / "none.png",))
     with pytest.raises(DataError, match="none.png.*take it out of files="):
-        check_generator(replace(model, generator=command))
+        check_generator(replace(model, generator=command), images_drawn())
 
 
 def test_the_page_says_what_a_fit_has_drawn():
     page = (HERE.parents[2] / "docs" / "generators.md").read_text(encoding="utf-8")
     quick = preset("quick")
-    for chosen in (quick, override(quick, ["learn=structure"]), quick.with_features("count=efficientnet")):
-        features = chosen.make_features().images
-        structure = chosen.batches * chosen.num_scenes * chosen.draws_per_structure
+    for chosen in (quick, quick.set("parameters=none"), quick.for_photographs()):
+        features, training = chosen.make_features().images, chosen.structure
+        structure = training.batches * training.num_scenes * training.draws_per_structure
         row = re.search(rf"\| {features:,} \| {structure:,} \|([^|]*)\|([^|]*)\|", page[page.index(_called(chosen)) :])
         assert row is not None
         rest = sum(int(number.replace(",", "")) for number in row.groups() if number.strip())
@@ -174,47 +174,57 @@ def test_the_page_says_what_a_fit_has_drawn():
 
 
 def _called(chosen):
-    if chosen.learn == "structure":
+    if chosen.parameters is None:
         return "the same, `--learn structure`"
-    return "`--preset quick`" if chosen.features == "count" else "`--preset quick --features count=efficientnet`"
+    renders = chosen.make_features().name == "count"
+    return "`--preset quick`" if renders else "`--preset quick --features count=efficientnet`"
 
 
 def test_a_generator_may_say_that_it_is_not_reproducible(copied, model, tmp_path):
     script = copied.with_name("draw_boxes.py")
     script.write_text(script.read_text().replace("random.Random(scene.seed)", "random.Random()"))
     command = Command([sys.executable, str(script)])
-    assert "another image" in check_generator(replace(model, generator=command)).fault
+    assert "another image" in check_generator(replace(model, generator=command), images_drawn()).fault
     kept = replace(command, keep=tmp_path / "kept")
     GeneratedRenderer(kept, model.canvas)(sample(model, model.prior, 2).drawing)
-    assert "another image" in check_generator(replace(model, generator=kept)).fault  # not those that are kept
-    open_ = check_generator(replace(model, generator=replace(command, reproducible=False)))
+    assert (
+        "another image" in check_generator(replace(model, generator=kept), images_drawn()).fault
+    )  # not those that are kept
+    open_ = check_generator(replace(model, generator=replace(command, reproducible=False)), images_drawn())
     assert not open_.fault and "no image can be made again" in str(open_)
 
 
 def test_hours_are_told_before_a_fit(model, monkeypatch):
     measured = "probscene.app.checking.generator_check._drawn"
     monkeypatch.setattr(measured, lambda *args: (0.001, []))
-    assert not cost(model, preset("quick"))
+    assert not cost(model, preset("quick").images)
     monkeypatch.setattr(measured, lambda *args: (1.2, []))
-    told = cost(replace(model, generator=replace(model.generator, workers=2)), preset("quick"))
+    told = cost(replace(model, generator=replace(model.generator, workers=2)), preset("quick").images)
     assert "needs" in told and " h (1.2e+03 ms an image, 2 at once)" in told
-    assert not cost(load_model("multi_mnist"), preset("quick"))
+    assert not cost(load_model("multi_mnist"), preset("quick").images)
 
 
 def test_telling_the_hours_leaves_the_workers_at_work(model):
     GeneratedRenderer(model.generator, model.canvas)(sample(model, model.prior, 4).drawing)
     before = pool_for(model.generator, 1).processes()
-    cost(model, preset("quick"))
+    cost(model, preset("quick").images)
     assert before and set(before) <= set(pool_for(model.generator, 1).processes())
 
 
 def test_a_fit_looks_at_what_the_generator_draws(copied, tmp_path):
     model = load_model(str(copied))
     generate_scenes(model, model.prior, 60, tmp_path / "target", format="images")
-    settings = {"count.steps": 20, "count.images": 8, "width": "8,16,32", "batches": 2, "num_scenes": 30}
-    settings |= {"pretrain_derivations": 200, "draws_per_structure": 1, "learn": "structure"}
-    more = {"features": "count", "threads": 1, "cache": False, "progress": False, "settings": settings}
-    run = fit(str(copied), tmp_path / "target" / "images", "quick", out=tmp_path / "run", **more)
+    settings = {
+        "features.schedule.steps": 20,
+        "features.schedule.images": 8,
+        "features.width": "8,16,32",
+        "structure.batches": 2,
+        "structure.num_scenes": 30,
+    }
+    settings |= {"pretrain.derivations": 200, "structure.draws_per_structure": 1}
+    config = preset("quick").set("features=count", "parameters=none", settings)
+    execution = Execution(1, cache=False, progress=False)
+    run = fit(str(copied), tmp_path / "target" / "images", config, out=tmp_path / "run", execution=execution)
     assert run.record["assets"].startswith("generator draw_boxes.py, ")
     run.generate(10, tmp_path / "out")
     assert len(list((tmp_path / "out" / "images").iterdir())) == 10
@@ -226,7 +236,13 @@ def test_a_fit_whose_generator_fails_says_so_and_leaves_nothing(copied, tmp_path
     fresh()
     fault("always")
     with pytest.raises((GeneratorError, ModelError), match="never any mesh"):
-        fit(str(copied), tmp_path / "target" / "images", "quick", out=tmp_path / "run", progress=False)
+        fit(
+            str(copied),
+            tmp_path / "target" / "images",
+            "quick",
+            out=tmp_path / "run",
+            execution=Execution(progress=False),
+        )
     assert not (tmp_path / "run").exists()
 
 
@@ -235,7 +251,7 @@ def test_what_a_program_printed_stands_below_the_message_line_by_line(copied, ca
     script.write_text("import sys\n\nprint('no licence:', 3, 'seats')\nsys.exit('ask Ann')\n")
     told = call("preview", copied, "--num", 1, "--out", tmp_path / "prior.png")
     message, *printed = told.err.strip().splitlines()
-    assert told.code == 2 and message.startswith("probscene: Expected the generator draw_boxes.py to draw the scene")
+    assert told.code == 2 and message.startswith("probscene: expected the generator draw_boxes.py to draw the scene")
     assert printed[0] == "The end of what it printed:" and set(printed[1:]) == {"no licence: 3 seats", "ask Ann"}
 
 
@@ -245,7 +261,7 @@ def test_the_page_on_generators_is_a_model_and_its_program(tmp_path, call):
     (tmp_path / "model.py").write_text(model)
     (tmp_path / "draw.py").write_text(draw)
     told = call("check", tmp_path / "model.py", "--render")
-    assert told.code == 0 and "Nothing to mend" in told.out and "the same bytes" in told.out
+    assert told.code == 0 and "Nothing to fix" in told.out and "the same bytes" in told.out
     for block in re.findall(r"(?:^    .*\n|^\n)+", page, re.MULTILINE):
         if "probscene_worker" in block:  # written for programs that are not here
             compile(textwrap.dedent(block), "page", "exec")

@@ -13,11 +13,11 @@ import probscene as ps
 from probscene.app.trial.detector import RECIPES, build
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures, Stage, augmented, detect, fitted, order, train
-from probscene.app.trial.trial import Budget, trial
+from probscene.app.trial.trial import Budget, TrialOptions, trial
 from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
-SMALL = {"budget": Budget(presentations=8), "seeds": 2, "resamples": 20, "size": (64, 64)}
+SMALL = {"budget": Budget(iterations=2), "seeds": 2, "resamples": 20, "size": (64, 64)}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_detector_learns_what_is_drawn(drawn, tmp_path):
     found = ps.trial(
         drawn / "test", tmp_path / "out", {"drawn": drawn / "train"},
-        seeds=1, resamples=50, size=(64, 64), budget=Budget(presentations=200), progress=False,
+        seeds=1, resamples=50, size=(64, 64), budget=Budget(iterations=50), progress=False,
     )  # fmt: skip
     assert found.precision("drawn").value > 0.6
     record = json.loads((tmp_path / "out" / "results.json").read_text())
@@ -38,7 +38,8 @@ def test_a_detector_learns_what_is_drawn(drawn, tmp_path):
 
 def test_two_workers_give_the_same_bytes(drawn, tmp_path):
     for workers in (1, 2):
-        trial(drawn / "test", tmp_path / str(workers), {"two": f"{drawn / 'train'}:2"}, **SMALL, workers=workers)
+        sets, options = {"two": f"{drawn / 'train'}:2"}, TrialOptions(**SMALL)
+        trial(drawn / "test", tmp_path / str(workers), sets, options, workers=workers)
     assert contents(tmp_path / "1") == contents(tmp_path / "2")
 
 
@@ -49,7 +50,7 @@ def test_mask_rcnn_is_trained_from_the_weights_of_a_user(drawn, tmp_path):
     frozen = detector.backbone.body.layer1[0].conv1.weight.clone()
     recipe = RECIPES["maskrcnn"]
     train(detector, [Stage((examples[:2],), 2)], recipe, (64, 64), (0,))
-    found = detect(detector, examples[0].path, (64, 64), recipe.first)
+    found = detect(detector, examples[0].path, (64, 64), recipe.first_label)
     assert set(found.classes.tolist()) <= {0, 1} and (frozen == detector.backbone.body.layer1[0].conv1.weight).all()
     safetensors.torch.save_file({"x": torch.zeros(1)}, file)
     with pytest.raises(DataError, match="maskrcnn_resnet50_fpn or resnet50"):

@@ -63,11 +63,11 @@ def spoiled(key: str, index: int, **values):
         (spoiled("annotations", 0, image_id=77), r"image_id.*annotations\[0\].*77"),
         (spoiled("annotations", 0, category_id=9), r"category_id.*annotations\[0\].*9"),
         (spoiled("images", 1, file_name="000.png"), r"second one of 000\.png in images\[1\]"),
-        (spoiled("images", 1, id=0), r"id that no other.*images\[1\].*actual 0;"),
+        (spoiled("images", 1, id=0), r"id that no other.*images\[1\].*got 0;"),
         (spoiled("categories", 1, name="disc"), r"'disc' more than once"),
-        (spoiled("images", 0, height=65), r"64x65 as in images\[0\].*actual 64x64"),
-        (lambda record: record.pop("images"), r"lists of images, annotations, categories.*actual none of images\."),
-        (lambda record: record.update(images=[], annotations=[]), r"Expected labelled images.*actual none of them"),
+        (spoiled("images", 0, height=65), r"64x65 as in images\[0\].*got 64x64"),
+        (lambda record: record.pop("images"), r"lists of images, annotations, categories.*got none of images\."),
+        (lambda record: record.update(images=[], annotations=[]), r"expected labelled images.*got none of them"),
     ],
 )
 def test_faults_of_coco_are_named(folder, how, said):
@@ -78,7 +78,7 @@ def test_faults_of_coco_are_named(folder, how, said):
 def test_images_that_do_not_decode_are_named(folder):
     (folder / "images" / "001.png").write_bytes(b"no image")
     (folder / "images" / "002.png").write_bytes(b"")
-    said = r"actual 2 of 3 bad: 001\.png is not a PNG, JPEG or TIFF image, 002\.png is empty; mend or delete them\."
+    said = r"got 2 of 3 bad: 001\.png is not a PNG, JPEG or TIFF image, 002\.png is empty; fix or delete them\."
     with pytest.raises(DataError, match=said):
         read_set(folder)
 
@@ -94,10 +94,10 @@ def test_images_are_the_same_by_all_their_bits(folder):
 
 def test_classes_that_differ_are_named_and_case_is(folder):
     with pytest.raises(
-        DataError, match=r"Expected the classes Disc.*actual disc, square.*'disc' differs in case.*--classes"
+        DataError, match=r"expected the classes Disc.*got disc, square.*'disc' differs in case.*--classes"
     ):
         read_set(folder, ("Disc",))
-    with pytest.raises(DataError, match="actual none of them"):
+    with pytest.raises(DataError, match="got none of them"):
         read_set(folder / "images")
 
 
@@ -150,7 +150,7 @@ def test_a_list_of_images(drawn, tmp_path):
     found, names = read_set(drawn / "train"), tmp_path / "names.txt"
     names.write_text("003\n001\n")
     assert [e.path.stem for e in only(found, names).examples] == ["003", "001"]
-    for text, said in (("003 999", "'999'"), ("", "actual none")):
+    for text, said in (("003 999", "'999'"), ("", "got none")):
         names.write_text(text)
         with pytest.raises(DataError, match=said):
             only(found, names)
@@ -173,7 +173,7 @@ def test_what_a_plan_understands(drawn):
 @pytest.mark.parametrize(
     ("sets", "said"),
     [
-        ({}, "actual none"),
+        ({}, "got none"),
         ({"a": "nowhere/at/all"}, "'nowhere/at/all'"),
         ({"learnt": "real"}, "'learnt' twice"),
         ({"a/b": "real"}, "can be a file's"),

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from probscene.app.datasets.generate import generate_scenes
+from probscene.app.datasets.generate import DatasetOptions, generate_scenes
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
-from probscene.app.trial.trial import Budget, trial
+from probscene.app.trial.trial import Budget, TrialOptions, trial
 from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.inference.guides.lstm import LSTMGuide
 
 from .conftest import change, draw_set
 
-SMALL = {"budget": Budget(presentations=8), "seeds": 2, "resamples": 20, "size": (64, 64)}
+SMALL = {"budget": Budget(iterations=2), "seeds": 2, "resamples": 20, "size": (64, 64)}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -46,7 +46,7 @@ def sets(drawn) -> dict:
 @pytest.fixture(scope="module")
 def undisturbed(drawn, tmp_path_factory) -> Path:
     train, out = str(drawn / "train"), tmp_path_factory.mktemp("trial") / "out"
-    trial(drawn / "test", out, {"four": f"{train}:4", "then": f"four,{train}"}, **SMALL)
+    trial(drawn / "test", out, {"four": f"{train}:4", "then": f"four,{train}"}, TrialOptions(**SMALL))
     return out
 
 
@@ -65,35 +65,35 @@ def test_an_interrupted_trial_goes_on_to_the_same_bytes(undisturbed, drawn, sets
     out = tmp_path / "out"
     for after in (1, 3):
         with pytest.raises(Stop):
-            trial(drawn / "test", out, sets, stopping(after), **SMALL)
+            trial(drawn / "test", out, sets, TrialOptions(**SMALL), show=stopping(after))
         assert len(list((out / "trainings").iterdir())) == after
-    trial(drawn / "test", out, sets, **SMALL)
+    trial(drawn / "test", out, sets, TrialOptions(**SMALL))
     assert contents(out) == contents(undisturbed)
 
 
 def test_sets_can_be_added_and_not_changed(undisturbed, drawn, sets, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(undisturbed, out)
-    found = trial(drawn / "test", out, {**sets, "mixed": f"four+{drawn / 'train'}"}, **SMALL)
+    found = trial(drawn / "test", out, {**sets, "mixed": f"four+{drawn / 'train'}"}, TrialOptions(**SMALL))
     assert found.rows == ("four", "then", "mixed")
     before = contents(out)
     with pytest.raises(RunError, match="'four' as .* was trained on"):
-        trial(drawn / "test", out, {**sets, "four": f"{drawn / 'train'}:3"}, **SMALL)
+        trial(drawn / "test", out, {**sets, "four": f"{drawn / 'train'}:3"}, TrialOptions(**SMALL))
     with pytest.raises(RunError, match=r"was begun with \(recipe"):
-        trial(drawn / "test", out, sets, **{**SMALL, "budget": Budget(presentations=16)})
+        trial(drawn / "test", out, sets, TrialOptions(**{**SMALL, "budget": Budget(iterations=4)}))
     assert contents(out) == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").touch()
     with pytest.raises(DataError, match="new or empty folder"):
-        trial(drawn / "test", tmp_path / "full", sets, **SMALL)
+        trial(drawn / "test", tmp_path / "full", sets, TrialOptions(**SMALL))
 
 
 def test_a_chain_goes_on_from_the_row_before(drawn, sets, tmp_path):
-    chain = {**SMALL, "budget": Budget(presentations=8, chain=True), "seeds": 1}
-    trial(drawn / "test", tmp_path / "whole", sets, **chain)
+    warm_start = {**SMALL, "budget": Budget(iterations=2, warm_start=True), "seeds": 1}
+    trial(drawn / "test", tmp_path / "whole", sets, TrialOptions(**warm_start))
     with pytest.raises(Stop):
-        trial(drawn / "test", tmp_path / "parts", sets, stopping(1), **chain)
-    trial(drawn / "test", tmp_path / "parts", sets, **chain)
+        trial(drawn / "test", tmp_path / "parts", sets, TrialOptions(**warm_start), show=stopping(1))
+    trial(drawn / "test", tmp_path / "parts", sets, TrialOptions(**warm_start))
     assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
     assert not list((tmp_path / "whole" / "trainings").glob("*.weights"))
 
@@ -109,10 +109,10 @@ def run(discs, tmp_path_factory) -> RunFolder:
 
 def test_a_run_is_generated_beside_photographs_on_the_command_line(run, discs, tmp_path, call):
     model = load_model(str(discs.file))
-    generate_scenes(model, model.prior, 20, tmp_path / "real", seed=9, box_margin=9)
+    generate_scenes(model, model.prior, 20, tmp_path / "real", seed=9, options=DatasetOptions(box_margin=9))
     words = ["trial", "--test", tmp_path / "real", "--hold-out", 8, "--real-numbers", "4,all", "--run", run.path]
     words += ["--generate", 6, "--set", "learnt then 4=learnt,real:4", "--out", tmp_path / "out", "--baseline", "prior"]
-    words += ["--seeds", 1, "--presentations", 8, "--resamples", 10, "--size", "64x64", "--box-margin", 2]
+    words += ["--seeds", 1, "--iterations", 2, "--resamples", 10, "--size", "64x64", "--box-margin", 2]
     done = call(*words)
     assert done.code == 0, done.err
     lines = (tmp_path / "out" / "sets" / "learnt" / "provenance.jsonl").read_text().splitlines()
@@ -135,8 +135,8 @@ def test_test_images_in_a_set_are_named(drawn, tmp_path):
 
     Image.open(drawn / "test" / "images" / "002.png").save(folder / "images" / "005.png", compress_level=1)
     change(folder, lambda record: record.update(annotations=[]))
-    with pytest.raises(DataError, match=r"actual 1 in .*set/images/005\.png is .*test/images/002\.png\. Take them out"):
-        trial(drawn / "test", tmp_path / "out", {"set": folder}, **SMALL)
+    with pytest.raises(DataError, match=r"got 1 in .*set/images/005\.png is .*test/images/002\.png\. Take them out"):
+        trial(drawn / "test", tmp_path / "out", {"set": folder}, TrialOptions(**SMALL))
     assert not (tmp_path / "out").exists()
 
 
@@ -146,20 +146,21 @@ def test_test_images_in_a_set_are_named(drawn, tmp_path):
         ({"baselines": ["none"]}, "baseline among"),
         ({"seeds": 0}, "positive number of seeds"),
         ({"workers": 0}, "positive number of workers"),
-        ({"size": (60, 64)}, "multiples of 32, actual 64x60"),
+        ({"size": (60, 64)}, "multiples of 32, got 64x60"),
         ({"detector": "yolo"}, "efficientnet or maskrcnn=FILE"),
         ({"detector": "maskrcnn=/nowhere"}, "file of weights"),
-        ({"budget": Budget(rate=-1.0)}, "positive learning rate"),
-        ({"budget": Budget(last=1.0)}, "between 0 and 1"),
-        ({"numbers": [10]}, "--real-numbers, actual neither"),
-        ({"hold_out": 2, "real": Path("x")}, "actual both"),
+        ({"budget": Budget(learning_rate=-1.0)}, "positive learning rate"),
+        ({"budget": Budget(finetune_fraction=1.0)}, "between 0 and 1"),
+        ({"numbers": [10]}, "--real-numbers, got neither"),
+        ({"hold_out": 2, "real": Path("x")}, "got both"),
         ({"hold_out": 60}, "hold out 1 to 5"),
         ({"classes": ["disc", "cross"]}, "rename cross there"),
     ],
 )
 def test_settings_that_make_no_sense(drawn, sets, tmp_path, options, said):
     with pytest.raises(ProbsceneError, match=said):
-        trial(drawn / "test", tmp_path / "out", sets, **{**SMALL, **options})
+        workers, options = options.get("workers", 1), {key: value for key, value in options.items() if key != "workers"}
+        trial(drawn / "test", tmp_path / "out", sets, TrialOptions(**{**SMALL, **options}), workers=workers)
     assert not (tmp_path / "out").exists()
 
 
@@ -167,13 +168,13 @@ def test_sets_are_all_checked_before_any_is_trained(drawn, sets, tmp_path):
     other = draw_set(tmp_path / "other", 2, 3, classes=("Disc", "square"))
     more = change(draw_set(tmp_path / "more", 2, 3), lambda r: r["categories"].append({"id": 3, "name": "ring"}))
     for sets_, said in (
-        ({**sets, "other": other}, r"classes disc, square in .*other, actual Disc, square \('Disc' differs in case\)"),
-        ({**sets, "more": more}, r"classes disc, square in .*more, actual ring, too; name the classes"),
-        ({**sets, "nine": f"{drawn / 'train'}:9"}, "at least 9 images .* 'nine', actual 8"),
+        ({**sets, "other": other}, r"classes disc, square in .*other, got Disc, square \('Disc' differs in case\)"),
+        ({**sets, "more": more}, r"classes disc, square in .*more, got ring, too; name the classes"),
+        ({**sets, "nine": f"{drawn / 'train'}:9"}, "at least 9 images .* 'nine', got 8"),
     ):
         with pytest.raises(DataError, match=said):
-            trial(drawn / "test", tmp_path / "out", sets_, **SMALL)
+            trial(drawn / "test", tmp_path / "out", sets_, TrialOptions(**SMALL))
     lacking = change(draw_set(tmp_path / "test", 2, 4), lambda record: record.update(annotations=[]))
-    with pytest.raises(DataError, match="objects of every class, actual none of disc, square"):
-        trial(lacking, tmp_path / "out", sets, **SMALL)
+    with pytest.raises(DataError, match="objects of every class, got none of disc, square"):
+        trial(lacking, tmp_path / "out", sets, TrialOptions(**SMALL))
     assert not (tmp_path / "out").exists()

@@ -120,7 +120,7 @@ def test_views_that_cannot_be(tmp_path, call, discs):
     for words, message in (
         (("--out", tmp_path / "scene.ply"), "suffix .rrd or .glb"),
         (("--out", tmp_path / "new" / "scene.glb"), "a model in 3D"),
-        (("--out", tmp_path / "scene.glb", "--num", 2), "one in a .glb, actual 2"),
+        (("--out", tmp_path / "scene.glb", "--num", 2), "one in a .glb, got 2"),
         (("--out", tmp_path / "scene.rrd", "--num", 0), "positive number of scenes"),
     ):
         done = call("view", discs.file, *words)
@@ -142,4 +142,4 @@ def test_a_folder_is_made(tmp_path, call, lots):
 def test_a_fit_that_is_not_finished_cannot_be_seen(tmp_path, call):
     RunFolder.create(tmp_path / "run", str(LOTS), {"guide": {"hidden": 8}})
     done = call("view", tmp_path / "run", "--out", tmp_path / "scene.rrd")
-    assert done.code == 2 and "Expected a finished fit" in done.err and not (tmp_path / "scene.rrd").exists()
+    assert done.code == 2 and "expected a finished fit" in done.err and not (tmp_path / "scene.rrd").exists()

@@ -92,7 +92,7 @@ def test_the_page_shows_figures_curves_grammar_time_and_configuration(text, fitt
         "Pretraining",
     ):
         assert what in words, what
-    for key in ("seed", "threads", "version", "target", "preset.count.steps", "preset.batches"):
+    for key in ("seed", "threads", "version", "target", "config.features.schedule.steps", "config.structure.batches"):
         assert f"<td>{key}</td>" in text
     assert f"<td>{html.escape(run.record['target'])}</td>" in text and f"version {run.record['version']}" in words
     assert len(re.findall(r"<b>\d\.\d{3} → \d\.\d{3}</b>", text)) == 4
@@ -156,7 +156,7 @@ def test_a_site_of_the_scene_has_quantiles_of_what_it_was_and_what_it_became(lea
 
 def test_the_page_of_a_run_without_parameters_says_so(fitted, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
-    (tmp_path / "run" / "parameters.json").unlink()
+    assert not (tmp_path / "run" / "parameters.json").exists()
     made = report(RunFolder.at(tmp_path / "run"), Display(), num=100, judged_by=0).read_text(encoding="utf-8")
     assert "Parameters were not learnt" in made
 

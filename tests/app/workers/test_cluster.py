@@ -8,35 +8,23 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from probscene.app.api.fit import fit
 from probscene.app.datasets import generate as datasets
-from probscene.app.datasets.generate import _actor, generate
+from probscene.app.datasets.generate import DatasetOptions, _actor, generate, workers_or_cluster
+from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.run import RunFolder
+from probscene.app.workers import actor_pool
 from probscene.app.workers import cluster as clusters
-from probscene.app.workers import crew as crews
 from probscene.app.workers.cluster import Cluster
 from probscene.errors import MachineError, ModelError, ProbsceneError
-from probscene.generator import Command
-from probscene.renderers.generator.pool import pool_for
+
+from .tasks import doubling, drawing, slow
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
-
-
-def doubling(pause=0.0, fault=None):
-    """A crew's work, found by nodes under this file's name."""
-
-    def do(task):
-        time.sleep(pause)
-        if task == fault:
-            raise ModelError("this one cannot be drawn")
-        return task, 2 * task
-
-    return do
 
 
 def unwritable(node, code, tried, *arguments):
@@ -59,40 +47,35 @@ def unwritable(node, code, tried, *arguments):
     return make
 
 
-def slow():
-    """The work of a crew whose preparation takes its time."""
-    time.sleep(4)
-    return doubling()
-
-
-def drawing(argv):
-    """Work that starts a generator; it gives the folder of its pool."""
-    pool = pool_for(Command(argv), 1)
-    pool.draw([{"height": 4, "width": 4, "seed": 1, "values": {"light": 1}, "nodes": []}])
-    return lambda task: str(pool.folder)
-
-
 def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 @pytest.fixture
-def said():
+def messages():
     return []
 
 
 @pytest.fixture
-def nodes(simulated, said, monkeypatch):
+def nodes(simulated, messages, monkeypatch):
     """A connection to the cluster; what is late is soon found to be."""
-    monkeypatch.setattr(crews, "LATE", 2.0)
-    with Cluster(simulated.address, said.append) as connected:
+    monkeypatch.setattr(actor_pool, "MIN_LATE_SECONDS", 2.0)
+    with Cluster(simulated.address, messages.append) as connected:
         yield connected
 
 
-def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, said):
-    crew, found = nodes.crew(doubling, (0.1,)), []
-    while sum(isinstance(member.asked, int) for member in crew._members) < 3:  # until every node is at work
-        crew.run(range(3), lambda result: None)
+@pytest.fixture(scope="module")
+def alone(fitted, tmp_path_factory) -> dict[str, bytes]:
+    """What one process makes of 700 images."""
+    out = tmp_path_factory.mktemp("alone") / "out"
+    generate(RunFolder.at(fitted), 700, out, seed=3, format="coco,yolo")
+    return contents(out)
+
+
+def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, messages):
+    pool, found = nodes.actor_pool(doubling, (0.1,)), []
+    while sum(isinstance(member.request, int) for member in pool._members) < 3:  # until every node is at work
+        pool.run(range(3), lambda result: None)
 
     def done(result):
         found.append(result)
@@ -101,21 +84,20 @@ def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, sa
         if len(found) == 12:
             simulated.freeze()
 
-    crew.run(range(40), done)
+    pool.run(range(40), done)
     assert sorted(found) == [(task, 2 * task) for task in range(40)]
     end = time.monotonic() + 120
-    while len(crew._names) == 3:  # Ray needs some seconds to see that one is lost
+    while len(pool._names) == 3:  # Ray needs some seconds to see that one is lost
         again = []
-        crew.run([7, 8], again.append)  # on the node that is left
+        pool.run([7, 8], again.append)  # on the node that is left
         assert sorted(again) == [(7, 14), (8, 16)] and time.monotonic() < end
-    told = [line for line in said if "is lost" in line or "has not answered" in line]
+    told = [line for line in messages if "is lost" in line or "has not answered" in line]
     assert len(told) == 2 and sum("has not answered" in line for line in told) >= 1  # on a busy machine both are late
-    crew.close()
+    pool.close()
 
 
-def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_path):
+def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, alone, tmp_path):
     run, made = RunFolder.at(fitted), []
-    generate(run, 700, tmp_path / "alone", seed=3, format="coco,yolo")
 
     def progress(number, _):
         made.append(number)
@@ -124,17 +106,17 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, tmp_pa
         if len(made) == 5:
             simulated.freeze()
 
-    dataset = generate(run, 700, tmp_path / "out", 3, format="coco,yolo", progress=progress, cluster=nodes)
+    dataset = generate(run, 700, tmp_path / "out", 3, format="coco,yolo", progress=progress, workers=nodes)
     assert dataset.made == 700 and dataset.finished and made[-1] == 700
-    assert contents(tmp_path / "out") == contents(tmp_path / "alone")
+    assert contents(tmp_path / "out") == alone
 
 
 def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_path, monkeypatch):
-    words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "num_scenes=150"]
+    words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "structure.num_scenes=150"]
     assert call(*words, "--out", tmp_path / "alone").code == 0
-    parts, run = [], crews.Crew.run
+    parts, run = [], actor_pool.ActorPool.run
 
-    def disturbed(crew, tasks, done):
+    def disturbed(pool, tasks, done):
         def each(result):
             parts.append(result)
             if len(parts) == 4:
@@ -143,10 +125,10 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
                 simulated.freeze()
             done(result)
 
-        return run(crew, tasks, each)
+        return run(pool, tasks, each)
 
-    monkeypatch.setattr(crews, "LATE", 2.0)
-    monkeypatch.setattr(crews.Crew, "run", disturbed)
+    monkeypatch.setattr(actor_pool, "MIN_LATE_SECONDS", 2.0)
+    monkeypatch.setattr(actor_pool.ActorPool, "run", disturbed)
     result = call(*words, "--out", tmp_path / "out", "--cluster", simulated.address)
     assert result.code == 0, result.err
     assert len(parts) == 4 * 3
@@ -155,48 +137,48 @@ def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_
 
 
 def test_an_actor_that_prepares_itself_for_long_is_waited_for(nodes, monkeypatch):
-    crew, found = nodes.crew(slow, ()), []
-    monkeypatch.setattr(crews, "START", 0.0)
-    while not crew._there():  # this has no actor yet
+    pool, found = nodes.actor_pool(slow, ()), []
+    monkeypatch.setattr(actor_pool, "START_TIMEOUT", 0.0)
+    while not pool.any_answered():  # this has no actor yet
         with suppress(MachineError):
-            crew.run([1], lambda result: None)
-    crew.run([1, 2], found.append)
+            pool.run([1], lambda result: None)
+    pool.run([1, 2], found.append)
     assert sorted(found) == [(1, 2), (2, 4)]
 
 
 def test_generators_that_nodes_have_started_leave_no_files(nodes):
     argv = [sys.executable, str(Path(__file__).parents[1] / "generators" / "draw_boxes.py")]
-    crew, folders = nodes.crew(drawing, (argv,)), []
-    crew.run(range(3), folders.append)
+    pool, folders = nodes.actor_pool(drawing, (argv,)), []
+    pool.run(range(3), folders.append)
     assert len(folders) == 3 and any(map(os.path.exists, folders))
-    crew.close()
+    pool.close()
     assert not any(map(os.path.exists, folders))
 
 
 def test_what_a_task_raises_is_told_with_its_node(nodes):
     with pytest.raises(ModelError, match="^On node .*: this one cannot be drawn$"):
-        nodes.crew(doubling, (0.0, 3)).run([3], lambda result: None)
+        nodes.actor_pool(doubling, (0.0, 3)).run([3], lambda result: None)
 
 
 @pytest.mark.parametrize("code, what", [(errno.ENOSPC, "The disk is full"), (errno.EROFS, "Read-only file system")])
-def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, tmp_path, monkeypatch, code, what):
+def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, alone, tmp_path, monkeypatch, code, what):
     run, node, out = RunFolder.at(fitted), simulated.nodes[1].node_id, tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr(datasets, "_actor", partial(unwritable, node, code, tmp_path / "tried"))
         with pytest.raises(MachineError, match=f"On node .*: .*{what}"):
-            generate(run, 700, out, seed=3, cluster=nodes)
-    generate(run, 700, tmp_path / "alone", seed=3)
+            generate(run, 700, out, seed=3, format="coco,yolo", workers=nodes)
     shown = {name: data for name, data in contents(out).items() if not name.startswith(".")}
-    assert shown.items() <= contents(tmp_path / "alone").items()  # whole or absent
-    generate(run, 700, out, seed=3, cluster=nodes)
-    assert contents(out) == contents(tmp_path / "alone")
+    assert shown.items() <= alone.items()  # whole or absent
+    if code == errno.ENOSPC:
+        generate(run, 700, out, seed=3, format="coco,yolo", workers=nodes)
+        assert contents(out) == alone
 
 
 def test_other_versions_are_refused(nodes, monkeypatch):
-    here = crews.versions()
-    monkeypatch.setattr(crews, "versions", lambda: {**here, "torch": "1.0"})
-    with pytest.raises(ProbsceneError, match="Expected torch 1.0 on node .*, as on this machine, actual 2"):
-        nodes.crew(doubling, ()).run([1], lambda result: None)
+    here = actor_pool.versions()
+    monkeypatch.setattr(actor_pool, "versions", lambda: {**here, "torch": "1.0"})
+    with pytest.raises(ProbsceneError, match="expected torch 1.0 on node .*, as on this machine, got 2"):
+        nodes.actor_pool(doubling, ()).run([1], lambda result: None)
 
 
 def test_the_last_node_is_lost(simulated, nodes):
@@ -204,41 +186,42 @@ def test_the_last_node_is_lost(simulated, nodes):
         while simulated.nodes:
             simulated.kill()
 
-    with pytest.raises(MachineError, match="Expected a node with 1 cores .*, actual .*goes on where it stopped"):
-        nodes.crew(doubling, (0.1,)).run(range(1000), done)
+    with pytest.raises(MachineError, match="expected a node with 1 cores .*, got .*goes on where it stopped"):
+        nodes.actor_pool(doubling, (0.1,)).run(range(1000), done)
 
 
 def test_a_folder_that_nodes_do_not_see_is_named(nodes, fitted, tmp_path):
     run = RunFolder.at(fitted)
     assert run.guide_hash() and run.guide  # as of another machine's disk, which nodes do not have
     run.path = tmp_path / "elsewhere"
-    with pytest.raises(ProbsceneError, match="On node .*: Expected a run folder .*elsewhere.*by the same paths"):
-        nodes.crew(_actor, (run.path, 10, tmp_path / "out", 0, ("coco",), 0.0, False)).run([0], lambda result: None)
+    with pytest.raises(ProbsceneError, match="On node .*: expected a run folder .*elsewhere.*by the same paths"):
+        arguments = run.path, 10, tmp_path / "out", 0, ("coco",), DatasetOptions()
+        nodes.actor_pool(_actor, arguments).run([0], lambda result: None)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "nowhere", "nowhere.invalid:6379"])
 def test_a_cluster_that_is_not_there_is_one_line(call, fitted, tmp_path, address):
     result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
     assert result.code == 1 and result.err.count("\n") == 1
-    assert f"Expected a Ray cluster at {address}, actual none" in result.err and not (tmp_path / "out").exists()
+    assert f"expected a Ray cluster at {address}, got none" in result.err and not (tmp_path / "out").exists()
 
 
 def test_a_fit_without_its_cluster_leaves_no_run(call, discs, target, tmp_path):
     result = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "out", "--cluster", "127.0.0.1:1")
     assert result.code == 1 and result.err.count("\n") == 1
-    assert "Expected a Ray cluster at 127.0.0.1:1" in result.err and not (tmp_path / "out").exists()
-    with pytest.raises(MachineError, match="Expected a Ray cluster at 127.0.0.1:1"):
-        fit(discs.file, target.images, out=tmp_path / "out", cluster="127.0.0.1:1", progress=False)
+    assert "expected a Ray cluster at 127.0.0.1:1" in result.err and not (tmp_path / "out").exists()
+    with pytest.raises(MachineError, match="expected a Ray cluster at 127.0.0.1:1"):
+        fit(discs.file, target.images, out=tmp_path / "out", execution=Execution(cluster="127.0.0.1:1", progress=False))
     assert not (tmp_path / "out").exists()
 
 
 def test_what_is_not_ray_is_told_in_time(call, fitted, tmp_path, monkeypatch):
-    monkeypatch.setattr(clusters, "ANSWER", 2.0)
+    monkeypatch.setattr(clusters, "ANSWER_TIMEOUT", 2.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         address = f"127.0.0.1:{listening.getsockname()[1]}"
         result = call("generate", fitted, "--num", 4, "--out", tmp_path / "out", "--cluster", address)
     assert result.code == 1 and result.err.count("\n") == 1
-    assert f"Expected a Ray cluster at {address}, actual none (something that is not Ray listens there" in result.err
+    assert f"expected a Ray cluster at {address}, got none (something that is not Ray listens there" in result.err
 
 
 def test_another_version_of_ray_is_no_missing_cluster(monkeypatch):
@@ -248,8 +231,8 @@ def test_another_version_of_ray_is_no_missing_cluster(monkeypatch):
         raise RuntimeError(f"Version mismatch: {there}{here}")
 
     monkeypatch.setattr("ray.init", mismatched)
-    monkeypatch.setattr(clusters, "_knocked", lambda address: address)
-    with pytest.raises(MachineError, match="actual Ray 2.1.0 and Python 3.9.1; install the same versions"):
+    monkeypatch.setattr(clusters, "_checked_address", lambda address: address)
+    with pytest.raises(MachineError, match="got Ray 2.1.0 and Python 3.9.1; install the same versions"):
         Cluster("10.0.0.1:6379")
 
 
@@ -257,10 +240,11 @@ def test_auto_starts_one_where_what_ray_remembers_is_gone(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     found = []
     with Cluster("auto") as cluster:
-        cluster.crew(doubling, ()).run([1, 2], found.append)
+        cluster.actor_pool(doubling, ()).run([1, 2], found.append)
     assert sorted(found) == [(1, 2), (2, 4)]
 
 
-def test_workers_or_a_cluster(fitted, tmp_path):
-    with pytest.raises(ProbsceneError, match="Expected workers or a cluster"):
-        generate(RunFolder.at(fitted), 4, tmp_path / "out", workers=2, cluster=SimpleNamespace())
+def test_workers_or_a_cluster(nodes):
+    assert workers_or_cluster(2, None) == 2 and workers_or_cluster(1, nodes) is nodes
+    with pytest.raises(ProbsceneError, match="expected workers or a cluster"):
+        workers_or_cluster(2, nodes)

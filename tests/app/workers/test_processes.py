@@ -32,7 +32,7 @@ fit.generate(130, sys.argv[2], workers=2, progress=False)
 ONCE = "import os\nos.mkdir('made')\n" + SPREAD + "\nmain()\n"
 
 
-NO_GUARD = "Expected a script with a main guard, .*, actual one without; put the calls .* under 'if __name__ == "
+NO_GUARD = "expected a script with a main guard, .*, got one without; put the calls .* under 'if __name__ == "
 
 
 def run(folder: Path, text: str, *words: object, stdin: bool = False) -> subprocess.CompletedProcess:
@@ -64,15 +64,13 @@ def test_so_it_is_where_calls_are_in_a_function(tmp_path):
 
 def test_a_script_from_stdin_is_named(tmp_path):
     done = run(tmp_path, GUARDED, stdin=True)
-    check_ends_with(
-        done, "ProbsceneError", "Expected a script in a file, .*, actual one from <stdin>; save it in a file"
-    )
+    check_ends_with(done, "ProbsceneError", "expected a script in a file, .*, got one from <stdin>; save it in a file")
 
 
 def test_a_script_that_breaks_in_a_worker_is_named(tmp_path):
     done = run(tmp_path, ONCE)
     assert "FileExistsError" in done.stderr
-    assert re.search("Expected a worker process to start, actual .* code 1 while .* under 'if __name__", done.stderr)
+    assert re.search("expected a worker process to start, got .* code 1 while .* under 'if __name__", done.stderr)
 
 
 def test_no_file_is_needed_where_there_is_no_script(tmp_path):

@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probscene import load_model
-from probscene.app.fitting.observer import Observer
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import enter
-from probscene.inference.features.counting.batches import FEWEST, FULL, CountBatches, CountSchedule, cells
-from probscene.inference.features.counting.choices import CountFeatures
+from probscene.inference.features.counting.batches import FULL_AREA, MIN_IMAGES, CountBatches, CountSchedule, cells
 from probscene.inference.features.counting.net import STRIDE, CountNet, toward_whole
-from probscene.inference.features.counting.training import CountTraining, count_loss
+from probscene.inference.features.counting.training import CountFeatures, CountTraining, count_loss
 from probscene.inference.features.presence import PresenceFeatures, PresenceNet, PresenceTraining
 from probscene.model import Groups
 from probscene.structure import StructurePrior
@@ -134,7 +133,7 @@ def test_fits_of_all_seeds_look_at_one_resolution(dots):
 def test_a_schedule_says_whether_a_network_sees_more_than_the_prior_has(dots, beyond):
     more = StructurePrior(dots.grammar, Things=lengths(0, 0, 0, 0, 0, 1))
     choice = CountFeatures(CountSchedule(beyond_prior=beyond))
-    renders = Observer(replace(dots, pretraining=more), threads=1)
+    renders = RenderedFeatures(replace(dots, pretraining=more), threads=1)
     number = (choice.training(choice.build(dots), renders, None, 0).batches.draw(32).label >= 0).sum(1)
     assert (number == 5).all() if beyond else (number <= 4).all()
 
@@ -239,8 +238,8 @@ def test_a_step_takes_no_more_pixels_of_large_images(height, width, images):
     taken = CountBatches(net, None, CountSchedule(images=images), 0).images
     area = height * width / net.reduce**2
     assert 1 <= taken <= images
-    assert taken == images or area > FULL
-    assert taken <= FEWEST or taken * area <= images * FULL + area / 2
+    assert taken == images or area > FULL_AREA
+    assert taken <= MIN_IMAGES or taken * area <= images * FULL_AREA + area / 2
 
 
 @pytest.mark.parametrize("groups", [None, Groups("row", max_groups=2)])

@@ -9,14 +9,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.app.fitting.observer import Observer
-from probscene.derivation import Derivation
+from probscene.app.fitting.rendered_features import RenderedFeatures
+from probscene.derivation import Derivation, group_of
 from probscene.derive import derive
 from probscene.drawing import Sprites
 from probscene.errors import ModelError
 from probscene.grammar import Grammar
 from probscene.inference.features.counting.batches import CountSchedule, object_targets
-from probscene.inference.features.counting.grouping import ABSENT, group_of, tally_groups
+from probscene.inference.features.counting.grouping import ABSENT, tally_groups
 from probscene.inference.features.counting.net import STRIDE, CountNet
 from probscene.inference.features.counting.training import CountTraining
 from probscene.model import Groups, SceneModel
@@ -56,7 +56,7 @@ def shelves():
 
 def test_a_node_belongs_to_the_nearest_group_above_it():
     rules = torch.tensor([[0, 1, 3, 4, 6, 5, 1, 3, 4, 6, 5, 2]])
-    derivation = Derivation.of(ROADS, rules)
+    derivation = Derivation.from_rules(ROADS, rules)
     assert [ROADS.kinds[k] for k in derivation.kind[0].tolist()] == ["sky", "road", "car", "dog", "road", "car", "dog"]
     of_road = group_of(derivation.kind, derivation.parent, ROADS.kind("road"))
     assert of_road.tolist() == [[-1, 1, 1, 1, 4, 4, 4]]
@@ -112,7 +112,7 @@ def test_votes_of_objects_say_where_the_middle_is(axis, seed):
 
 def test_a_network_counts_by_group_along_either_axis(shelves):
     """Boxes with discs, side by side: the true counts of nearly every image after a minute."""
-    view = Observer(shelves, threads=1)
+    view = RenderedFeatures(shelves, threads=1)
     torch.manual_seed(0)
     net = CountNet(shelves.classes, 3, shelves.canvas, (8, 16, 24), groups=shelves.groups)
     assert net.names == ("shelf", "disc 1", "disc 2", "disc 3")
@@ -133,5 +133,5 @@ def test_a_network_counts_by_group_along_either_axis(shelves):
 def test_groups_that_make_no_sense():
     with pytest.raises(ModelError, match="along 'x' or 'y'"):
         Groups("road", along="z")
-    with pytest.raises(ModelError, match="actual 'y' and 0"):
+    with pytest.raises(ModelError, match="got 'y' and 0"):
         Groups("road", max_groups=0)

@@ -102,5 +102,5 @@ def test_nothing_moves_without_a_gradient():
 
 
 def test_takes_matrices_alone():
-    with pytest.raises(ProbsceneError, match="Expected matrices"):
+    with pytest.raises(ProbsceneError, match="expected matrices"):
         Muon([torch.nn.Parameter(torch.ones(3))])

@@ -122,7 +122,7 @@ def test_an_image_keeps_its_shape_and_enters_with_the_squares_area(height, width
     for size, step in ((224, 32), (299, 1)):
         frozen = pretrained._Frozen(size, step, 0.0, 1.0, ())
         h, w = frozen.entering(height, width)
-        assert h % step == w % step == 0 and min(h, w) >= pretrained.LEAST
+        assert h % step == w % step == 0 and min(h, w) >= pretrained.MIN_SIDE
         assert (frozen.entering(width, height)) == (w, h)
         if height == width:
             assert (h, w) == (size, size)
@@ -175,7 +175,7 @@ def test_torchvisions_own_file_is_taken_where_it_was_downloaded(weights, residua
     (tmp_path / "checkpoints").mkdir()
     images = noise(1)
     for name, (file, _), network in (("inception", weights, Inception), ("resnet50", residual, ResNet50)):
-        url = pretrained.OFFERED[name].url
+        url = pretrained.TORCHVISION_WEIGHTS[name].url
         (tmp_path / "checkpoints" / url.rpartition("/")[2]).write_bytes(file.read_bytes())
         assert pretrained.weights_file(f"{name}=x.pth").name == "x.pth"
         own = pretrained.pretrained(name)
@@ -192,11 +192,11 @@ def test_without_a_file_and_a_network_one_error_says_what_to_give(name, tmp_path
     monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
     monkeypatch.setattr(torch.hub, "urlopen", refused)
     before = socket.getdefaulttimeout()
-    with pytest.raises(DataError, match=f"^Expected weights for {name}, .*checkpoints") as error:
+    with pytest.raises(DataError, match=f"^expected weights for {name}, .*checkpoints") as error:
         pretrained.pretrained(name)
     said = str(error.value)
     assert f"{name}=FILE" in said and "efficientnet" in said and "no route" in said and "\n" not in said
-    assert pretrained.OFFERED[name].url in said and socket.getdefaulttimeout() == before
+    assert pretrained.TORCHVISION_WEIGHTS[name].url in said and socket.getdefaulttimeout() == before
 
 
 @pytest.mark.parametrize("word", ["vgg", "inception=", "resnet50=", "efficientnet=x", "resnet", ""])
@@ -214,7 +214,7 @@ def test_safetensors_are_read_and_what_the_features_do_not_need_may_lack(weights
 
 
 FAULTS = {
-    "missing": (lambda path: None, "actual none"),
+    "missing": (lambda path: None, "got none"),
     "empty": (lambda path: path.write_bytes(b""), "cannot be read"),
     "no weights": (lambda path: path.write_bytes(b"not weights at all" * 9), "cannot be read"),
     "another network": (lambda path: torch.save(models.squeezenet1_0().state_dict(), path), "another network's"),
@@ -234,7 +234,7 @@ def test_what_is_no_file_of_weights_is_refused(fault, suffix, tmp_path):
     make, expected = FAULTS[fault]
     file = tmp_path / f"weights{suffix}"
     make(file)
-    with pytest.raises(DataError, match=r"^Expected ") as refused:
+    with pytest.raises(DataError, match=r"^expected ") as refused:
         Inception(file)
     assert str(file) in str(refused.value) and "\n" not in str(refused.value)
     if suffix == ".pth":

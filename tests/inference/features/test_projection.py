@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from probscene.errors import ProbsceneError, RunError
-from probscene.inference.divergence import KDELogRatio
-from probscene.inference.features.projection import SHARE, Projected, bandwidth, discriminant, self_share
+from probscene.inference.divergence import SELF_SHARE, KDELogRatio, bandwidth, self_share
+from probscene.inference.features.projection import Projected, discriminant
 
 
 def pairs(number, dimensions=12, structures=3, noise=0.3, seed=0):
@@ -78,10 +78,10 @@ def test_turning_scaling_and_shifting_the_features_changes_nothing(seed, scale, 
 def test_the_bandwidth_gives_each_scene_its_share(N, d, scale, seed):
     points = torch.randn(N, d, generator=torch.Generator().manual_seed(seed))
     width = bandwidth(points)
-    assert self_share(points / width) == pytest.approx(SHARE, rel=1e-2)
+    assert self_share(points / width) == pytest.approx(SELF_SHARE, rel=1e-2)
     assert bandwidth(scale * points) == pytest.approx(scale * width, rel=1e-2)
     kernels = np.exp(-0.5 * np.square(points.numpy()[:, None] / width - points.numpy() / width).sum(-1))
-    assert (np.diag(kernels) / kernels.sum(1)).mean() == pytest.approx(SHARE, rel=1e-2)
+    assert (np.diag(kernels) / kernels.sum(1)).mean() == pytest.approx(SELF_SHARE, rel=1e-2)
 
 
 def test_the_log_ratio_of_projected_features_is_alive():
@@ -90,7 +90,7 @@ def test_the_log_ratio_of_projected_features_is_alive():
     found = discriminant(one, other, 3, 150)
     assert torch.allclose(found(torch.cat([one, other])).mean(0), torch.zeros(3), atol=1e-3)
     generated, real = one[:150], other[150:] + 0.6 * (found.weight / found.weight.norm(dim=0)).sum(1)
-    assert self_share(found(generated)) < 2 * SHARE
+    assert self_share(found(generated)) < 2 * SELF_SHARE
     assert KDELogRatio(1.0, None)(found(generated), found(real)).std() > 0.3
 
 
@@ -107,7 +107,7 @@ def test_few_pairs_have_a_bandwidth_too():
 )  # fmt: skip
 def test_what_cannot_be_projected_is_refused(spoil, part):
     one, other, _ = pairs(40)
-    with pytest.raises(ProbsceneError, match=rf"^Expected .*{part}"):
+    with pytest.raises(ProbsceneError, match=rf"^expected .*{part}"):
         discriminant(spoil(one), spoil(other), 3, 40)
 
 

@@ -9,8 +9,8 @@ from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.scenario import ScenarioGuide
-from probscene.inference.learn import Trainer
 from probscene.inference.objective import ScoreFunction
+from probscene.inference.structure_training import StructureTraining
 from probscene.scenarios import JointGrammar
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts
@@ -55,7 +55,7 @@ def test_guides_of_two_scenarios_come_to_the_truth_together():
     objective = ScoreFunction(
         lambda scenes: counted(scenes.derivation), KDELogRatio(0.2, None), updates=3, strata=guide.strata
     )
-    Trainer(program, guide, objective, real, 60, num_scenes=300).run()
+    StructureTraining(program, guide, objective, real, 60, num_scenes=300).run()
     assert distance() < 0.15 < 0.5 < before
 
 

@@ -9,13 +9,13 @@ from scipy import stats
 
 from probscene.inference.parameters.energy import (
     EnergyDistance,
-    OwnReadings,
+    GuideReadings,
     WeightedEnergyDistance,
     WeightedRows,
     energy_distance,
-    moving,
+    reparameterised_readings,
 )
-from probscene.inference.parameters.graph import Graph
+from probscene.inference.parameters.graph import SceneGraph
 from probscene.inference.parameters.likelihood import Values
 from probscene.inference.parameters.net import ParameterNet
 from probscene.sampling import seed_everything
@@ -44,7 +44,7 @@ def random_net(seed=0, spread=0.4):
 def drawn(net, number, nodes=3, quantiles=None):
     """u of a guide's scenes, with gradients where they are on."""
     kind, parent = torch.zeros(number, nodes, dtype=torch.int64), torch.full((number, nodes), -1)
-    graph = Graph.of(kind, parent)
+    graph = SceneGraph.from_nodes(kind, parent)
     v = torch.rand(number, nodes * SITES + 1).double() if quantiles is None else quantiles
     scene = net.scene_mixture(graph, torch.full((number, 1), torch.nan).double(), 0).icdf(v[:, :1])
     values = torch.full((number, nodes, SITES), torch.nan).double()
@@ -67,7 +67,7 @@ def test_the_gradient_is_that_of_finite_differences(seed):
     """Of the energy distance of values at given quantiles of their mixtures, along a random direction of weights."""
     net = random_net()
     seed_everything(seed)
-    graph, scene, nodes = (x if isinstance(x, Graph) else x.detach() for x in drawn(net, 30))
+    graph, scene, nodes = (x if isinstance(x, SceneGraph) else x.detach() for x in drawn(net, 30))
     target = values_of(torch.rand(60, 3, SITES).double(), torch.rand(60, 1).double())
     direction = [torch.randn_like(parameter) for parameter in net.parameters()]
 
@@ -86,8 +86,8 @@ def test_the_gradient_is_that_of_finite_differences(seed):
     away = 1e-6  # a distance of two rows has a kink where they meet
     expected = float(found(away) - found(-away)) / (2 * away)
     read = values_of(nodes, scene)
-    own = OwnReadings(read.kind, read.parent, nodes, scene, read, torch.arange(3).expand(30, 3))
-    moved = moving(net, own, ALL)
+    own = GuideReadings(read.kind, read.parent, nodes, scene, read, torch.arange(3).expand(30, 3))
+    moved = reparameterised_readings(net, own, ALL)
     assert torch.equal(moved.nodes, nodes) and torch.equal(moved.scene, scene)
     energy_distance(moved, target).backward()
     slope = sum(
@@ -117,10 +117,10 @@ def test_a_circle_has_no_ends():
 
 def test_objects_that_were_not_drawn_do_not_move():
     net = random_net()
-    graph, scene, nodes = (x if isinstance(x, Graph) else x.detach() for x in drawn(net, 10))
+    graph, scene, nodes = (x if isinstance(x, SceneGraph) else x.detach() for x in drawn(net, 10))
     read = values_of(nodes, scene)
     which = torch.tensor([0, -1, 2]).expand(10, 3)
-    found = moving(net, OwnReadings(graph.kind, graph.parent, nodes, scene, read, which), ALL)
+    found = reparameterised_readings(net, GuideReadings(graph.kind, graph.parent, nodes, scene, read, which), ALL)
     moves = torch.autograd.grad(
         found.nodes[:, 1].sum() + 0 * found.nodes.sum(), list(net.parameters()), allow_unused=True
     )
@@ -131,10 +131,10 @@ def test_objects_that_were_not_drawn_do_not_move():
 @pytest.mark.parametrize("chosen", range(SITES + 1))
 def test_a_site_moves_as_it_would_with_the_others_or_not_at_all(chosen):
     net = random_net()
-    graph, scene, nodes = (x if isinstance(x, Graph) else x.detach() for x in drawn(net, 10))
+    graph, scene, nodes = (x if isinstance(x, SceneGraph) else x.detach() for x in drawn(net, 10))
 
     def slopes(trained):
-        of_scene, of_nodes = net.moving(graph, scene, nodes, trained)
+        of_scene, of_nodes = net.reparameterise(graph, scene, nodes, trained)
         assert torch.equal(of_scene, scene) and torch.equal(of_nodes, nodes)
         moved = torch.cat([of_nodes.flatten(0, 1), of_scene.repeat_interleave(3, 0)], 1)[:, chosen].sum()
         return torch.autograd.grad(moved, list(net.parameters()), allow_unused=True, materialize_grads=True)
@@ -159,7 +159,7 @@ def test_errors_of_the_reader_are_taken_out():
         net.float()
         nodes, scene = nodes.float(), scene.float()
         values = values_of(read(nodes), scene)
-        return OwnReadings(graph.kind, graph.parent, nodes, scene, values, torch.arange(3).expand(number, 3))
+        return GuideReadings(graph.kind, graph.parent, nodes, scene, values, torch.arange(3).expand(number, 3))
 
     target = values_of(read(drawn_values), torch.rand(300, 1))
     noisy = torch.tensor([True, True, False])
@@ -192,7 +192,7 @@ def scenes_of(scene):
 def test_weighted_renders_are_as_far_from_the_target_as_scipy_says(seed, number, images):
     rng = np.random.default_rng(seed)
     own, target, weight = rng.random((number, 2)), rng.random((images, 2)), rng.random(number) + 1e-3
-    rows = WeightedRows.of(*(scenes_of(torch.from_numpy(values)) for values in (own, target)), 1)
+    rows = WeightedRows.from_readings(*(scenes_of(torch.from_numpy(values)) for values in (own, target)), 1)
     weight /= weight.sum()
     expected = stats.energy_distance(own[:, 1], target[:, 1], weight) ** 2
     assert float(rows.distance(torch.from_numpy(weight))) == pytest.approx(expected, abs=1e-9)
@@ -203,14 +203,14 @@ def test_few_renders_are_farther_from_the_target_than_many_of_the_same_distribut
     by the share of pairs that a render makes with itself."""
     rng = np.random.default_rng(0)
     own, target = (scenes_of(torch.from_numpy(rng.normal(size=(size, 1)))) for size in (1000, 400))
-    rows, each = WeightedRows.of(own, target, 0), []
+    rows, each = WeightedRows.from_readings(own, target, 0), []
     for _ in range(1000):
         few = torch.zeros(1000).double()
         few[rng.choice(1000, 20, replace=False)] = 1 / 20
         each.append(float(rows.distance(few)))
-    farther = (1 / 20 - 1 / 1000) * float(rows.own.sum()) / (1000 * 999)
+    expected = (1 / 20 - 1 / 1000) * float(rows.own.sum()) / (1000 * 999)
     many = float(rows.distance(torch.full((1000,), 1e-3).double()))
-    assert np.mean(each) - many == pytest.approx(farther, abs=4 * np.std(each) / 1000**0.5)
+    assert np.mean(each) - many == pytest.approx(expected, abs=4 * np.std(each) / 1000**0.5)
 
 
 def test_what_is_read_with_little_skill_is_learnt_by_weights():
@@ -228,9 +228,9 @@ def test_what_is_read_with_little_skill_is_learnt_by_weights():
         return 0.5 + 0.3 * (u - 0.5) + 0.12 * torch.randn_like(u)
 
     own, target = scenes_of(read(u)), scenes_of(read(true))
-    own = OwnReadings(own.kind, own.parent, own.nodes, u, own, own.kind)
+    own = GuideReadings(own.kind, own.parent, own.nodes, u, own, own.kind)
     WeightedEnergyDistance(net, target, own, [0, 1], steps=300).run()
-    graph = Graph.of(own.kind, own.parent)
+    graph = SceneGraph.from_nodes(own.kind, own.parent)
     with torch.no_grad():
         learnt = [net.scene_mixture(graph, u, g).icdf(torch.rand(1000, 1))[:, 0].numpy() for g in range(2)]
     away = [stats.wasserstein_distance(values, true[:, g].numpy()) for g, values in enumerate(learnt)]
@@ -250,9 +250,11 @@ def test_what_no_weights_explain_is_not_learnt_as_a_few_values():
         return (u - off + 0.15 * torch.randn_like(u)).clamp(0, 1)
 
     own, target = scenes_of(read(u)), scenes_of(read(true, 0.2))
-    own = OwnReadings(own.kind, own.parent, own.nodes, u, own, own.kind)
+    own = GuideReadings(own.kind, own.parent, own.nodes, u, own, own.kind)
     WeightedEnergyDistance(net, target, own, [0], steps=300).run()
     with torch.no_grad():
-        learnt = net.scene_mixture(Graph.of(own.kind, own.parent), u, 0).icdf(torch.rand(1000, 1))[:, 0].numpy()
+        learnt = (
+            net.scene_mixture(SceneGraph.from_nodes(own.kind, own.parent), u, 0).icdf(torch.rand(1000, 1))[:, 0].numpy()
+        )
     away, of_prior = (stats.wasserstein_distance(values, true[:, 0].numpy()) for values in (learnt, u[:, 0].numpy()))
     assert away < 0.75 * of_prior

@@ -9,11 +9,11 @@ from pyro import poutine
 from pyro.infer import SVI, Predictive, Trace_ELBO
 from pyro.optim import Adam
 
-from probscene.inference.parameters import mates as module
-from probscene.inference.parameters.graph import Graph, Seen
+from probscene.inference.parameters import sibling_encoder as module
+from probscene.inference.parameters.graph import ClassNodes, SceneGraph
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.likelihood import Values, log_density
-from probscene.inference.parameters.mates import Mates
+from probscene.inference.parameters.sibling_encoder import SiblingEncoder
 from probscene.inference.parameters.sites import Site, find_sites, of_scenes, quantiles_of, site_name
 from probscene.sampling import run_program, sample, seed_everything
 
@@ -39,7 +39,7 @@ def drawn(model, number=64, seed=0):
 @given(st.integers(0, 2**31))
 def test_zero_weights_are_the_prior(model, seed):
     guide = guide_of(model, spread=0)
-    one, other = drawn(model, seed=seed), drawn(guide.suited(model), seed=seed)
+    one, other = drawn(model, seed=seed), drawn(guide.with_parameters(model), seed=seed)
     assert torch.equal(one.derivation.rules, other.derivation.rules)
     u = quantiles_of(model, one), quantiles_of(model, other)
     for name, value in u[0].items():
@@ -54,7 +54,7 @@ def test_zero_weights_are_the_prior(model, seed):
 
 
 def test_sites_that_are_not_learnt_draw_the_priors_very_numbers(model):
-    learnt = drawn(guide_of(model, ("tray.x", "ball.away")).suited(model))
+    learnt = drawn(guide_of(model, ("tray.x", "ball.away")).with_parameters(model))
     prior = drawn(model)
     for name, value in prior.parameters.items():
         own = site_name(model.grammar, name)
@@ -64,7 +64,7 @@ def test_sites_that_are_not_learnt_draw_the_priors_very_numbers(model):
 def test_weights_are_a_distribution(model):
     """Under q the mean of p / q is 1, over parameters of given structures."""
     guide = guide_of(model, spread=0.2)
-    scenes = drawn(guide.suited(model), 4000)
+    scenes = drawn(guide.with_parameters(model), 4000)
     under_prior = pyro.poutine.condition(model, data={**scenes.derivation.sites(), **scenes.parameters})
     with torch.no_grad():
         trace = poutine.trace(under_prior).get_trace(4000)
@@ -78,13 +78,13 @@ def test_weights_are_a_distribution(model):
 def test_density_and_sampling_are_one_distribution(model):
     """The quantile of each value, by the mixtures that its density is of, is the number that it was drawn from."""
     guide = guide_of(model)
-    scenes = drawn(guide.suited(model), 120)
+    scenes = drawn(guide.with_parameters(model), 120)
     guide.net.double()
     u = quantiles_of(model, scenes)
     derivation = scenes.derivation.trimmed()
-    seen = Seen.of(model.grammar, model.classes, derivation)
-    graph = Graph.of(seen.kind, seen.parent)
-    values = torch.stack([seen.taken(u[site.name]) for site in guide.node_sites], -1).double()
+    seen = ClassNodes.from_derivation(model.grammar, model.classes, derivation)
+    graph = SceneGraph.from_nodes(seen.kind, seen.parent)
+    values = torch.stack([seen.gather(u[site.name]) for site in guide.node_sites], -1).double()
     values = values.where((seen.kind >= 0).unsqueeze(-1), torch.nan)
     scene = torch.cat([of_scenes(u[site.name]) for site in guide.scene_sites], 1).double()
     for s in range(len(guide.node_sites)):
@@ -104,8 +104,8 @@ def test_density_and_sampling_are_one_distribution(model):
 def values_of(guide, scenes):
     """The u that a sample of a guide has."""
     model, u = guide.model, quantiles_of(guide.model, scenes)
-    seen = Seen.of(model.grammar, model.classes, scenes.derivation.trimmed())
-    nodes = torch.stack([seen.taken(u[site.name]) for site in guide.node_sites], -1)
+    seen = ClassNodes.from_derivation(model.grammar, model.classes, scenes.derivation.trimmed())
+    nodes = torch.stack([seen.gather(u[site.name]) for site in guide.node_sites], -1)
     nodes = nodes.where((seen.kind >= 0).unsqueeze(-1), torch.nan)
     scene = torch.cat([of_scenes(u[site.name]) for site in guide.scene_sites], 1)
     sites = len(guide.node_sites) + len(guide.scene_sites)
@@ -116,7 +116,7 @@ def values_of(guide, scenes):
 def test_what_is_fitted_is_what_is_sampled(model):
     """The density that maximum likelihood raises is that of the program with learnt parameters."""
     guide = guide_of(model)
-    scenes = drawn(guide.suited(model), 200)
+    scenes = drawn(guide.with_parameters(model), 200)
     with torch.no_grad():
         found = log_density(guide.net, values_of(guide, scenes)).sum(1)
     prior = run_program(model, scenes.derivation, scenes.parameters).log_prob
@@ -126,7 +126,7 @@ def test_what_is_fitted_is_what_is_sampled(model):
 
 def test_a_density_is_the_same_whatever_else_is_in_the_batch(model):
     """A scene's log-probability does not depend on others', which may be of another scenario."""
-    learnt = guide_of(model).suited(model)
+    learnt = guide_of(model).with_parameters(model)
 
     def against_prior(derivation, values):
         found = [run_program(one, derivation, values).log_prob.detach() for one in (learnt, model)]
@@ -146,7 +146,7 @@ def test_a_density_is_the_same_whatever_else_is_in_the_batch(model):
 def test_nodes_without_a_class_are_passed_over(model):
     scenes = drawn(model, 30)
     derivation = scenes.derivation.trimmed()
-    seen = Seen.of(model.grammar, model.classes, derivation)
+    seen = ClassNodes.from_derivation(model.grammar, model.classes, derivation)
     kinds = {name: model.grammar.kind(name) for name in ("tray", "red", "blue")}
     for n in range(30):
         wanted = []
@@ -197,21 +197,21 @@ def test_a_site_is_told_by_its_name_alone(trays):
     assert guide_of(trays).sites[0] == Site("scene.bright", ())
 
 
-def test_ties_of_many_scenes_are_those_of_each(monkeypatch):
+def test_links_of_many_scenes_are_those_of_each(monkeypatch):
     torch.manual_seed(0)
-    mates = Mates(3, 8)
+    mates = SiblingEncoder(3, 8)
     own = torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
-    together = Graph.of(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).together
-    whole = mates.ties(together, own)
+    siblings = SceneGraph.from_nodes(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).siblings
+    whole = mates.links(siblings, own)
     monkeypatch.setattr(module, "PAIRS", 1)
-    for one, other in zip(whole, mates.ties(together, own), strict=True):
+    for one, other in zip(whole, mates.links(siblings, own), strict=True):
         assert torch.equal(one, other)
 
 
-def test_ties_of_later_sites_are_added_to_those_before():
+def test_links_of_later_sites_are_added_to_those_before():
     torch.manual_seed(0)
-    mates, own = Mates(3, 8), torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
-    together = Graph.of(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).together
-    before = mates.ties(together, own.where(torch.arange(3) < 1, torch.nan))
-    for one, other in zip(mates.ties(together, own), mates.ties(together, own, before, 1), strict=True):
+    mates, own = SiblingEncoder(3, 8), torch.rand(20, 6, 3).where(torch.rand(20, 6, 3) < 0.7, torch.nan)
+    siblings = SceneGraph.from_nodes(torch.zeros(20, 6, dtype=torch.int64), torch.randint(-1, 1, (20, 6))).siblings
+    before = mates.links(siblings, own.where(torch.arange(3) < 1, torch.nan))
+    for one, other in zip(mates.links(siblings, own), mates.links(siblings, own, before, 1), strict=True):
         assert torch.equal(one, other)

@@ -9,18 +9,19 @@ from torch.distributions import Categorical
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
-from probscene.inference.parameters.best import HeldOut
-from probscene.inference.parameters.graph import Graph
+from probscene.inference.parameters import missed_objects as missing
+from probscene.inference.parameters import reader
+from probscene.inference.parameters.backbone import RenderBackbone
+from probscene.inference.parameters.calibration import CalibratedReader
+from probscene.inference.parameters.checkpoint_selection import HeldOutSet
+from probscene.inference.parameters.graph import SceneGraph
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.learning import ParameterLearning
 from probscene.inference.parameters.likelihood import MaximumLikelihood, Values, draws_and_density, log_density
 from probscene.inference.parameters.net import ParameterNet
-from probscene.inference.parameters.reading import missing, reader
-from probscene.inference.parameters.reading.eyes import RenderEye
-from probscene.inference.parameters.reading.skill import Skill
-from probscene.inference.parameters.reading.tried import TriedReader
-from probscene.inference.parameters.schedule import LIKELIHOOD, SCENES, UNCLEAR, WEIGHTS, ParameterSchedule
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.inference.parameters.schedule import LIKELIHOOD, REFIT, SCENES, WEIGHTS, ParameterSchedule
+from probscene.inference.parameters.skill import Skill
+from probscene.renderers.sprite.renderer import SpriteRenderer
 
 
 def rows(number=300, sd=0.01, noise=0.0, seed=0):
@@ -35,7 +36,7 @@ def rows(number=300, sd=0.01, noise=0.0, seed=0):
 
 @torch.no_grad()
 def posterior_draws(net, values, candidates):
-    return draws_and_density(net, values.drawn(), [values.drawn() for _ in range(candidates)])[0]
+    return draws_and_density(net, values.sample(), [values.sample() for _ in range(candidates)])[0]
 
 
 def test_what_was_read_is_learnt():
@@ -50,7 +51,7 @@ def test_what_was_read_is_learnt():
     before = density()
     MaximumLikelihood(net, values, steps=200, images=64, learning_rate=1e-2).run()
     assert abs(before) < 3 < 10 < density()
-    graph, found = Graph.of(values.kind, values.parent), torch.full((300, 3, 2), torch.nan)
+    graph, found = SceneGraph.from_nodes(values.kind, values.parent), torch.full((300, 3, 2), torch.nan)
     with torch.no_grad():
         for s in range(2):
             found[..., s] = net.sample(graph, values.scene, found, s, torch.rand(300, 3), values.kind >= 0)
@@ -63,7 +64,7 @@ def test_the_error_of_readings_is_taken_out():
     net, values = ParameterNet(1, 2, 0, hidden=24), rows(600, sd=0.1, noise=0.1)
     MaximumLikelihood(net, values, steps=300, images=100, learning_rate=1e-2).run()
     spread = posterior_draws(net, values, 16).nodes.std(0).mean()
-    assert float(values.drawn().nodes.std(0).mean()) > 0.13 and float(spread) < 0.085
+    assert float(values.sample().nodes.std(0).mean()) > 0.13 and float(spread) < 0.085
 
 
 def test_density_and_draws_are_those_of_one_site_after_the_other():
@@ -76,13 +77,13 @@ def test_density_and_draws_are_those_of_one_site_after_the_other():
     mean = torch.rand(30, 6, 5).where(has, torch.nan)
     sds = torch.full((30, 6, 5), 0.2), torch.full((30, 1), 0.2)
     values = Values(kind, torch.full_like(kind, -1), mean, sds[0], torch.rand(30, 1), sds[1], torch.zeros(6) > 0)
-    graph = Graph.of(kind, values.parent)
+    graph = SceneGraph.from_nodes(kind, values.parent)
 
     def taken(candidates, log_weight):
         return candidates.gather(-1, Categorical(logits=log_weight).sample().unsqueeze(-1)).squeeze(-1)
 
     torch.manual_seed(1)
-    drawn, others = values.drawn(), [values.drawn() for _ in range(4)]
+    drawn, others = values.sample(), [values.sample() for _ in range(4)]
     scene, nodes, density = drawn.scene.clone(), drawn.nodes.clone(), []
     with torch.no_grad():
         each = [other.scene[:, 0] for other in others]
@@ -113,7 +114,7 @@ def test_a_node_that_counts_double_is_as_good_as_two():
     assert torch.allclose(found, each[1] + 3 * each[2], atol=1e-4)
     rows_of = torch.tensor([3, 1])
     assert torch.equal(
-        values._replace(weight=weight * torch.arange(5)[:, None]).of(rows_of).weight[:, 1], rows_of.float()
+        values._replace(weight=weight * torch.arange(5)[:, None]).select(rows_of).weight[:, 1], rows_of.float()
     )
 
 
@@ -150,18 +151,20 @@ def test_one_layout_in_all_images_is_learnt_as_such():
 
 def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     """Nothing is learnt of a site that was hardly read, and it is said."""
-    monkeypatch.setattr(reader, "LEAST_MASS", (10.0,))  # no object is found
+    monkeypatch.setattr(reader, "SCORE_THRESHOLDS", (10.0,))  # no object is found
     counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=2, rounds=0, energy_steps=0, reader_images=2)
     empty = torch.zeros(30, 3, 64, 64, dtype=torch.uint8)
-    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: empty, schedule)
+    learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, lambda: empty, schedule)
     learning.run()
-    assert learning.tried.skill is not None
-    learning.tried.skill = learning.tried.skill._replace(share=torch.ones_like(learning.tried.skill.share))
+    assert learning.calibrated.skill is not None
+    learning.calibrated.skill = learning.calibrated.skill._replace(
+        share=torch.ones_like(learning.calibrated.skill.share)
+    )
     site = next(site for site in learning.sites if site.name == "ball.away")
     assert [site.name for site in learning.learnt] == ["scene.bright", "floor.turn"]
-    assert learning.tried.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
+    assert learning.calibrated.why_not(site) == "it was read 0 times in the target, of 20 that it takes"
 
 
 def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, monkeypatch):
@@ -170,7 +173,7 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=1, rounds=0, energy_steps=0, reader_images=2)
     counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.zeros(30, 3, 64, 64).byte()
-    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule)
+    learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, lambda: images, schedule)
     learning.run()
     learning.phase = learning.phases.index(SCENES)
     with torch.no_grad():
@@ -178,15 +181,15 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
             layer.weight.zero_()
             layer.bias.copy_(torch.tensor([0.0, 2.0, -4.0]).repeat_interleave(len(layer.bias) // 3))
     bright = [site.name for site in learning.scene_sites].index("scene.bright")
-    own, own_scenes = [], learning.own_scenes
+    own, guide_scenes = [], learning.guide_scenes
 
     def seen(kept, num):
-        valued = own_scenes(kept, num)
+        valued = guide_scenes(kept, num)
         own.append(valued.overall[:, bright])
         return valued
 
-    monkeypatch.setattr(learning, "own_scenes", seen)
-    told = torch.cat([learning._entered(200)[1][:, bright] for _ in range(6)])
+    monkeypatch.setattr(learning, "guide_scenes", seen)
+    told = torch.cat([learning._draw_entering(200)[1][:, bright] for _ in range(6)])
     as_drawn = torch.cat(own)
     is_told = ~told.isnan()
     assert kstest(told[is_told].double().numpy(), "uniform").pvalue > 1e-3
@@ -197,29 +200,30 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
 
 def test_unclear_sites_of_scenes_are_read_anew_by_a_network_that_is_told_them_alone(trays, monkeypatch):
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
-    monkeypatch.setattr(TriedReader, "unclear", frozenset(["scene.bright"]))
+    monkeypatch.setattr(CalibratedReader, "low_skill_sites", frozenset(["scene.bright"]))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(
         reader_steps=1, scene_renders=200, steps=1, rounds=0, round_steps=1, energy_steps=0, weighted_scenes=4,
         reader_images=2,
     )  # fmt: skip
     counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.randint(256, (30, 3, 64, 64))
-    learning = ParameterLearning(trays, trays.prior, RenderEye(counts), label, images.byte, schedule)
+    learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, images.byte, schedule)
     learning.run()
     anew = torch.tensor([site.name == "scene.bright" for site in learning.scene_sites])
-    found, entered = (see(images.byte()) for see in (learning.tried.reader.find, learning.tried.reader.eye.enter))
-    before, after = (net(entered) for net in (learning.tried.reader.overall, learning.tried.reader.again))
+    reader = learning.calibrated.reader
+    found, entered = reader.detect(images.byte()), reader.eye.enter(images.byte())
+    before, after = reader.overall(entered), reader.again(entered)
     assert not torch.equal(before, after)
     assert torch.equal(found.overall, after.where(anew[:, None], before))
-    learning.phase = learning.phases.index(UNCLEAR)
-    assert torch.equal(~learning._entered(40)[1].isnan(), anew.expand(40, -1))
+    learning.phase = learning.phases.index(REFIT)
+    assert torch.equal(~learning._draw_entering(40)[1].isnan(), anew.expand(40, -1))
 
 
 def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatch):
     """Sites that would keep their prior have it there, and so have those that are learnt at the end."""
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
-    monkeypatch.setattr(TriedReader, "unclear", frozenset(["scene.bright", "ball.away"]))
-    monkeypatch.setattr(TriedReader, "noisy", property(lambda tried: torch.ones(len(tried.good_sites)).bool()))
+    monkeypatch.setattr(CalibratedReader, "low_skill_sites", frozenset(["scene.bright", "ball.away"]))
+    monkeypatch.setattr(CalibratedReader, "noisy", property(lambda tried: torch.ones(len(tried.good_sites)).bool()))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(
         reader_steps=1, scene_renders=4, steps=1, rounds=1, round_reader_steps=1, round_scene_renders=2,
@@ -229,27 +233,27 @@ def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatc
     looked, would_keep = [], iter([(), ("floor.turn",), (), ("floor.turn",)])
 
     def look(guide):
-        looked.append(guide.passed)
+        looked.append(guide.prior_sites)
         return torch.rand(30, 2).double().numpy()
 
     learning = ParameterLearning(
-        trays, trays.prior, RenderEye(counts), label, lambda: images, schedule,
-        held=HeldOut(look, torch.rand(30, 2).double().numpy()), settle=lambda _, last: next(would_keep),
+        trays, trays.prior, RenderBackbone(counts), label, lambda: images, schedule,
+        held=HeldOutSet(look, torch.rand(30, 2).double().numpy()), select_prior_sites=lambda _, last: next(would_keep),
     )  # fmt: skip
     learning.run()
     assert looked == [{"scene.bright"}, {"scene.bright", "floor.turn"}, {"scene.bright"}]
-    assert learning.settled == {"floor.turn"} and next(would_keep, None) is None
+    assert learning.prior_sites == {"floor.turn"} and next(would_keep, None) is None
 
 
-@pytest.mark.parametrize("phase", [LIKELIHOOD, UNCLEAR, WEIGHTS])
+@pytest.mark.parametrize("phase", [LIKELIHOOD, REFIT, WEIGHTS])
 def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
     """In the middle of likelihood, which looks at objects that the guide of before was missing; and of the last
     phases, in whose renders some sites have their prior."""
-    monkeypatch.setattr(reader, "LEAST_MASS", (0.1,))  # an untrained reader finds something
+    monkeypatch.setattr(reader, "SCORE_THRESHOLDS", (0.1,))  # an untrained reader finds something
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
-    monkeypatch.setattr(missing, "FEWEST", 1)
-    monkeypatch.setattr(missing, "TOLD", 0.0)
-    for renders in ("TRIED", "ASSEMBLED", "MISSED"):
+    monkeypatch.setattr(missing, "MIN_OBJECTS", 1)
+    monkeypatch.setattr(missing, "MIN_DISTANCE", 0.0)
+    for renders in ("CALIBRATION_RENDERS", "BUILDER_RENDERS", "MISSED_RENDERS"):
         monkeypatch.setattr(f"probscene.inference.parameters.learning.{renders}", 60)
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     few = {"scene_renders": 60, "round_scene_renders": 4, "energy_steps": 0, "weighted_scenes": 60}
@@ -260,17 +264,19 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
     def begun():
         torch.manual_seed(0)
         counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
-        return ParameterLearning(trays, trays.prior, RenderEye(counts), label, lambda: images, schedule, settle=settle)
+        return ParameterLearning(
+            trays, trays.prior, RenderBackbone(counts), label, lambda: images, schedule, select_prior_sites=select
+        )
 
-    asked, kept, suited = [], [], ParameterGuide.suited
+    asked, kept, suited = [], [], ParameterGuide.with_parameters
 
     def seen(guide, model):
-        kept.append(guide.passed)
+        kept.append(guide.prior_sites)
         return suited(guide, model)
 
-    monkeypatch.setattr(ParameterGuide, "suited", seen)
+    monkeypatch.setattr(ParameterGuide, "with_parameters", seen)
 
-    def settle(learning, last):
+    def select(learning, last):
         assert last
         kept.clear()
         asked.append(learning.phases[learning.phase])
@@ -281,7 +287,7 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
 
     def interrupt(training, _):
         if training.phase >= training.phases.index(LIKELIHOOD) + 3 and training.phases[training.phase] == phase:
-            assert phase != LIKELIHOOD or (len(training.missing.label) and training.inner.images == 20)
+            assert phase != LIKELIHOOD or (len(training.missed.label) and training.inner.images == 20)
             assert 0 < training.inner.done < training.inner.total
             raise Interrupted
 
@@ -294,8 +300,8 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
     second.run()
     for one, other in zip(whole.guide.net.parameters(), second.guide.net.parameters(), strict=True):
         assert torch.equal(one, other)
-    assert whole.settled == second.settled == {"scene.bright"}
-    assert asked == [UNCLEAR] * 2  # of the whole, and once of the other
+    assert whole.prior_sites == second.prior_sites == {"scene.bright"}
+    assert asked == [REFIT] * 2  # of the whole, and once of the other
 
 
 def _labels(render, classes, scenes):

@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
 from probscene.inference.features.base import class_table, examples
-from probscene.inference.parameters.meta_sim.differences import At, Differences, Drawn, with_values
+from probscene.inference.parameters.meta_sim.differences import At, Differences, SampledScenes, with_values
 from probscene.inference.parameters.meta_sim.discrepancy import SCALES, Discrepancy
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.presence_task import PresenceTask
 from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.meta_sim.task import TaskLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
-from probscene.inference.parameters.sites import find_sites, quantiles_of, within
+from probscene.inference.parameters.sites import find_sites, quantiles_of, with_handlers
 from probscene.model import scene_model
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
 
@@ -62,7 +62,7 @@ def test_it_begins_as_the_identity(trays, seed, all_zero):
     transform = transform_of(trays, spread=0)
     for parameter in transform.net.parameters() if all_zero else ():
         torch.nn.init.zeros_(parameter)
-    one, other = drawn(trays, seed=seed), drawn(transform.suited(trays), seed=seed)
+    one, other = drawn(trays, seed=seed), drawn(transform.with_parameters(trays), seed=seed)
     assert torch.equal(one.derivation.rules, other.derivation.rules)
     quantiles, again = quantiles_of(trays, one), quantiles_of(trays, other)
     for name, value in one.parameters.items():
@@ -74,7 +74,7 @@ def test_it_begins_as_the_identity(trays, seed, all_zero):
 
 
 def test_sites_that_are_not_learnt_draw_the_priors_very_numbers(trays):
-    moved, prior = drawn(transform_of(trays, ("tray.x", "ball.away")).suited(trays)), drawn(trays)
+    moved, prior = drawn(transform_of(trays, ("tray.x", "ball.away")).with_parameters(trays)), drawn(trays)
     for name, value in prior.parameters.items():
         assert torch.equal(value, moved.parameters[name]) == (name not in ("tray.x", "ball.away")), name
     has = prior.site_mask["tray.x"]
@@ -84,9 +84,9 @@ def test_sites_that_are_not_learnt_draw_the_priors_very_numbers(trays):
 def test_the_program_moves_what_the_network_moves_at_once(trays):
     """Site by site as the program runs, or all sites of scenes that are drawn: the same values."""
     transform = transform_of(trays)
-    scenes = drawn(transform.suited(trays))
+    scenes = drawn(transform.with_parameters(trays))
     seed_everything(0)
-    before = Drawn.of(trays, trays.prior, transform.sites, 40)
+    before = SampledScenes.sample(trays, trays.prior, transform.sites, 40)
     with torch.no_grad():
         moved = [x.sigmoid() for x in transform.net(before.graph, before.of_scene, before.of_nodes)]
     again = with_values(trays, transform.sites, before, *moved)
@@ -98,7 +98,7 @@ def test_the_program_moves_what_the_network_moves_at_once(trays):
 
 def test_a_site_does_not_see_those_after_it(trays):
     transform = transform_of(trays)
-    before = Drawn.of(trays, trays.prior, transform.sites, 20)
+    before = SampledScenes.sample(trays, trays.prior, transform.sites, 20)
     with torch.no_grad():
         scene, nodes = transform.net(before.graph, before.of_scene, before.of_nodes)
         changed = before.of_nodes.clone()
@@ -112,11 +112,11 @@ def test_a_site_does_not_see_those_after_it(trays):
 def test_padding_moves_nothing(trays):
     """A scene's values do not depend on how many nodes the others have."""
     transform = transform_of(trays)
-    before = Drawn.of(trays, trays.prior, transform.sites, 30)
+    before = SampledScenes.sample(trays, trays.prior, transform.sites, 30)
     with torch.no_grad():
         _, whole = transform.net(before.graph, before.of_scene, before.of_nodes)
         for n in range(30):
-            M = max(1, int((before.seen.kind[n] >= 0).sum()))
+            M = max(1, int((before.class_nodes.kind[n] >= 0).sum()))
             graph = type(before.graph)(*(part[n : n + 1, :M] for part in before.graph))
             _, alone = transform.net(graph, before.of_scene[n : n + 1], before.of_nodes[n : n + 1, :M])
             assert torch.allclose(alone[0], whole[n, :M], atol=1e-5)
@@ -136,7 +136,7 @@ def differentiated(trays, seed=0, most=None):
     """Scenes, u somewhere, and the derivative of a cost by finite differences and by autograd."""
     sites = tuple(site for site in find_sites(trays) if site.name in NAMES)
     seed_everything(seed)
-    before = Drawn.of(trays, trays.prior, sites, 12)
+    before = SampledScenes.sample(trays, trays.prior, sites, 12)
     scene, nodes = (0.1 + 0.8 * torch.rand_like(u) for u in (before.of_scene, before.of_nodes))
     ways = torch.randn(12, len(NAMES))
 
@@ -147,13 +147,15 @@ def differentiated(trays, seed=0, most=None):
     base = with_values(trays, sites, before, scene, nodes)
     for values in (scene, nodes):
         values.requires_grad_()
-    u, empty = {}, torch.full(before.seen.place.shape, torch.nan)
+    u, empty = {}, torch.full(before.class_nodes.place.shape, torch.nan)
     for site in sites:
         column = [other.name for other in sites if other.of_scene == site.of_scene].index(site.name)
-        u[site.name] = scene[:, column : column + 1] if site.of_scene else before.seen.put(nodes[..., column], empty)
+        u[site.name] = (
+            scene[:, column : column + 1] if site.of_scene else before.class_nodes.scatter(nodes[..., column], empty)
+        )
         u[site.name] = u[site.name].where(base.site_mask[site.name], torch.nan)
     with pyro.poutine.trace() as trace, pyro.poutine.condition(data=before.derivation.sites()):
-        within(trays, At(u, before.parameters))(12)
+        with_handlers(trays, At(u, before.parameters))(12)
     values = {name: node["value"] for name, node in trace.trace.nodes.items() if name in NAMES}
     cost = (looked_at(values, base.site_mask) * ways).sum()
     return found, torch.autograd.grad(cost, [scene, nodes])
@@ -220,7 +222,7 @@ def test_what_images_show_is_learnt():
     training.run()
     assert training.guide is not None and training.learnt == training.sites
     far = []
-    for model in (dots, training.guide.suited(dots)):
+    for model in (dots, training.guide.with_parameters(dots)):
         scenes = drawn(model, 300)
         off = (scenes.parameters["x"] - 44).abs() + (scenes.parameters["y"] - 20).abs()
         far.append(float(off[scenes.site_mask["x"]].mean()))
@@ -265,10 +267,10 @@ def by_score(steps, score=near):
 
 def test_a_tasks_score_is_raised():
     training = by_score(100)
-    before = near(drawn(training.guide.suited(dots), 400))
+    before = near(drawn(training.guide.with_parameters(dots), 400))
     heard = []
     training.run(lambda _, line: heard.append(-line["loss"]))
-    assert near(drawn(training.guide.suited(dots), 400)) > before + 0.2
+    assert near(drawn(training.guide.with_parameters(dots), 400)) > before + 0.2
     assert sum(heard[-20:]) > sum(heard[:20]) + 20 * 0.2 and training.summary()["score"] > before
 
 
@@ -305,9 +307,9 @@ def test_the_task_is_learnt_from_scenes():
 def test_u_of_moved_values_is_what_they_were_moved_to(trays):
     sites = tuple(site for site in find_sites(trays) if site.name in NAMES)
     seed_everything(0)
-    before = Drawn.of(trays, trays.prior, sites, 20)
+    before = SampledScenes.sample(trays, trays.prior, sites, 20)
     scene, nodes = torch.rand_like(before.of_scene), torch.rand_like(before.of_nodes)
     found = quantiles_of(trays, with_values(trays, sites, before, scene, nodes))
-    taken = before.seen.taken(found["ball.shade"])
-    there = ~taken.isnan() & (before.seen.kind >= 0)
+    taken = before.class_nodes.gather(found["ball.shade"])
+    there = ~taken.isnan() & (before.class_nodes.kind >= 0)
     assert there.any() and torch.allclose(taken[there], nodes[..., -1][there], atol=1e-3)

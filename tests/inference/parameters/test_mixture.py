@@ -11,13 +11,13 @@ seeds = st.integers(0, 2**31)
 
 
 def mixture(seed, spread=1.5):
-    return LogisticMixture.of(spread * torch.randn(7, 12, generator=torch.Generator().manual_seed(seed)).double())
+    return LogisticMixture.from_raw(spread * torch.randn(7, 12, generator=torch.Generator().manual_seed(seed)).double())
 
 
 @given(st.floats(0, 1))
 @example(0.5)  # where bisection starts
 def test_zeros_are_the_uniform_distribution(u):
-    zeros = LogisticMixture.of(torch.zeros(1, 12))
+    zeros = LogisticMixture.from_raw(torch.zeros(1, 12))
     assert float(zeros.log_prob(torch.tensor([u]))) == pytest.approx(0, abs=1e-5)
     assert float(zeros.icdf(torch.tensor([u]))) == pytest.approx(u, abs=2e-6)
 
@@ -47,4 +47,4 @@ def test_quantiles_invert_the_distribution_function(seed):
 def test_the_gradient_of_a_quantile_is_that_of_finite_differences():
     raw = torch.randn(5, 12, generator=torch.Generator().manual_seed(0)).double().requires_grad_()
     v = torch.rand(5, generator=torch.Generator().manual_seed(1)).double()
-    assert torch.autograd.gradcheck(lambda x: LogisticMixture.of(x).icdf(v), raw, eps=1e-5, atol=1e-4)
+    assert torch.autograd.gradcheck(lambda x: LogisticMixture.from_raw(x).icdf(v), raw, eps=1e-5, atol=1e-4)

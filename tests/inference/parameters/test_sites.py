@@ -11,10 +11,10 @@ from probscene.grammar import Grammar
 from probscene.inference.parameters.sites import (
     Site,
     find_sites,
-    having,
+    occurs_once,
     of_scenes,
-    once_in_each,
     quantiles_of,
+    site_mask,
     site_name,
 )
 from probscene.model import scene_model
@@ -47,8 +47,8 @@ def test_a_node_that_each_scene_has_one_of_is_the_scenes(trays):
         Light -> sun | lamp
         Extra -> cat | ε
     """)
-    assert once_in_each(grammar, ["sky"]) and once_in_each(grammar, ["sun", "lamp"])
-    assert not any(once_in_each(grammar, kinds) for kinds in (["sun"], ["cat"], ["sky", "cat"], ["sky", "sun"]))
+    assert occurs_once(grammar, ["sky"]) and occurs_once(grammar, ["sun", "lamp"])
+    assert not any(occurs_once(grammar, kinds) for kinds in (["sun"], ["cat"], ["sky", "cat"], ["sky", "sun"]))
 
 
 def test_sites_of_one_name_are_one_of_all_scenarios(rooms):
@@ -103,7 +103,7 @@ def test_quantiles_are_nan_where_a_node_has_no_such_site(model):
     scenes = sample(model, model.prior, 50)
     found, kind = quantiles_of(model, scenes), scenes.derivation.trimmed().kind
     sites = tuple(site for site in find_sites(model) if site.kinds and not site.keeps)
-    has = having(model.grammar, sites, kind)
+    has = site_mask(model.grammar, sites, kind)
     for s, site in enumerate(sites):
         assert torch.equal(~found[site.name].isnan(), has[..., s]), site.name
     assert not of_scenes(found["floor.turn"]).isnan().any() and of_scenes(found["floor.turn"]).shape == (50, 1)

@@ -11,20 +11,20 @@ from pyro.poutine.messenger import Messenger
 from scipy.stats import chi2, kstest
 
 from probscene.inference.features.base import class_table, examples
-from probscene.inference.judging.two_sample import energy_distance
-from probscene.inference.parameters.sites import within
+from probscene.inference.parameters.sites import with_handlers
+from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import (
     TiltingLearning,
-    beside_structure,
+    basis,
     dependence,
-    explained,
-    numbers,
-    tilted,
+    explained_part,
+    tilted_weights,
+    without_structure,
     witness,
 )
-from probscene.inference.parameters.tilting.plain import plain
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
-from probscene.renderers.sprites import SpriteRenderer
+from probscene.inference.statistics.energy import energy_distance
+from probscene.renderers.sprite.renderer import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 seeds = st.integers(0, 2**31)
@@ -33,20 +33,20 @@ seeds = st.integers(0, 2**31)
 @given(seeds, st.integers(3, 300), st.floats(0.2, 0.95))
 def test_as_many_scenes_are_effective_as_are_kept(seed, number, kept):
     w = np.random.default_rng(seed).normal(size=number) * 7 + 3
-    weight = tilted(w, kept)
+    weight = tilted_weights(w, kept)
     assert weight.sum() == pytest.approx(1) and (weight >= 0).all()
     assert (np.diff(weight[np.argsort(w)]) <= 1e-12).all()  # the smaller w, the heavier
     assert 1 / np.square(weight).sum() == pytest.approx(max(kept * number, 1.0), rel=1e-3)
 
 
 def test_scenes_that_are_all_as_near_weigh_the_same():
-    assert tilted(np.full(20, 3.0), 0.4) == pytest.approx(np.full(20, 0.05))
+    assert tilted_weights(np.full(20, 3.0), 0.4) == pytest.approx(np.full(20, 0.05))
 
 
 @given(seeds, st.integers(1, 60), st.floats(0.9999999, 1))
 def test_where_all_are_kept_all_weigh_the_same(seed, number, kept):
     w = np.random.default_rng(seed).normal(size=number)
-    assert tilted(w, kept) == pytest.approx(np.full(number, 1 / number), rel=0.02)
+    assert tilted_weights(w, kept) == pytest.approx(np.full(number, 1 / number), rel=0.02)
 
 
 @given(seeds, st.integers(20, 400), st.integers(1, 4), st.floats(0, 2))
@@ -55,8 +55,8 @@ def test_what_is_explained_of_w_is_its_regression(seed, number, sites, strength)
     rng = np.random.default_rng(seed)
     u = torch.from_numpy(rng.uniform(size=(number, sites)))
     w = strength * np.sin(6 * u[:, 0].numpy()) + rng.normal(size=number)
-    x, y = np.concatenate([numbers(one) for one in u.unbind(1)], 1), w - w.mean()
-    v, sure = explained(u, w)
+    x, y = np.concatenate([basis(one) for one in u.unbind(1)], 1), w - w.mean()
+    v, sure = explained_part(u, w)
     assert v == pytest.approx(x @ np.linalg.solve(x.T @ x, x.T @ y), abs=1e-6)
     determined, freedom = 1 - np.square(y - v).sum() / np.square(y).sum(), number - 4 * sites - 1
     adjusted = 1 - (1 - determined) * (number - 1) / freedom
@@ -66,13 +66,13 @@ def test_what_is_explained_of_w_is_its_regression(seed, number, sites, strength)
 @pytest.mark.parametrize(("number", "w"), [(50, lambda u: 0 * u + 3), (5, lambda u: u), (1, lambda u: u)])
 def test_nothing_is_explained_surely_of_one_value_or_of_few_scenes(number, w):
     u = torch.from_numpy(np.random.default_rng(0).uniform(size=(number, 2)))
-    assert explained(u, w(u[:, 0].numpy()))[1] == 0
+    assert explained_part(u, w(u[:, 0].numpy()))[1] == 0
 
 
 def test_noise_is_mostly_known_for_what_it_is():
     rng, found = np.random.default_rng(0), []
     for _ in range(300):
-        found.append(explained(torch.from_numpy(rng.uniform(size=(500, 9))), rng.normal(size=500))[1])
+        found.append(explained_part(torch.from_numpy(rng.uniform(size=(500, 9))), rng.normal(size=500))[1])
     assert np.mean(np.square(found)) < 0.2 and np.mean(np.array(found) == 0) > 0.4
 
 
@@ -82,7 +82,7 @@ def test_what_is_plainly_said_is_so(seed, noise, light, tint):
     rng = np.random.default_rng(seed)
     wall = np.stack([np.full((60, 80), light + tint), np.full((60, 80), light), np.full((60, 80), light)])
     image = (wall + noise * rng.normal(size=(1, 60, 80))).clip(0, 255).round().astype(np.uint8)
-    said = plain(torch.from_numpy(image)[None])[0].numpy()
+    said = image_statistics(torch.from_numpy(image)[None])[0].numpy()
     assert said[:3] == pytest.approx(image.mean((1, 2)) / 255, abs=1e-5)
     assert said[3:6] == pytest.approx(image.std((1, 2)) / 255, abs=1e-5)
     assert said[6:14].mean() == pytest.approx(image.mean() / 255, abs=0.01)
@@ -94,7 +94,7 @@ def test_what_is_plainly_said_is_so(seed, noise, light, tint):
     if 2 < noise and 70 < light < 170 - tint:  # nothing is cut off
         assert said[16] == pytest.approx(10 * noise / 255, rel=0.1)
     grey_image = torch.from_numpy(image[:1])[None]
-    assert torch.equal(plain(grey_image), plain(grey_image.expand(-1, 3, -1, -1)))
+    assert torch.equal(image_statistics(grey_image), image_statistics(grey_image.expand(-1, 3, -1, -1)))
 
 
 @given(seeds, st.integers(2, 80))
@@ -102,12 +102,12 @@ def test_what_structure_explains_is_left_out(seed, number):
     rng = np.random.default_rng(seed)
     kind = torch.from_numpy(rng.integers(-1, 3, (number, 5)))
     w = rng.normal(size=number) + 3 * (kind == 1).sum(1).numpy() - 2 * (kind == 2).any(1).numpy()
-    left = beside_structure(kind, w)
+    left = without_structure(kind, w)
     for k in (0, 1, 2):
         assert abs(left @ (kind == k).sum(1).numpy()) < 1e-6 and abs(left @ (kind == k).any(1).numpy()) < 1e-6
     assert abs(left.sum()) < 1e-6
     of_structure = 4 * (kind == 0).sum(1).numpy() + 1.0
-    assert beside_structure(kind, of_structure) == pytest.approx(np.zeros(number), abs=1e-8)
+    assert without_structure(kind, of_structure) == pytest.approx(np.zeros(number), abs=1e-8)
 
 
 @given(seeds)
@@ -172,7 +172,7 @@ def learning(trays):
                 msg["value"] = 0.85 + 0.1 * torch.rand(msg["fn"].batch_shape)
 
     seed_everything(3)
-    real = look(label(sample(within(trays, Bright()), trays.prior, 150)).image)
+    real = look(label(sample(with_handlers(trays, Bright()), trays.prior, 150)).image)
     schedule = TiltingSchedule(rounds=8, first=300, scenes=120, steps=30, rate=0.02)
     return lambda: TiltingLearning(trays, trays.prior, label, (look,), (real,), schedule)
 
@@ -183,10 +183,10 @@ def test_what_images_show_is_learnt_and_what_they_do_not_show_is_not(learning, t
     assert apart[-1] < 0.5 * apart[0]
     assert [site.name for site in whole.learnt] == ["scene.bright"]
     seed_everything(0)
-    bright = sample(whole.guide.suited(trays), trays.prior, 200).parameters["scene.bright"]
+    bright = sample(whole.guide.with_parameters(trays), trays.prior, 200).parameters["scene.bright"]
     assert 0.79 < float(bright.mean()) < 0.98  # 0.7 in the prior, 0.9 in the target
     turns = []
-    for model in (whole.guide.suited(trays), trays):
+    for model in (whole.guide.with_parameters(trays), trays):
         seed_everything(0)
         turns.append(sample(model, trays.prior, 20).parameters["floor.turn"])
     assert torch.equal(*turns)

@@ -9,10 +9,10 @@ rays.
 import numpy as np
 import torch
 
-from probscene.batch import RenderBatch, Space
+from probscene.batch import RenderBatch, SceneGeometry
 from probscene.world import World
 
-from .photo import photographed
+from .camera_effects import apply_camera_effects
 from .rays import meet, sample
 from .scenes import SceneReference
 
@@ -62,13 +62,13 @@ class MeshReference:
         visible, truncated = torch.from_numpy(visible[..., 0]), torch.from_numpy(truncated[..., 0])
         labels = [torch.from_numpy(x) for x in (depth, semantic, space_box, lens, box, amodal, pixels, instance, image)]
         depth, semantic, space_box, lens, box, amodal, pixels, instance, image = labels
-        space = Space(depth, semantic, names, truncated, space_box, lens)
+        space = SceneGeometry(depth, semantic, names, truncated, space_box, lens)
         return RenderBatch(image.permute(0, 3, 1, 2), instance, kind, box, amodal, pixels, visible, space)
 
     def _image(self, scene: "_Scene", u, v) -> np.ndarray:
         shifts = [(0.0, 0.0)] if self.samples == 1 else [(a, b) for a in (-0.25, 0.25) for b in (-0.25, 0.25)]
         colours = np.mean([scene.colours(u + a, v + b) for a, b in shifts], 0).reshape(*self.canvas, 3)
-        return photographed(colours, scene.world.photo, 0).image
+        return apply_camera_effects(colours, scene.world.photo, 0).image
 
 
 class _Scene(SceneReference):

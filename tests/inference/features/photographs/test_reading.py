@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from probscene.inference.features.photographs.readability import (
-    AGREE,
+    MAX_DISAGREEMENT,
     Read,
     disagreement,
     histogram_scores,
@@ -137,7 +137,7 @@ COUNTS = np.random.default_rng(5).integers(0, 5, 60).astype(float)
 def test_heads_that_agree_are_believed():
     found = without_labels(made(COUNTS, COUNTS), 0)
     assert found.readable and found.by == "agreement" and found.mean == pytest.approx(COUNTS.mean(), rel=1e-4)
-    assert found.because.startswith("readable, ") and found.disagreement < AGREE
+    assert found.because.startswith("readable, ") and found.disagreement < MAX_DISAGREEMENT
 
 
 @pytest.mark.parametrize("spoilt", [{"apart": 1.5}, {"ramp": 0.8}], ids=str)

@@ -1,1 +1,0 @@
-"""Distances between samples, their intervals, and the verdict."""

@@ -1,1 +1,0 @@
-"""Reading the values of sites in images."""

@@ -1,0 +1,1 @@
+"""Distances between samples, their tests and intervals, and the verdict."""

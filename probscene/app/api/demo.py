@@ -1,0 +1,118 @@
+"""``probscene demo``: the whole path on a target that the model itself draws.
+
+    target/images    the target; fitting sees nothing else
+    truth.csv        what is in it, for judging only
+    run              the fit, with report.html
+    dataset          labelled images of what was learnt
+    evaluation.json  how near that is to the truth
+    grid.png         prior, learnt structure alone, all that was learnt, and target side by side
+
+Each step is left out where it is finished, so the same command goes on after an interruption.
+"""
+
+import json
+from pathlib import Path
+
+from rich.console import Console
+
+from probscene.dataset import Images
+from probscene.errors import ModelError
+from probscene.model import SceneModel
+
+from ..datasets.generate import generate, generate_scenes
+from ..evaluation.diagnose import diagnose
+from ..evaluation.evaluate import evaluate
+from ..evaluation.labels import counts_of_dataset, read_labels
+from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
+from ..files import make_folder, write_json
+from ..fitting.config import FitConfig
+from ..fitting.pipeline import Execution
+from ..fitting.presets import QUICK
+from ..fitting.run import RunFolder
+from ..fitting.store import timing
+from ..labels.counts import write_counts
+from ..loading import load_model
+from ..pictures import pixels, side_by_side, write_picture
+from ..progress import Display
+from ..targets import open_images
+from ..views import report, tables, verdict_text
+from ..views.preview import scenes
+from .fit import carried_out, fit_request
+
+SAMPLES = 16  # images a grid
+
+
+def demo(
+    out: Path,
+    seed: int = 0,
+    model: str = "multi_mnist",
+    config: FitConfig = QUICK,
+    images: int = 3000,
+    num: int = 500,
+    execution: Execution | None = None,
+) -> None:
+    """Draw a target, fit, generate, evaluate, report; prints how near it came and where to look.
+
+    Args:
+        seed: of the target's distribution as well as of the fit.
+        images: of the target.
+        num: of the dataset.
+        execution: of the fit.
+
+    Raises:
+        ProbsceneError: a model without a target, or a folder that holds something else.
+    """
+    loaded, execution = load_model(model), execution or Execution()
+    if loaded.target is None:
+        raise ModelError(f"expected a model with a target to learn from, got {model!r}, which has none.")
+    out = make_folder(out)
+    with Display() as show:
+        target = _draw(loaded.target(seed), images, out, seed, show)
+        request = fit_request(model, target, config, seed, None, execution.threads)
+        done = carried_out(request, out / "run", show, (out / "run" / "run.json").exists(), execution)
+        run, opened = done.run, done.images
+        generate(run, num, out / "dataset", seed, progress=show.stage("generating"))
+        if not all((out / name).exists() for name in ("evaluation.json", "grid.png", "run/report.html")):
+            _judge(run, opened or open_images(target, loaded, False, show), out, show)
+    console = Console(highlight=False)
+    measured = json.loads((out / "evaluation.json").read_text(encoding="utf-8"))
+    for table in tables.distance_tables({"truth": measured["distances"]["truth"]}):
+        console.print(table)
+    print("\nWithout labels:")
+    verdict_text.show_parts(measured["trust"], console)
+    spent = sum(timing(run).values())
+    print(f"\nFitting took {spent:.0f} s and saw only {target}. Where to look:")
+    for name, what in (
+        ("grid.png", "scenes of the prior, of learnt structure alone, of all that was learnt, and of the target"),
+        ("run/report.html", "the report: histograms, learning curves, configuration"),
+        ("dataset", f"{num} labelled images: images/, annotations.json (COCO), provenance.jsonl"),
+        ("truth.csv", "what the target holds, for judging only"),
+    ):
+        print(f"  {out / name!s:<24} {what}")
+
+
+def _draw(truth: SceneModel, images: int, out: Path, seed: int, show: Display) -> Path:
+    """The folder of the target's images, with its counts beside it."""
+    folder = out / "target"
+    generate_scenes(truth, truth.prior, images, folder, seed, "images", show.stage("drawing"))
+    if not (out / "truth.csv").exists():
+        write_counts(out / "truth.csv", *counts_of_dataset(truth, folder), truth.classes)
+    return folder / "images"
+
+
+def _judge(run: RunFolder, target: Images, out: Path, show: Display) -> None:
+    model = run.model
+    found = evaluate(run, target, read_labels(out / "truth.csv", model, target), show)
+    judged = diagnose(run, target, show, evaluation=found)
+    write_json(out / "evaluation.json", found.record() | {"trust": judged.record()})
+    report.write(run, found, target, diagnostics=judged)
+    sources = policies(run)
+    panels = {"Prior": PRIOR, "Structure alone": STRUCTURE, "Structure and parameters": LEARNT}
+    if STRUCTURE not in sources:
+        panels = {"Prior": PRIOR, "Learnt": LEARNT}
+    pictures = {
+        caption: pixels(scenes(model, sources.get(name, model.prior), SAMPLES, 0).image)
+        for caption, name in panels.items()
+    }
+    pictures["Target"] = [pixels(target.load(i)[None])[0] for i in range(min(SAMPLES, len(target)))]
+    write_picture(out / "grid.png", side_by_side(pictures))

@@ -1,1 +1,0 @@
-"""What a fit leaves behind: parameters, and the guide or the prior."""

@@ -1,0 +1,161 @@
+"""The stage of a fit that learns parameters, and what a run keeps of it.
+
+``parameters.json`` says of each site whether it is learnt, and why not. The learnt network is kept with the guide, so
+that one digest is of both. Axis letters: L images, C H W.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from probscene.dataset import Images
+from probscene.inference.features.base import FeatureNet
+from probscene.inference.guides.base import Guide
+from probscene.inference.parameters.backbone import Backbone, RenderBackbone
+from probscene.inference.parameters.learning import ParameterLearning
+from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
+from probscene.inference.parameters.reader_counts import counting_state
+from probscene.inference.parameters.schedule import ParameterSchedule
+from probscene.inference.parameters.tilting.schedule import TiltingSchedule
+from probscene.inference.training import Training, batch_seed
+from probscene.sampling import seed_everything
+from probscene.scenarios import JointGrammar
+
+from ..progress import Progress
+from .config import LIKELIHOOD
+from .image_level import ImageLevelTraining, meta_sim_learning, sites_record, tilting_learning
+from .learnt_parameters import NAME, prefixed, with_parameters
+from .plugins import inner
+from .rendered_features import RenderedFeatures
+from .run import RunFolder
+from .site_selection import held_out, prior_site_selector, select_sites
+from .store import Checkpointer
+
+READER = "reader"  # of the file with what finds objects, until structure was learnt again
+HELD = 5  # one image of the target in so many is not learnt from, and judges
+JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and where these are too few to tell which sites are learnt
+
+
+def learn_parameters(
+    run: RunFolder,
+    observer: RenderedFeatures,
+    net: FeatureNet,
+    guide: Guide,
+    images: Callable[[], Images],
+    progress: Progress,
+    say: Callable[[str], None],
+) -> None:
+    """Learn the parameters of the model's sites; from now on the guide's scenes have them, where they are kept.
+
+    Args:
+        net: what structure was learnt by.
+        guide: of the structures; its scenes are rendered.
+        images: opens the target.
+        say: is told which sites were learnt.
+
+    Raises:
+        ProbsceneError: a loss is no longer finite.
+    """
+    seed_everything(batch_seed(run.record["seed"], 5))
+    eye, schedule = Backbone.from_feature_net(inner(net)), run.config.parameters
+    by_reading = isinstance(schedule, ParameterSchedule)
+    joint = isinstance(schedule, MetaSimSchedule) and isinstance(run.model.grammar, JointGrammar)
+    if joint or (by_reading and eye is None):
+        who = "models of several scenarios are" if joint else f"{run.features.name} features are"
+        say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
+        return
+    kept = run.read_tensors(NAME)
+    if kept is None:
+        target = images()
+        held = torch.arange(len(target)) % HELD == HELD - 1
+        if isinstance(schedule, ParameterSchedule) and eye is not None:
+            learning = ParameterLearning(
+                run.model,
+                guide,
+                eye,
+                observer.labelled,
+                cache(lambda: _some(target, ~held, schedule.images)),
+                schedule,
+                batch_seed(run.record["seed"], 5),
+                held_out(run, guide, _some(target, held, JUDGED)),
+                prior_site_selector(
+                    run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED), schedule.sure
+                ),
+            )
+        elif isinstance(schedule, MetaSimSchedule):
+            learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
+        else:
+            assert isinstance(schedule, TiltingSchedule)
+            learning = tilting_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
+        keep = Checkpointer(run, NAME, learning)
+
+        def each(training: Training, line: dict[str, float]) -> None:
+            keep({"stage": NAME, "step": training.done, **line})
+            progress(NAME, training.done, training.total, f"loss {line['loss']:.3f}")
+
+        learning.run(each)
+        keep.finish()
+        if isinstance(learning, ParameterLearning) and isinstance(eye, RenderBackbone):
+            run.write_tensors(READER, counting_state(learning.calibrated.reader))
+        kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
+        judges = _some(target, held, JUDGED), lambda: _some(target, held, DOUBTFUL)
+        run.write_parameters(_record(run, guide, learning, *judges))
+        run.write_tensors(NAME, kept)
+        (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
+    say(_said(run.parameters))
+    with_parameters(run.model, run.config, run.parameters, guide, prefixed(kept))
+
+
+def _some(images: Images, which: Tensor, most: int) -> Tensor:
+    """At most so many of the chosen images, evenly spread, ``(L, C, H, W)`` uint8."""
+    rows = which.nonzero().flatten()
+    rows = rows[torch.linspace(0, len(rows) - 1, min(most, len(rows))).round().long()]
+    return torch.stack([images.load(row) for row in rows.tolist()])
+
+
+def _record(
+    run: RunFolder,
+    guide: Guide,
+    learning: ParameterLearning | ImageLevelTraining,
+    held: Tensor,
+    more: Callable[[], Tensor],
+) -> dict[str, Any]:
+    """For JSON, see ``select_sites``."""
+    method = {"method": run.config.parameter_method}
+    if not isinstance(learning, ParameterLearning):
+        return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held, more).distances}
+    assert learning.calibrated.skill is not None
+    shares = learning.calibrated.skill.share.tolist()
+    skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
+    found = select_sites(run, guide, learning, held, more)
+    passed = frozenset() if learning.guide is None else learning.guide.prior_sites
+    sites = []  # in the program's order, which is that of the network's columns
+    for site in learning.sites:
+        share, fitted = skill.get(site, torch.nan), site in learning.learnt
+        because = site.keeps or learning.calibrated.why_not(site)
+        if site.name in passed:
+            because = found.because.get(site.name, "scenes come no nearer to held-out images by it")
+        about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}
+        about |= {"fitted": fitted, "skill": share if share == share else None, "because": because}
+        sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
+    return method | {"sites": sites, **found.distances}
+
+
+def _said(record: dict[str, Any]) -> str:
+    sites, read = record["sites"], record.get("method", LIKELIHOOD) == LIKELIHOOD
+    named = [site["name"] + (f" ({site['skill']:.2f})" if read else "") for site in sites if site["learnt"]]
+    others = ", ".join(site["name"] for site in sites if not site["learnt"])
+    if not named:
+        why = "read in renders" if read else "moved"
+        return f"No site can be {why}, so where things stand and how they look keeps the prior."
+    said = f"Sites that are learnt{', with the share of their variance that is read' * read}: {', '.join(named)}."
+    said += f" Keeping the prior: {others}." if others else ""
+    if record["kept"] != "learnt":
+        said += (
+            f" All keep the prior, as learnt scenes come no nearer to held-out images, {record['learnt']:.2f} against "
+            f"{record['prior']:.2f} in energy distance."
+        )
+    return said

@@ -1,0 +1,260 @@
+"""The stages of a fit that learn structure: before its parameters, and once more after them.
+
+Before, scenes have the prior's layout and looks, in which objects lie over one another that do not in the target, so
+that their counts are read otherwise. With learnt parameters both are read alike, and a second, shorter pass takes the
+difference out. Axis letters: L images, D features.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from probscene.dataset import Images
+from probscene.inference.count_penalty import PriorCountPenalty
+from probscene.inference.divergence import Divergence
+from probscene.inference.features.base import FeatureNet, embed_all
+from probscene.inference.features.counting.net import CountNet
+from probscene.inference.guides.base import Guide
+from probscene.inference.objective import ScoreFunction
+from probscene.inference.parameters.reader_counts import ReaderCounts
+from probscene.inference.pretrain import pretrain
+from probscene.inference.render_cache import RenderCache
+from probscene.inference.statistics.energy import bootstrap_test
+from probscene.inference.structure_training import StructureTraining
+from probscene.inference.training import Training, batch_seed
+from probscene.model import SceneModel
+from probscene.sampling import sample, seed_everything
+
+from ..progress import Progress
+from ..workers.actor_pool import ActorPool
+from ..workers.cluster import Cluster
+from .config import ScoreFunctionTraining
+from .learnt_parameters import NAME, prefixed, with_parameters
+from .outcome import feature_mask
+from .parameter_stage import READER
+from .plugins import inner
+from .rendered_features import RENDERED_AT_ONCE, Chunk, Observe, RenderedFeatures
+from .run import RunFolder
+from .store import Checkpointer
+
+FIRST, AGAIN = "guide", "structure-again"  # of the checkpoints
+BEFORE = "guide-first"  # of the guide that parameters are learnt with
+SLOWER = 0.2  # of the first pass's rate
+
+
+def learn_structure(
+    run: RunFolder,
+    observer: RenderedFeatures,
+    net: FeatureNet,
+    real: Tensor,
+    progress: Progress,
+    cluster: Cluster | None = None,
+) -> Guide:
+    """A guide of the structures of a model with the prior's parameters.
+
+    Args:
+        real: ``(L, D)``.
+        cluster: of which all nodes render and read scenes; else this process does.
+
+    Raises:
+        ProbsceneError: a cost or a parameter is no longer finite.
+    """
+    training, seed = run.config.structure, run.record["seed"]
+    seed_everything(batch_seed(seed, 2))
+    guide, known = run.new_guide(), run.read_tensors(BEFORE)
+    if known is not None:
+        guide.load_state_dict(known)
+        return guide
+    pool, crew = _pool(run, run.model), _crew(run, cluster, training.draws_per_structure)
+    observe = observer.resample_and_embed(net, training.draws_per_structure, crew)
+    objective = _objective(run, run.model, observe, net, guide, pool)
+    rate, seeds = training.learning_rate, batch_seed(seed, 3)
+    trainer = _trainer(run, run.model, guide, objective, real, training.batches, rate, seeds, pool)
+    keep = Checkpointer(run, FIRST, trainer)
+    if trainer.done == 0:
+        pretraining = run.config.pretrain
+        epochs = pretraining.epochs
+        pretrain(
+            guide,
+            run.model.pretraining_policy,
+            pretraining.derivations,
+            epochs,
+            learning_rate=pretraining.learning_rate,
+            progress=lambda epoch, loss: progress("pretraining", epoch + 1, epochs, f"{loss:.2f} nats a scene"),
+        )
+    _run(trainer, keep, "structure", progress, crew)
+    if run.config.parameters is not None:
+        run.write_tensors(BEFORE, guide.state_dict())
+    return guide
+
+
+def refine_structure(
+    run: RunFolder,
+    net: FeatureNet,
+    real: Tensor,
+    guide: Guide,
+    images: Callable[[], Images],
+    progress: Progress,
+    cluster: Cluster | None = None,
+) -> None:
+    """Go on with a guide whose scenes have learnt parameters; as it is where they have none, and as it was where its
+    scenes end farther from the target. Both are seen by what the reader of parameters finds, where that tells more of
+    the scenes' structures than the network.
+
+    Args:
+        real: ``(L, D)``.
+        images: opens the target.
+        cluster: see ``learn_structure``.
+
+    Raises:
+        ProbsceneError: a cost or a parameter is no longer finite.
+    """
+    config, seed = run.config, run.record["seed"]
+    if guide.suits is None or config.refine is None or not config.refine.batches:
+        return
+    seed_everything(batch_seed(seed, 8))
+    model = guide.suits(run.model)
+    observer, before = (
+        RenderedFeatures(model, run.record["threads"]),
+        {k: v.clone() for k, v in guide.state_dict().items()},
+    )
+    finder = _finder(run, net, observer, guide)
+    if finder is not None:
+        net, real = finder, embed_all(finder, images().batches(RENDERED_AT_ONCE))
+    pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True, finder=finder is not None)
+    objective = _objective(run, model, observer.resample_and_embed(net, 1, crew), net, guide, pool)
+    rate, seeds = SLOWER * config.structure.learning_rate, batch_seed(seed, 7)
+    trainer = _trainer(run, model, guide, objective, real, config.refine.batches, rate, seeds, pool)
+    seen = _seen(run, observer, net, guide)
+    _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
+    which = feature_mask(net)
+    which = slice(None) if which is None else which
+    now, then, target = (part[:, which].double().numpy() for part in (_seen(run, observer, net, guide), seen, real))
+    if bootstrap_test(now, then, target).significant:
+        guide.load_state_dict(before)
+
+
+def _seen(run: RunFolder, observer: RenderedFeatures, net: FeatureNet, guide: Guide) -> Tensor:
+    """Features of scenes of the guide, as many as a batch has."""
+    seed_everything(batch_seed(run.record["seed"], 9))
+    with torch.no_grad():
+        return observer.observe(net)(sample(run.model, guide, run.config.structure.num_scenes))
+
+
+def _finder(run: RunFolder, net: FeatureNet, observer: RenderedFeatures, guide: Guide) -> ReaderCounts | None:
+    """Counts of what the reader finds, where they are nearer to those of a guide's scenes than the network's are."""
+    finder = _reader_counts(run, net)
+    if finder is None:
+        return None
+    seed_everything(batch_seed(run.record["seed"], 10))
+    kinds = [run.model.grammar.kind(name) for name in run.model.classes]
+    with torch.no_grad():
+        scenes = sample(run.model, guide, run.config.structure.num_scenes)
+        drawn = scenes.derivation.counts(len(run.model.grammar.kinds))[:, kinds]
+        of_finder, of_network = (_wrong(observer.observe(one)(scenes)[:, : len(kinds)], drawn) for one in (finder, net))
+    return finder if of_finder < of_network else None
+
+
+def _wrong(seen: Tensor, drawn: Tensor) -> float:
+    """By how much counts are wrong, in the mean."""
+    return float((seen - drawn).abs().mean())
+
+
+def _reader_counts(run: RunFolder, net: FeatureNet) -> ReaderCounts | None:
+    """None where there is no reader, or classes are counted group by group."""
+    state, counts = run.read_tensors(READER), inner(net)
+    return ReaderCounts(counts, state) if state and isinstance(counts, CountNet) and counts.groups is None else None
+
+
+def _pool(run: RunFolder, model: SceneModel) -> RenderCache | None:
+    return RenderCache(model, size) if (size := run.config.structure.render_cache) else None
+
+
+def _crew(
+    run: RunFolder, cluster: Cluster | None, draws_per_structure: int, again: bool = False, finder: bool = False
+) -> ActorPool | None:
+    task = run.path.resolve(), draws_per_structure, again, finder
+    return None if cluster is None else cluster.actor_pool(_actor, task, run.record["threads"])
+
+
+def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> Callable[[Chunk], tuple[int, Tensor]]:
+    """What a node of a cluster does with a part of a batch."""
+    run = RunFolder.at(path)
+    model, net = run.model, run.network()
+    assert net is not None
+    if again:
+        tensors = prefixed(run.read_tensors(NAME) or {})
+        suits = with_parameters(model, run.config, run.parameters, run.new_guide(), tensors).suits
+        model = model if suits is None else suits(model)
+    net = (_reader_counts(run, net) if finder else None) or net
+    observer = RenderedFeatures(model, run.record["threads"])
+    return lambda part: observer.part(part, net, draws_per_structure)
+
+
+def _objective(
+    run: RunFolder,
+    model: SceneModel,
+    observe: Observe,
+    net: FeatureNet,
+    guide: Guide,
+    pool: RenderCache | None,
+) -> ScoreFunction:
+    kinds = {*run.unread, *(model.stuff if run.readings else ())}
+    held = PriorCountPenalty(model, kinds, run.config.structure.num_scenes)
+    observe = held.append_counts(observe if pool is None else pool.wrap(observe))
+    return score_function(run.config.structure, model, observe, held.add_to(run.divergence(inner(net))), guide)
+
+
+def score_function(
+    training: ScoreFunctionTraining, model: SceneModel, observe: Observe, divergence: Divergence, guide: Guide
+) -> ScoreFunction:
+    """The loss by which a guide of the model learns, with the configured settings.
+
+    Args:
+        observe: features ``(N, D)`` of a batch of scenes.
+        divergence: of these from the target's.
+    """
+    return ScoreFunction(
+        observe,
+        divergence,
+        baseline=training.baseline,
+        updates=training.updates,
+        scale=training.scale,
+        strata=guide.strata,
+        incompletion_weight=training.incompletion_weight,
+        prior=model.pretraining_policy,
+        prior_kl_weight=training.prior_kl_weight,
+    )
+
+
+def _trainer(
+    run: RunFolder,
+    model: SceneModel,
+    guide: Guide,
+    objective: ScoreFunction,
+    real: Tensor,
+    batches: int,
+    rate: float,
+    seed: int,
+    pool: RenderCache | None,
+) -> StructureTraining:
+    training = run.config.structure
+    scenes, images = training.num_scenes, training.num_real
+    return StructureTraining(model, guide, objective, real, batches, scenes, images, rate, training.cosine, seed, pool)
+
+
+def _run(
+    trainer: StructureTraining, keep: Checkpointer, stage: str, progress: Progress, crew: ActorPool | None
+) -> None:
+    def each(trainer: Training, diagnostics: dict[str, float]) -> None:
+        keep({"stage": stage, **diagnostics})
+        progress(stage, trainer.done, trainer.total, f"cost {diagnostics['cost']:.3f}")
+
+    try:
+        trainer.run(each)
+    finally:
+        if crew is not None:
+            crew.close()
+    keep.finish()

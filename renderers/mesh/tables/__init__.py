@@ -1,0 +1,1 @@
+"""The tables that the host fills and the mesh kernels read."""
