@@ -41,16 +41,14 @@ def fit(
 ) -> Run:
     """Learn which structures occur in unlabelled images, where things stand and how they look.
 
-    Main arguments:
+    Args:
         model: a scene model, the name of a built-in one, or a Python file; ``ModelFile`` for one that is drawn with a
             folder of assets.
-        target: a folder of images, a list of files or of Pillow images, an array ``(L, H, W)`` or ``(L, H, W, 1 or
-            3)``, or a torch dataset of images, see ``ImageFolder`` and ``ImageArray``; ``TargetImages`` says how they
-            are read.
+        target: a folder of images, a list of files or of Pillow images, an array
+            ``(L, H, W)`` or ``(L, H, W, 1 or 3)``, or a torch dataset of images, see ``ImageFolder`` and
+            ``ImageArray``; ``TargetImages`` says how they are read.
         config: how to learn: a ``FitConfig``, or the name of a preset: ``"quick"``, ``"default"``, ``"street"``,
             ``"paper"``, ``"paper-aerial"`` or ``"paper-driving"``; ``"default"`` where None.
-
-    Other arguments:
         out: the folder of the run; a temporary one where None, which ``Run.save`` copies.
         seed: of everything random; 0 where None.
         labels: of a few of the images, for features that take them: a ``counts.csv``, COCO's ``.json``, KITTI's folder
