@@ -70,7 +70,7 @@ class Verdict(StrEnum):
     DOMAIN_SHIFT = "domain shift"
 
 
-class Uncovered(NamedTuple):
+class UncoveredShare(NamedTuple):
     """Images of one side that the other side does not cover.
 
     Attributes:
@@ -114,9 +114,9 @@ class StructureStatistics(NamedTuple):
     feature_names: tuple[str, ...]
     from_prior: EnergyTest | None
     p_value: float
-    real_uncovered: Uncovered
-    real_out_of_support: Uncovered
-    generated_uncovered: Uncovered
+    real_uncovered: UncoveredShare
+    real_out_of_support: UncoveredShare
+    generated_uncovered: UncoveredShare
     modes: Modes
     domain_shift_share: float
     by_patches: bool
@@ -309,10 +309,10 @@ def _check_scenes(features: ArrayLike, width: int, what: str) -> Features:
     return features
 
 
-def _uncovered(uncovered: Mask, nearest: Features, floor: float, index: NDArray[np.int64]) -> Uncovered:
+def _uncovered(uncovered: Mask, nearest: Features, floor: float, index: NDArray[np.int64]) -> UncoveredShare:
     low, high = binomial_interval(np.array([uncovered.sum()]), len(uncovered), 0.95)
     worst = index[np.argsort(-nearest, kind="stable")[:LISTED_OUTLIERS]]
-    return Uncovered(float(uncovered.mean()), float(low[0]), float(high[0]), floor, worst)
+    return UncoveredShare(float(uncovered.mean()), float(low[0]), float(high[0]), floor, worst)
 
 
 def _energy_record(found: EnergyTest) -> dict[str, Any]:
@@ -320,7 +320,7 @@ def _energy_record(found: EnergyTest) -> dict[str, Any]:
     return known | {"ratio": _finite(found.ratio), "close": found.close}
 
 
-def _uncovered_record(found: Uncovered) -> dict[str, Any]:
+def _uncovered_record(found: UncoveredShare) -> dict[str, Any]:
     return {**found._asdict(), "worst": found.worst.tolist()}
 
 

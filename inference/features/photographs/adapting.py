@@ -30,8 +30,8 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
     images, labelled = photographs.subset(most), photographs.labelled
     marked = images[:0] if labelled is None else labelled.images
     total = len(images) + len(marked)
-    whole = _look(net, images, 0, total, callback)
-    of_labelled = _look(net, marked, len(images), total, callback) if len(marked) else whole[:0]
+    whole = _read_images(net, images, 0, total, callback)
+    of_labelled = _read_images(net, marked, len(images), total, callback) if len(marked) else whole[:0]
     read = Read(whole, of_labelled, net.apart, net.held_read, net.held_true)
     counts = {} if labelled is None else dict(zip(labelled.classes, labelled.counts.T, strict=True))
     records: dict[str, Any] = {}
@@ -52,7 +52,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
     return {"classes": records}
 
 
-def _look(net: PretrainedCountNet, images: Tensor, done: int, total: int, callback: ImageCallback) -> Tensor:
+def _read_images(net: PretrainedCountNet, images: Tensor, done: int, total: int, callback: ImageCallback) -> Tensor:
     """Readings ``(L, S, R, C)``."""
     parts = []
     for some in images.split(LOOKED_AT_ONCE):

@@ -82,14 +82,16 @@ def fit(
     return run
 
 
-class Diagnosed(NamedTuple):
+class FitAndDiagnostics(NamedTuple):
     """A run, and what can be said of it without labels; None where it was finished before."""
 
     run: Run
     diagnostics: FitDiagnostics | None
 
 
-def fit_and_diagnose(request: FitRequest, out: Path, resume: bool, execution: Execution, verdict: bool) -> Diagnosed:
+def fit_and_diagnose(
+    request: FitRequest, out: Path, resume: bool, execution: Execution, verdict: bool
+) -> FitAndDiagnostics:
     """A fit and its verdict, as the command line gives them.
 
     Raises:
@@ -100,7 +102,7 @@ def fit_and_diagnose(request: FitRequest, out: Path, resume: bool, execution: Ex
         found = None
         if verdict and done.unfinished:
             found = diagnose(done.run, done.images or open_target(done.run, show), show)
-    return Diagnosed(done.run, found)
+    return FitAndDiagnostics(done.run, found)
 
 
 class Done(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 
 from probscene.inference.parameters.sites import LEARN
 from probscene.inference.statistics.residual import BETTER_RATIO, Grade, ResidualRatio
-from probscene.inference.statistics.verdict import StructureVerdict, Uncovered, Verdict
+from probscene.inference.statistics.verdict import StructureVerdict, UncoveredShare, Verdict
 
 from ..fitting.config import BOTH, LIKELIHOOD, META_SIM, TILTING
 from ..fitting.run import RunFolder
@@ -149,7 +149,7 @@ def percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-def _out_of_support(found: Uncovered) -> str:
+def _out_of_support(found: UncoveredShare) -> str:
     return (
         f"{percent(found.share)} of the real images are like no generated and no prior scene (between real halves at "
         f"most {percent(found.floor)})"

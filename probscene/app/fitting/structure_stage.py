@@ -127,16 +127,18 @@ def refine_structure(
     objective = _objective(run, model, observer.resample_and_embed(net, 1, crew), net, guide, pool)
     rate, seeds = SLOWER * config.structure.learning_rate, batch_seed(seed, 7)
     trainer = _trainer(run, model, guide, objective, real, config.refine.batches, rate, seeds, pool)
-    seen = _seen(run, observer, net, guide)
+    seen = _features_of_samples(run, observer, net, guide)
     _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
     which = feature_mask(net)
     which = slice(None) if which is None else which
-    now, then, target = (part[:, which].double().numpy() for part in (_seen(run, observer, net, guide), seen, real))
+    now, then, target = (
+        part[:, which].double().numpy() for part in (_features_of_samples(run, observer, net, guide), seen, real)
+    )
     if bootstrap_test(now, then, target).significant:
         guide.load_state_dict(before)
 
 
-def _seen(run: RunFolder, observer: RenderedFeatures, net: FeatureNet, guide: Guide) -> Tensor:
+def _features_of_samples(run: RunFolder, observer: RenderedFeatures, net: FeatureNet, guide: Guide) -> Tensor:
     """Features of scenes of the guide, as many as a batch has."""
     seed_everything(batch_seed(run.record["seed"], 9))
     with torch.no_grad():

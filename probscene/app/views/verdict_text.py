@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from probscene.inference.statistics.energy import EnergyTest
-from probscene.inference.statistics.verdict import StructureStatistics, Uncovered
+from probscene.inference.statistics.verdict import StructureStatistics, UncoveredShare
 
 from ..evaluation.components import ABSENT
 from ..evaluation.diagnose import FitDiagnostics
@@ -195,6 +195,6 @@ def _energy(found: EnergyTest, unit: float | None = None) -> tuple[str, str]:
     return f"{found.distance / unit:.2f} floors", f"{found.low / unit:.2f} to {found.high / unit:.2f}"
 
 
-def _uncovered(found: Uncovered) -> tuple[str, str]:
+def _uncovered(found: UncoveredShare) -> tuple[str, str]:
     spread = 50 * (found.high - found.low)
     return f"{100 * found.share:.1f} ± {spread:.1f} %", f"up to {percent(found.floor)}"
