@@ -8,10 +8,10 @@ import moderngl
 import numpy as np
 import opengl_shaders as glsl
 
-from probscene.renderers.mesh.instances import instances
-from probscene.renderers.mesh.scenes import view
-from probscene.renderers.mesh.tables import layout
-from probscene.renderers.mesh.tables.atlas import MeshAtlas
+from probscene.renderers.meshes.instances import instances
+from probscene.renderers.meshes.scenes import view
+from probscene.renderers.meshes.tables import layout
+from probscene.renderers.meshes.tables.atlas import MeshAtlas
 from probscene.world import World
 
 

@@ -21,7 +21,7 @@ import torch
 
 from probscene.camera_effects import CameraEffects
 from probscene.mesh import Mesh, Surface
-from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.meshes import MeshRenderer
 from probscene.threads import use_threads
 from probscene.world import Camera, Ground, Light, Meshes, World, resolve_ground, resolve_meshes, resolve_scene
 

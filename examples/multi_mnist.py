@@ -25,7 +25,7 @@ from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.features.counting.training import CountTraining
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL, target
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 
 
 def true_counts(scenes):

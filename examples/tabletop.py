@@ -20,7 +20,7 @@ import torch
 from probscene.drawing import Atlas, Drawing, Sprites, disc
 from probscene.grammar import Grammar
 from probscene.model import SceneModel, scene_model
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, ranked

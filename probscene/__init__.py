@@ -69,6 +69,7 @@ _MODULES = {
     "probscene.world": ("Camera", "Ground", "Light", "Meshes", "World"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+_OLD_MODULE_OF = {"Photo": "probscene.photo"}  # names in the model files that older runs keep
 
 if TYPE_CHECKING:
     from probscene.app.api.calls import compare, evaluate, generate, render, report, trial
@@ -147,9 +148,10 @@ _sys.modules[__name__].__class__ = _PublicApi
 
 
 def __getattr__(name: str) -> object:
-    if name not in _MODULE_OF:
+    module = _MODULE_OF.get(name) or _OLD_MODULE_OF.get(name)
+    if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(_import_module(_MODULE_OF[name]), name)
+    found = getattr(_import_module(module), name)
     globals()[name] = found
     return found
 

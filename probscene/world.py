@@ -206,6 +206,7 @@ def resolve_meshes(layer: Meshes, present: Tensor) -> MeshLayer:
     return MeshLayer(layer.meshes, present, index, labelled=layer.labelled, **numbers)
 
 
+Photo = CameraEffects  # its name in models of 0.1, which runs keep
 Part = TypeVar("Part", Camera, Light, CameraEffects)
 
 

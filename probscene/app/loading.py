@@ -22,8 +22,8 @@ from probscene.generator import Command
 from probscene.model import SceneModel
 from probscene.render_check import check_renderer
 from probscene.renderers.generator.renderer import GeneratedRenderer
-from probscene.renderers.mesh.renderer import MeshRenderer
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.request import Renderable, Request
 from probscene.scenarios import join
 from probscene.world import World

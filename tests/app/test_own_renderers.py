@@ -9,7 +9,7 @@ import torch
 from probscene.app.loading import load_model, renderer_for
 from probscene.batch import SceneGeometry
 from probscene.errors import ModelError
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.scenarios import join
 from probscene.structure import StructurePrior, counts

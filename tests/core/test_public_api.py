@@ -61,6 +61,17 @@ def test_type_checkers_see_the_same():
     assert homes == probscene._MODULE_OF
 
 
+@pytest.mark.parametrize("module", ["probscene", "probscene.photo", "probscene.world"])
+def test_model_files_of_older_runs_still_import_photo(module):
+    assert import_module(module).Photo is probscene.CameraEffects
+
+
+@pytest.mark.parametrize("name", ["sprites.SpriteRenderer", "meshes.MeshRenderer"])
+def test_renderers_are_imported_as_model_files_of_all_versions_do(name):
+    module, _, attribute = f"probscene.renderers.{name}".rpartition(".")
+    assert callable(getattr(import_module(module), attribute))
+
+
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'probscene' has no attribute 'grammer'"):
         _ = probscene.grammer

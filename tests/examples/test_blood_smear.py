@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from probscene.app.loading import load_model
 from probscene.checks import check
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,7 @@ from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
 from probscene.inference.features.base import class_table, examples
 from probscene.model import SceneModel
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts

@@ -17,7 +17,7 @@ from probscene.errors import DataError
 from probscene.models.aerial2d import APART, CANVAS, GRAMMAR, LANE, MODEL, PRETRAINING, ROAD, TARGET
 from probscene.models.aerial_sprites import folder
 from probscene.relations import per_parent
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 from probscene.structure import StructurePrior, counts
 

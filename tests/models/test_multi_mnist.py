@@ -13,7 +13,7 @@ from probscene.app.loading import load_model
 from probscene.checks import check
 from probscene.models.digits import shipped
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL, target
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
 

@@ -16,8 +16,8 @@ from probscene.camera_effects import CameraEffects
 from probscene.drawing import Atlas, Drawing, Sprites, resolve
 from probscene.errors import ModelError
 from probscene.renderers.camera import effects as effects_module
-from probscene.renderers.mesh.renderer import MeshRenderer
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.world import Camera, Light, Meshes, resolve_scene
 
 SEED = st.integers(0, 2**32 - 1)

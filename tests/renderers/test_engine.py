@@ -10,7 +10,7 @@ import os, torch
 from probscene.drawing import Drawing, Sprites, resolve
 from probscene.errors import ProbsceneError
 from probscene.renderers import engine
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 one = torch.ones(1, 1)
 layer = resolve(Sprites.disc("a", 9 * one, 9 * one, 5 * one), one > 0)
 drawing = Drawing(torch.zeros(1, 1, dtype=torch.int64), ("a",), (layer,))
@@ -60,7 +60,7 @@ from collections import defaultdict
 import numpy as np
 from probscene.mesh import Mesh
 from probscene.camera_effects import CameraEffects
-from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.meshes import MeshRenderer
 from probscene.renderers.camera.effects import apply_camera_effects
 from probscene.world import Camera, Light, Meshes, World, resolve_meshes, resolve_scene
 

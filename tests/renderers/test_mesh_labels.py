@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.meshes import MeshRenderer
 from probscene.world import KITTI_FOCAL, Camera, Meshes
 
 CANVAS = (94, 310)

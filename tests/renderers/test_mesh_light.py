@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from probscene.camera_effects import CameraEffects
 from probscene.mesh import Surface
-from probscene.renderers.mesh.renderer import MeshRenderer
-from probscene.renderers.mesh.tables.texture_atlas import TextureAtlas
+from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.meshes.tables.texture_atlas import TextureAtlas
 from probscene.world import Camera, Ground, Light, Meshes
 
 CANVAS = (188, 300)

@@ -14,8 +14,8 @@ from reference.meshes import MeshReference
 
 from probscene.camera_effects import CameraEffects
 from probscene.errors import ModelError
-from probscene.renderers.mesh import renderer as meshes_module
-from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.meshes import MeshRenderer
+from probscene.renderers.meshes import renderer as meshes_module
 from probscene.world import KITTI_CANVAS, Camera, Light, Meshes, resolve_scene
 
 CANVAS = (40, 66)
@@ -179,7 +179,7 @@ def test_nothing_is_left_of_the_world_before(shapes, monkeypatch):
     batches = [RENDERER(world) for world in worlds]
     renderer = MeshRenderer(CANVAS, threads=1)
     assert all(shapes.same(renderer(worlds[i]), batches[i]) for i in (0, 2, 1, 0))
-    monkeypatch.setattr("probscene.renderers.mesh.tables.atlas._FACES", 0)  # forget the meshes at every call
+    monkeypatch.setattr("probscene.renderers.meshes.tables.atlas._FACES", 0)  # forget the meshes at every call
     renderer = MeshRenderer(CANVAS, threads=1)
     assert all(shapes.same(renderer(worlds[i]), batches[i]) for i in (0, 2, 1, 0))
 
@@ -309,7 +309,7 @@ def test_a_users_own_taichi_is_left_alone():
     code = """
 import torch
 from probscene.renderers import engine
-from probscene.renderers.mesh.renderer import MeshRenderer
+from probscene.renderers.meshes import MeshRenderer
 from probscene.world import KITTI_CANVAS, Camera, Light, CameraEffects, World, resolve_scene
 engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)
 parts = {k: resolve_scene(v, 1) for k, v in dict(camera=Camera(), light=Light(), photo=CameraEffects()).items()}

@@ -10,8 +10,8 @@ from reference.sprites import ReferenceRenderer, spread
 from probscene.batch import RenderBatch
 from probscene.drawing import Atlas, Drawing, Layer, Sprites, box, disc, resolve
 from probscene.errors import ModelError
-from probscene.renderers.sprite import renderer as sprites_module
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
+from probscene.renderers.sprites import renderer as sprites_module
 
 CANVAS = (37, 43)
 RENDERER = SpriteRenderer(CANVAS, threads=1)
@@ -308,7 +308,7 @@ def test_sprites_are_made_again_once_the_sheet_has_been_full(monkeypatch):
     generator = np.random.default_rng(0)
     shape = (3, 4)
     drawing = Drawing(torch.zeros(shape, dtype=torch.int64), ("a",), (_layer(generator, shape, _atlas(generator)),))
-    monkeypatch.setattr("probscene.renderers.sprite.sheet._LIMIT", 0)
+    monkeypatch.setattr("probscene.renderers.sprites.sheet._LIMIT", 0)
     renderer = SpriteRenderer(CANVAS, threads=1)
     batches = [renderer(drawing) for _ in range(3)]
     assert _same(batches[0], RENDERER(drawing)) and _same(batches[1], batches[0]) and _same(batches[2], batches[0])

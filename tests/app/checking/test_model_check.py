@@ -15,7 +15,7 @@ from probscene.drawing import Sprites
 from probscene.generator import Command
 from probscene.grammar import Grammar
 from probscene.model import Groups, scene_model
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.request import Objects
 from probscene.sampling import sample
 from probscene.structure import StructurePrior, counts

@@ -21,7 +21,7 @@ from probscene.inference.parameters.likelihood import MaximumLikelihood, Values,
 from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.schedule import LIKELIHOOD, REFIT, SCENES, WEIGHTS, ParameterSchedule
 from probscene.inference.parameters.skill import Skill
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 
 
 def rows(number=300, sd=0.01, noise=0.0, seed=0):

@@ -20,7 +20,7 @@ from probscene.inference.parameters.meta_sim.task import TaskLearning
 from probscene.inference.parameters.meta_sim.transform import ParameterTransform
 from probscene.inference.parameters.sites import find_sites, quantiles_of, with_handlers
 from probscene.model import scene_model
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
 

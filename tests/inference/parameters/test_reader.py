@@ -27,7 +27,7 @@ from probscene.inference.parameters.scene_graph_builder import fit_scene_graph_b
 from probscene.inference.parameters.sites import Site, find_sites
 from probscene.inference.parameters.skill import CIRCLE, LINE, TWICE, Skill
 from probscene.inference.parameters.supervised_renders import SupervisedRenders, concatenate
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 seeds = st.integers(0, 2**31)

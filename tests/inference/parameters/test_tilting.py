@@ -24,7 +24,7 @@ from probscene.inference.parameters.tilting.learning import (
 )
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.statistics.energy import energy_distance
-from probscene.renderers.sprite.renderer import SpriteRenderer
+from probscene.renderers.sprites import SpriteRenderer
 from probscene.sampling import sample, seed_everything
 
 seeds = st.integers(0, 2**31)

@@ -1,1 +1,0 @@
-"""The mesh renderer's tables and atlases."""

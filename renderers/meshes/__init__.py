@@ -1,0 +1,3 @@
+"""The renderer of meshes."""
+
+from .renderer import MeshRenderer as MeshRenderer

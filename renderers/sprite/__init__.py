@@ -1,1 +1,0 @@
-"""The sprite renderer's tables and kernel."""

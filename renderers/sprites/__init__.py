@@ -1,0 +1,3 @@
+"""The renderer of sprites."""
+
+from .renderer import SpriteRenderer as SpriteRenderer
