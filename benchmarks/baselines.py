@@ -38,9 +38,9 @@ from probscene.errors import ProbsceneError
 from probscene.inference.divergence import MMD, KDELogRatio
 from probscene.inference.guides.base import Guide
 from probscene.inference.guides.pcfg import PCFG
-from probscene.inference.objective import BASELINES, ScoreFunction
+from probscene.inference.objective import BASELINES, ScoreFunction, ScoreFunctionConfig
 from probscene.inference.pretrain import pretrain
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.models.aerial2d import GRAMMAR, MODEL, TARGET
 from probscene.relations import per_parent
 from probscene.sampling import Scenes, seed_everything
@@ -127,10 +127,17 @@ def learnt(fit: str, settings: Settings, truth: Truth, seed: int) -> Guide:
 
     assert isinstance(config.divergence, KDELogRatio | MMD)
     divergence = replace(config.divergence, variance=settings.variance)
-    loss = ScoreFunction(observe, divergence, settings.baseline, updates=settings.updates)
+    loss = ScoreFunction(observe, divergence, ScoreFunctionConfig(baseline=settings.baseline, updates=settings.updates))
     batches = max(1, settings.scenes // settings.num_scenes)
     rate, num_scenes = settings.learning_rate, settings.num_scenes
-    StructureTraining(structures, guide, loss, real, batches, num_scenes, learning_rate=rate, seed=seed).run()
+    StructureTraining(
+        structures,
+        guide,
+        loss,
+        real,
+        StructureSchedule(batches=batches, num_scenes=num_scenes, learning_rate=rate),
+        seed=seed,
+    ).run()
     return guide
 
 

@@ -32,10 +32,10 @@ from probscene.app.fitting.store import timing
 from probscene.derive import derive_complete
 from probscene.drawing import Drawing
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
 from probscene.inference.pretrain import pretrain
 from probscene.inference.statistics.count_metrics import histogram, pooled_shares, total_variation
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.models.multi_mnist import CLASSES, GRAMMAR, MODEL
 from probscene.sampling import seed_everything
 from probscene.structure import StructurePrior, counts, weights
@@ -159,9 +159,9 @@ def fit_counts(target: int, seed: int, images: int) -> tuple[LSTMGuide, dict[str
     seen = real.counts(len(GRAMMAR.kinds))[:, kinds].float()
     guide = LSTMGuide(GRAMMAR, MODEL.max_steps)
     pretrain(guide, MODEL.prior)
-    loss = ScoreFunction(observe, QUICK.divergence(), updates=QUICK.updates)
+    loss = ScoreFunction(observe, QUICK.divergence(), ScoreFunctionConfig(updates=QUICK.updates))
     features = torch.cat([seen, seen.sum(1, keepdim=True)], 1)
-    StructureTraining(structures, guide, loss, features, ORACLE_BATCHES, seed=seed).run()
+    StructureTraining(structures, guide, loss, features, StructureSchedule(batches=ORACLE_BATCHES), seed=seed).run()
     return guide, {"structure": time.monotonic() - start}
 
 

@@ -33,7 +33,7 @@ from probscene.derive import derive_complete
 from probscene.inference.guides.base import Guide
 from probscene.inference.guides.scenario import guide_of
 from probscene.inference.pretrain import pretrain
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.policy import Policy
@@ -78,7 +78,16 @@ def learn(model: SceneModel, channel: Channel, real: Tensor, config: FitConfig, 
     pretrain(guide, start, first.derivations, first.epochs, learning_rate=first.learning_rate)
     scenes, images, rate = then.num_scenes, then.num_real, then.learning_rate
     seeds = batch_seed(seed, 3)
-    StructureTraining(model, guide, objective, real, then.batches, scenes, images, rate, then.cosine, seeds).run()
+    StructureTraining(
+        model,
+        guide,
+        objective,
+        real,
+        StructureSchedule(
+            batches=then.batches, num_scenes=scenes, num_real=images, learning_rate=rate, cosine=then.cosine
+        ),
+        seed=seeds,
+    ).run()
     return guide
 
 

@@ -19,7 +19,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.progress import Display
 from probscene.app.trial.tables import text
-from probscene.app.trial.trial import Budget, Generated, TrialOptions, trial
+from probscene.app.trial.trial import GeneratedSets, TrainingBudget, TrialOptions, trial
 
 TESTED, RARE = 500, 0.02  # images; objects of a class in an image, of which fewer are left out
 
@@ -50,8 +50,8 @@ def main():
                 hold_out=TESTED,
                 numbers=(args.generate,),
                 classes=there,
-                generated=Generated(RunFolder.at(out / "run"), number=args.generate),
-                budget=Budget(iterations=args.iterations),
+                generated=GeneratedSets(RunFolder.at(out / "run"), number=args.generate),
+                budget=TrainingBudget(iterations=args.iterations),
                 seeds=args.seeds,
                 seed=args.seed,
                 baselines=("prior",),

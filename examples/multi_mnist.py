@@ -84,7 +84,7 @@ def main():
     updates = 3
     cosine = {"lr_lambda": lambda step: 0.5 * (1 + math.cos(math.pi * step / (updates * args.batches)))}
     adam = PyroLRScheduler(LambdaLR, {"optimizer": torch.optim.Adam, "optim_args": {"lr": 1e-2}, **cosine})
-    loss = ps.ScoreFunction(observe, ps.KDELogRatio(), updates=updates)
+    loss = ps.ScoreFunction(observe, ps.KDELogRatio(), ps.ScoreFunctionConfig(updates=updates))
     svi = SVI(MODEL, guide, adam, loss=loss)
     for step in range(updates * args.batches):
         cost = svi.step(args.num_scenes, real=real)

@@ -37,6 +37,7 @@ References:
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import pyro
@@ -90,6 +91,48 @@ def _check_guide(guide: object) -> None:
         )
 
 
+@dataclass(frozen=True)
+class ScoreFunctionConfig:
+    """How a ``ScoreFunction`` makes a gradient of costs.
+
+    Args:
+        baseline: ``"moving_average"``, ``"leave_one_out"`` or ``"none"``.
+        decay: weight of the new value in the moving average.
+        updates: steps taken on one rendered batch.
+        clip: the importance ratio of those steps stays within ``1 +- clip``.
+        scale: of the cost; under Adam it changes nothing but the weight of failed attempts, which is not scaled.
+        reject_weight, reject_threshold: lambda and epsilon of section 3.3.
+        incompletion_weight: of half the squared number of failed attempts.
+        prior_kl_weight: of the reverse KL from a prior, where there is one.
+
+    Raises:
+        ProbsceneError: an unknown baseline, or numbers out of range.
+    """
+
+    baseline: str = "leave_one_out"
+    decay: float = 0.05
+    updates: int = 1
+    clip: float = 0.2
+    scale: float = 1.0
+    reject_weight: float = 1e-2
+    reject_threshold: float = 1.0
+    incompletion_weight: float = 1.0
+    prior_kl_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.baseline not in BASELINES:
+            raise ProbsceneError(f"expected a baseline among {', '.join(BASELINES)}, got {self.baseline!r}.")
+        if self.updates < 1 or not 0 < self.decay <= 1 or self.clip <= 0:
+            raise ProbsceneError(
+                "expected updates >= 1, decay in (0, 1] and clip > 0, got "
+                f"{self.updates}, {self.decay} and {self.clip}."
+            )
+        if self.reject_threshold < 0:
+            raise ProbsceneError(
+                f"expected a reject_threshold of at least 0 failed attempts, got {self.reject_threshold}."
+            )
+
+
 class ScoreFunction:
     """A loss for ``pyro.infer.SVI``: ``loss(model, guide, num_scenes, real=...)``.
 
@@ -100,56 +143,27 @@ class ScoreFunction:
     Args:
         observe: features ``(N, D)`` of a batch of ``Scenes``, for example render and embed; no gradient is taken.
         divergence: one cost a scene.
-        baseline: ``"moving_average"``, ``"leave_one_out"`` or ``"none"``.
-        decay: weight of the new value in the moving average.
-        updates: steps taken on one rendered batch.
-        clip: the importance ratio of those steps stays within ``1 +- clip``.
-        scale: of the cost; under Adam it changes nothing but the weight of failed attempts, which is not scaled.
-        reject_weight, reject_threshold: lambda and epsilon of section 3.3.
-        incompletion_weight: of half the squared number of failed attempts.
-        prior, prior_kl_weight: a policy, and the weight of the reverse KL from it: ``log q(T) - log p(T)`` nats, at
-            most ``MAX_LOG_RATIO``, are added to the cost of a scene (not in the paper). Without it, whatever images do
-            not show drifts freely, such as the number of cars that are hidden behind others.
+        config: how costs become a gradient.
+        prior: a policy; with ``config.prior_kl_weight`` the reverse KL from it, ``log q(T) - log p(T)`` nats, at most
+            ``MAX_LOG_RATIO``, is added to the cost of a scene (not in the paper). Without it, whatever images do not
+            show drifts freely, such as the number of cars that are hidden behind others.
         strata: ``(N,)`` int64 of a batch of derivations: scenes of one number have a baseline of their own, as where
             several guides learn together, so that the gradient is that of their own mean cost; all have one where None.
 
     Attributes:
         batch: the last ``SceneBatch``, for logging.
-
-    Raises:
-        ProbsceneError: an unknown baseline, or numbers out of range.
     """
 
     def __init__(
         self,
         observe: Callable[[Scenes], Tensor],
         divergence: Divergence,
-        baseline: str = "leave_one_out",
-        decay: float = 0.05,
-        updates: int = 1,
-        clip: float = 0.2,
-        scale: float = 1.0,
-        reject_weight: float = 1e-2,
-        reject_threshold: float = 1.0,
-        incompletion_weight: float = 1.0,
+        config: ScoreFunctionConfig = ScoreFunctionConfig(),
         prior: Policy | None = None,
-        prior_kl_weight: float = 0.0,
         strata: Callable[[Derivation], Tensor] | None = None,
     ):
-        if baseline not in BASELINES:
-            raise ProbsceneError(f"expected a baseline among {', '.join(BASELINES)}, got {baseline!r}.")
-        if updates < 1 or not 0 < decay <= 1 or clip <= 0:
-            raise ProbsceneError(
-                f"expected updates >= 1, decay in (0, 1] and clip > 0, got {updates}, {decay} and {clip}."
-            )
-        if reject_threshold < 0:
-            raise ProbsceneError(f"expected a reject_threshold of at least 0 failed attempts, got {reject_threshold}.")
-        self.observe, self.divergence, self.baseline, self.decay = observe, divergence, baseline, decay
-        self.updates, self.clip, self.scale = updates, clip, scale
-        self.reject_weight, self.reject_threshold = reject_weight, reject_threshold
-        self.incompletion_weight = incompletion_weight
-        self.prior, self.prior_kl_weight = prior, prior_kl_weight
-        self.strata = strata
+        self.observe, self.divergence, self.config = observe, divergence, config
+        self.prior, self.strata = prior, strata
         self.averages: dict[int, float] = {}  # moving, by stratum
         self.batch: SceneBatch | None = None
         self._updates_done = 0
@@ -167,7 +181,8 @@ class ScoreFunction:
             return self._costs(model, guide, num_scenes, real)[2].mean()
         if am_i_wrapped():  # in SVI, which learns the parameters that it sees registered
             pyro.module("guide", guide)
-        if self.batch is None or self._updates_done == self.updates or not self._reusable(self.batch, num_scenes, real):
+        done = self._updates_done == self.config.updates
+        if self.batch is None or done or not self._reusable(self.batch, num_scenes, real):
             self.batch, self._updates_done, self._real = self._draw(model, guide, num_scenes, real), 0, real
         batch = self.batch
         log_prob, advantage = guide.log_prob(batch.derivation), batch.advantage
@@ -179,7 +194,7 @@ class ScoreFunction:
         self._updates_done += 1
         assert self._old_log_prob is not None
         ratio = torch.exp(log_prob - self._old_log_prob)
-        clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
+        clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
         surrogate = torch.maximum(advantage * ratio, advantage * clipped).sum() / num_scenes
         return batch.cost.mean() + surrogate - surrogate.detach()
 
@@ -202,17 +217,17 @@ class ScoreFunction:
         derivation, failures = derive_complete(guide.grammar, guide, num_scenes, guide.max_steps, failed=failed)
         features = self.observe(run_program(model, derivation, failures=failures, density=False))
         cost = self.divergence(features, real)
-        if self.prior is not None and self.prior_kl_weight:
+        if self.prior is not None and self.config.prior_kl_weight:
             log_ratio = guide.log_prob(derivation) - self.prior.log_prob(derivation)
-            cost = cost + self.prior_kl_weight * log_ratio.clamp(max=MAX_LOG_RATIO)
+            cost = cost + self.config.prior_kl_weight * log_ratio.clamp(max=MAX_LOG_RATIO)
         return derivation, features, cost, failures.float().mean().item()
 
     def _draw(self, model: Callable[[int], Any], guide: Guide, num_scenes: int, real: Tensor) -> SceneBatch:
         with torch.no_grad():
-            attempts: list[Derivation] | None = None if self.baseline == "leave_one_out" else []
+            attempts: list[Derivation] | None = None if self.config.baseline == "leave_one_out" else []
             derivation, features, cost, rejections = self._costs(model, guide, num_scenes, real, attempts)
             strata = self._strata(derivation)
-            advantage = self.scale * (cost - self._baseline(cost, strata))
+            advantage = self.config.scale * (cost - self._baseline(cost, strata))
             failed, failed_advantage = None, advantage[:0]
             if attempts:
                 places = torch.arange(sum(map(len, attempts))).split([len(attempt) for attempt in attempts])
@@ -226,17 +241,17 @@ class ScoreFunction:
 
     def _failure_cost(self, failed: float) -> float:
         """The cost of a mean number of failed attempts a scene, which is subtracted from all advantages."""
-        completion, k = 1 / (1 + failed), math.floor(self.reject_threshold) + 1
+        completion, k = 1 / (1 + failed), math.floor(self.config.reject_threshold) + 1
         rejected = k * (1 - completion) ** (k - 1) * completion
-        return self.reject_weight * rejected + self.incompletion_weight * failed * (1 + failed)
+        return self.config.reject_weight * rejected + self.config.incompletion_weight * failed * (1 + failed)
 
     def _baseline(self, cost: Tensor, strata: Tensor) -> Tensor:
         baseline = torch.zeros_like(cost)
-        if self.baseline == "none":
+        if self.config.baseline == "none":
             return baseline
         for stratum in strata.unique().tolist():
             own = strata == stratum
-            if self.baseline == "moving_average":
+            if self.config.baseline == "moving_average":
                 baseline[own] = self._moving_average(stratum, cost[own].mean().item())
             else:
                 others = cost[own] if own.sum() > 1 else cost  # a scene alone in its stratum has none
@@ -246,7 +261,7 @@ class ScoreFunction:
     def _moving_average(self, stratum: int, new: float) -> float:
         # The paper leaves the first value open. From 0, every scene of the first batches would seem bad, or good.
         before = self.averages.get(stratum)
-        self.averages[stratum] = new if before is None else self.decay * new + (1 - self.decay) * before
+        self.averages[stratum] = new if before is None else self.config.decay * new + (1 - self.config.decay) * before
         return self.averages[stratum]
 
 

@@ -2,6 +2,7 @@
 training that was interrupted goes on to the same result."""
 
 import math
+from dataclasses import dataclass
 from typing import Any, cast
 
 import pyro
@@ -18,6 +19,24 @@ from .render_cache import RenderCache
 from .training import Callback, TrainingLoop, check_finite, of_prefix, restore_training, training_state
 
 
+@dataclass(frozen=True)
+class StructureSchedule:
+    """How long structures are trained.
+
+    Args:
+        batches: rendered batches in all.
+        num_scenes: scenes a batch, N.
+        num_real: real images a batch, a new sample each time (the paper); all of them where None.
+        learning_rate: at the start; it falls to 0 along a cosine, or stays where ``cosine`` is False (the paper).
+    """
+
+    batches: int
+    num_scenes: int = 500
+    num_real: int | None = None
+    learning_rate: float = 1e-2
+    cosine: bool = True
+
+
 class StructureTraining(TrainingLoop):
     """``SVI`` on a ``ScoreFunction``; each step draws and renders one batch of scenes.
 
@@ -26,10 +45,7 @@ class StructureTraining(TrainingLoop):
         guide: trained in place.
         objective: its ``updates`` are taken on each batch.
         real: ``(L, D)`` features of the real images.
-        batches: rendered batches in all.
-        num_scenes: scenes a batch, N.
-        num_real: real images a batch, a new sample each time (the paper); all of them where None.
-        learning_rate: at the start; it falls to 0 along a cosine, or stays where ``cosine`` is False (the paper).
+        schedule: how long.
         seed: batch k is drawn from (seed, k).
         render_cache: the cache that the objective looks features up in, if any; part of ``state``.
 
@@ -46,19 +62,14 @@ class StructureTraining(TrainingLoop):
         guide: Guide,
         objective: ScoreFunction,
         real: Tensor,
-        batches: int,
-        num_scenes: int = 500,
-        num_real: int | None = None,
-        learning_rate: float = 1e-2,
-        cosine: bool = True,
+        schedule: StructureSchedule,
         seed: int = 0,
         render_cache: RenderCache | None = None,
     ):
-        super().__init__(guide, {}, batches, seed)
+        super().__init__(guide, {}, schedule.batches, seed)
         self.model, self.guide, self.objective, self.real = model, guide, objective, real
-        self.num_scenes, self.num_real, self.render_cache = num_scenes, num_real, render_cache
-        self.learning_rate, self.cosine = learning_rate, cosine
-        self.adam = _Adam(learning_rate)
+        self.schedule, self.render_cache = schedule, render_cache
+        self.adam = _Adam(schedule.learning_rate)
         self.svi = SVI(model, guide, self.adam, loss=objective)
 
     def run(self, callback: Callback | None = None) -> None:
@@ -115,17 +126,19 @@ class StructureTraining(TrainingLoop):
         self.objective.averages = {int(key.removeprefix("average-")): value for key, value in averages.items()}
 
     def _batch(self) -> float:
-        real = self.real
-        if self.num_real is not None and self.num_real < len(real):
-            real = real[torch.randperm(len(real))[: self.num_real]]
-        updates, loss = self.objective.updates, 0.0
+        real, schedule = self.real, self.schedule
+        if schedule.num_real is not None and schedule.num_real < len(real):
+            real = real[torch.randperm(len(real))[: schedule.num_real]]
+        updates, loss = self.objective.config.updates, 0.0
         for update in range(updates):
             progress = (self.done * updates + update) / (self.total * updates)
-            self.adam.rate = self.learning_rate * (0.5 * (1 + math.cos(math.pi * progress)) if self.cosine else 1.0)
-            loss = cast(float, self.svi.step(self.num_scenes, real=real))
+            self.adam.rate = schedule.learning_rate * (
+                0.5 * (1 + math.cos(math.pi * progress)) if schedule.cosine else 1.0
+            )
+            loss = cast(float, self.svi.step(schedule.num_scenes, real=real))
         remedy = (
-            f"begin again with a lower rate, such as learning_rate={self.learning_rate / 4:g}, or a larger variance; "
-            "the guide is as it was before the batch"
+            f"begin again with a lower rate, such as learning_rate={schedule.learning_rate / 4:g}, or a larger "
+            "variance; the guide is as it was before the batch"
         )
         check_finite(loss, self.guide.parameters(), self.subject, "in this batch", remedy)
         return loss

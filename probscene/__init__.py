@@ -24,7 +24,11 @@ __version__ = "0.2.0"
 _APP_MODULES = {
     "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
     "api.fit": ("fit",),
-    "fitting.begin": ("ModelFile", "TargetImages"),
+    "datasets.generate": ("DatasetOptions",),
+    "evaluation.labels": ("TargetLabels",),
+    "fitting.begin": ("ModelFile",),
+    "targets": ("TargetImages",),
+    "trial.trial": ("GeneratedSets", "TrainingBudget", "TrialOptions"),
     "fitting.config": ("FitConfig",),
     "fitting.pipeline": ("Execution",),
     "fitting.presets": ("preset",),
@@ -54,7 +58,7 @@ _MODULES = {
     "probscene.inference.guides.grammar_vae": ("GrammarVAE",),
     "probscene.inference.guides.lstm": ("LSTMGuide",),
     "probscene.inference.guides.pcfg": ("PCFG",),
-    "probscene.inference.objective": ("ScoreFunction",),
+    "probscene.inference.objective": ("ScoreFunction", "ScoreFunctionConfig"),
     "probscene.inference.parameters.guide": ("ParameterGuide",),
     "probscene.inference.parameters.sites": ("find_sites",),
     "probscene.inference.pretrain": ("pretrain",),
@@ -76,19 +80,23 @@ if TYPE_CHECKING:
     from probscene.app.api.fit import fit
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
+    from probscene.app.datasets.generate import DatasetOptions
     from probscene.app.datasets.scene_dataset import SceneDataset
-    from probscene.app.fitting.begin import ModelFile, TargetImages
+    from probscene.app.evaluation.labels import TargetLabels
+    from probscene.app.fitting.begin import ModelFile
     from probscene.app.fitting.config import FitConfig
     from probscene.app.fitting.pipeline import Execution
     from probscene.app.fitting.presets import preset
     from probscene.app.loading import load_model
+    from probscene.app.targets import TargetImages
+    from probscene.app.trial.trial import GeneratedSets, TrainingBudget, TrialOptions
     from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELogRatio
     from probscene.inference.features.base import FeatureNet, Features
     from probscene.inference.guides.base import Guide
     from probscene.inference.guides.grammar_vae import GrammarVAE
     from probscene.inference.guides.lstm import LSTMGuide
     from probscene.inference.guides.pcfg import PCFG
-    from probscene.inference.objective import ScoreFunction
+    from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
     from probscene.inference.parameters.guide import ParameterGuide
     from probscene.inference.parameters.sites import find_sites
     from probscene.inference.pretrain import pretrain
@@ -123,15 +131,15 @@ if TYPE_CHECKING:
     from .world import Camera, Ground, Light, Meshes, World
 
 __all__ = [
-    "Camera", "CameraEffects", "Command", "DataError", "Derivation", "Divergence", "Drawing", "Execution",
-    "FeatureNet", "Features", "FitConfig", "GeneratorError", "Grammar", "GrammarError", "GrammarVAE", "Ground",
-    "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide", "Light", "MMD",
-    "MachineError", "Mesh", "Meshes", "ModelError", "ModelFile", "Objects", "PCFG", "ParameterGuide", "Policy",
-    "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError", "SamplingError", "SceneDataset",
-    "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "Sprites", "StructurePrior", "TargetImages", "World",
-    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
-    "load_model", "preset", "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything",
-    "trial", "weights",
+    "Camera", "CameraEffects", "Command", "DataError", "DatasetOptions", "Derivation", "Divergence", "Drawing",
+    "Execution", "FeatureNet", "Features", "FitConfig", "GeneratedSets", "GeneratorError", "Grammar", "GrammarError",
+    "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide",
+    "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "ModelFile", "Objects", "PCFG", "ParameterGuide",
+    "Policy", "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError", "SamplingError",
+    "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "ScoreFunctionConfig", "Sprites",
+    "StructurePrior", "TargetImages", "TargetLabels", "TrainingBudget", "TrialOptions", "World", "compare", "counts",
+    "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label", "load_model", "preset",
+    "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything", "trial", "weights",
 ]  # fmt: skip
 
 

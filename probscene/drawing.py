@@ -148,7 +148,7 @@ class Sprites:
         return Sprites(kinds, _DISC, 0, x, y, scale=scale, tint=tint, labelled=labelled, keypoints=keypoints)
 
     @staticmethod
-    def box(
+    def box(  # noqa: PLR0913 - one for each property of a rectangle
         kinds, x, y, width, height, angle=0.0, tint=(1.0, 1.0, 1.0), labelled: bool = True, keypoints=None
     ) -> "Sprites":
         """Rectangles of ``width`` by ``height`` pixels, turned by ``angle``."""

@@ -144,7 +144,7 @@ class SceneGraph:
         seed = seed_site("request.seed", N, "scene.request(...)").squeeze(1)
         return Request(self.kind, self.grammar.kinds, self.parent, seed, tuple(found), (of_scene,), effects)
 
-    def photo(
+    def photo(  # noqa: PLR0913 - one for each effect
         self,
         *,
         exposure: EffectValue | None = None,

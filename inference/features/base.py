@@ -4,8 +4,8 @@ They are trained on the model's own renders only, whose labels come free. Axis l
 features, C H W.
 """
 
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -57,11 +57,46 @@ class FeatureNet(Protocol):
         """Features ``(N, D)`` float32, finite, of images ``(N, C, H, W)`` uint8, N >= 0. Renders come with C = 3;
         target images with C = 1 where the model's colour carries nothing, else 3.
 
-        A network may have three more beside it: ``embed_real``, which is then called for target images,
-        ``embed_from_labels(examples)``, which is called for renders where their labels are at hand (their images may be
-        black if the network's ``uses_labels`` is true), and ``cells(images)``, ``(N, classes, h, w)``, how many objects
-        of each of its ``classes`` each cell of the image holds, by which a verdict on layout goes."""
+        A network may have more beside it: see ``EmbedsReal``, ``EmbedsLabels``, ``LocatesObjects`` and
+        ``CountsObjects``."""
         ...
+
+
+@runtime_checkable
+class EmbedsReal(Protocol):
+    """A ``FeatureNet`` that looks at target images in another way than at renders."""
+
+    def embed_real(self, images: Tensor) -> Tensor:
+        """``FeatureNet.embed`` of target images."""
+        ...
+
+
+@runtime_checkable
+class EmbedsLabels(Protocol):
+    """A ``FeatureNet`` whose features of renders come from their labels, where these are at hand. Where its
+    ``uses_labels`` is true, it does not look at their images, which may be black."""
+
+    def embed_from_labels(self, drawn: Examples) -> Tensor:
+        """Features ``(N, D)``."""
+        ...
+
+
+@runtime_checkable
+class LocatesObjects(Protocol):
+    """A ``FeatureNet`` that finds objects of some classes, by which a verdict on layout goes."""
+
+    classes: Sequence[str]
+
+    def cells(self, images: Tensor) -> Tensor:
+        """``(N, classes, h, w)`` how many objects of each class each cell of the image holds."""
+        ...
+
+
+@runtime_checkable
+class CountsObjects(Protocol):
+    """A ``FeatureNet`` whose features count objects: 1 in a feature is ``unit`` of them, a number or ``(D,)``."""
+
+    unit: float | Tensor
 
 
 Draw = Callable[[int], Examples]
@@ -259,7 +294,17 @@ def enter(images: Tensor, channels: int, reduce: int) -> Tensor:
 
 def embed_real(net: FeatureNet, images: Tensor) -> Tensor:
     """Features ``(L, D)`` of target images, which a network may look at in another way than at renders."""
-    return getattr(net, "embed_real", net.embed)(images)
+    return net.embed_real(images) if isinstance(net, EmbedsReal) else net.embed(images)
+
+
+def needs_images(net: FeatureNet | EmbedsLabels) -> bool:
+    """Whether a network looks at the images of renders, and not at their labels alone."""
+    return not getattr(net, "uses_labels", False)
+
+
+def objects_counted(net: FeatureNet, features: Tensor) -> Tensor:
+    """Features ``(N, D)`` in objects, where they count some."""
+    return features * net.unit if isinstance(net, CountsObjects) else features
 
 
 @torch.no_grad()

@@ -6,7 +6,8 @@ and contrast, which such maps keep badly. Axis letters: N images, h w cells.
 """
 
 import copy
-from typing import TYPE_CHECKING, cast
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -15,9 +16,6 @@ from torch import Tensor, nn
 from ..features.base import FeatureNet, enter
 from ..features.counting.batches import images_per_step
 from ..features.counting.net import CountNet, conv, layers
-
-if TYPE_CHECKING:
-    from ..features.photographs.net import PretrainedCountNet
 
 WIDTH = 64  # channels
 STRIDE = 4  # pixels of a reduced image a cell
@@ -49,9 +47,7 @@ class Backbone(nn.Module):
         """That which suits what structure was learnt by; None where nothing does."""
         if isinstance(net, CountNet):
             return RenderBackbone(net)
-        if hasattr(net, "compute_maps"):  # torchvision takes seconds to import
-            return PhotographBackbone(cast("PretrainedCountNet", net))
-        return None
+        return PhotographBackbone(net) if isinstance(net, FrozenMaps) else None
 
 
 class RenderBackbone(Backbone):
@@ -83,18 +79,43 @@ class RenderBackbone(Backbone):
         return self.both(self.side(fine) + coarse)
 
 
+@runtime_checkable
+class FrozenMaps(Protocol):
+    """A ``FeatureNet`` on the maps of a pretrained network: ``PretrainedCountNet``, which takes seconds to import."""
+
+    @property
+    def map_channels(self) -> Sequence[int]:
+        """Of each map."""
+        ...
+
+    def compute_maps(self, images: Tensor) -> list[Tensor]:
+        """Maps ``(N, c, h, w)`` of ``(N, C, H, W)`` uint8 images."""
+        ...
+
+    def normalise(self, maps: list[Tensor]) -> list[Tensor]:
+        """The maps, each channel of mean 0 and standard deviation 1 in the target."""
+        ...
+
+    def places(self, stride: int) -> tuple[int, int]:
+        """Height and width of a grid with a cell every ``stride`` pixels of what enters."""
+        ...
+
+    def scale(self) -> Tensor:
+        """``(2,)`` pixels of what enters a pixel of the image, along x and y."""
+        ...
+
+
 class PhotographBackbone(Backbone):
     """On frozen maps.
 
     Args:
-        net: a ``PretrainedCountNet``, trained.
+        net: trained.
     """
 
-    def __init__(self, net: "PretrainedCountNet"):
+    def __init__(self, net: FrozenMaps):
         super().__init__()
         self.net = (net,)  # not a submodule: its state is the run's
-        channels = net.frozen[0].channels
-        self.sides = nn.ModuleList(nn.Conv2d(number, WIDTH, 1, bias=False) for number in channels)
+        self.sides = nn.ModuleList(nn.Conv2d(number, WIDTH, 1, bias=False) for number in net.map_channels)
         self.colours = nn.Conv2d(6, WIDTH, 1, bias=False)
         self.both = nn.Sequential(nn.BatchNorm2d(WIDTH), nn.ReLU(inplace=True), *conv(WIDTH, WIDTH, 3, 1))
         self.cell = FINEST / net.scale()

@@ -78,7 +78,7 @@ class ParameterLearning:
 
     unit = "steps"
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         model: SceneModel,
         structure: Policy,

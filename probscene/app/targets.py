@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -13,6 +14,22 @@ from .progress import Display
 
 Target = Path | str | Sequence[Path | str] | Any
 """A folder, a list of files, an array or a dataset of images, see ``open_images``."""
+
+
+@dataclass(frozen=True)
+class TargetImages:
+    """Images, and how they are read.
+
+    Args:
+        source: a folder, a list of files, or images in memory, see ``open_images``.
+        skip_bad: leave out files that do not decode.
+        value_range: the values of images of 16 bits that are read as black and white, such as ``(0, 4095)``; where
+            None, what is found in the images, see ``ImageFolder``. A run keeps it.
+    """
+
+    source: Target
+    skip_bad: bool | None = None
+    value_range: Sequence[float] | None = None
 
 
 def open_images(

@@ -13,12 +13,13 @@ import torch
 from PIL import Image
 
 from probscene.app.arguments import range_given
-from probscene.app.fitting.begin import FitRequest, ModelFile, TargetImages, begin, resume
+from probscene.app.fitting.begin import FitRequest, ModelFile, begin, resume
 from probscene.app.fitting.pipeline import open_target
 from probscene.app.fitting.presets import QUICK
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.sheet import write_sheet
 from probscene.app.progress import Display
+from probscene.app.targets import TargetImages
 from probscene.app.trial.jobs import Job
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures

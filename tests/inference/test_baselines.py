@@ -17,9 +17,9 @@ from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.grammar_vae import GrammarVAE
 from probscene.inference.guides.lstm import GUIDES, LSTMGuide, make_guide
 from probscene.inference.guides.pcfg import PCFG
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
 from probscene.inference.pretrain import pretrain
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts, ranked, weights
 
@@ -151,8 +151,10 @@ def test_the_score_function_brings_a_pcfg_to_the_closed_form():
         with pyro.plate("scenes", num_scenes, dim=-2):
             return SceneGraph(grammar, derive(grammar, structure, num_scenes, 40)).draw()
 
-    objective = ScoreFunction(lambda scenes: counted(scenes.derivation), KDELogRatio(), updates=3)
-    StructureTraining(program, guide, objective, real, 60, num_scenes=500, num_real=500).run()
+    objective = ScoreFunction(lambda scenes: counted(scenes.derivation), KDELogRatio(), ScoreFunctionConfig(updates=3))
+    StructureTraining(
+        program, guide, objective, real, StructureSchedule(batches=60, num_scenes=500, num_real=500)
+    ).run()
     again = torch.softmax(guide.weights.detach()[grammar.rules_of("Items")], 0)[0].item()
     closed = 1 - 1 / (1 + real.mean().item())  # a repeat's share of all expansions of Items
     assert again == pytest.approx(closed, abs=0.02)
@@ -173,8 +175,8 @@ def test_the_score_function_learns_what_needs_context(small, kind):
     def counted(scenes):
         return scenes.derivation.counts(len(small.grammar.kinds)).float()
 
-    objective = ScoreFunction(counted, KDELogRatio(0.2, None), updates=3)
-    StructureTraining(small.program, guide, objective, real, 60, num_scenes=300).run()
+    objective = ScoreFunction(counted, KDELogRatio(0.2, None), ScoreFunctionConfig(updates=3))
+    StructureTraining(small.program, guide, objective, real, StructureSchedule(batches=60, num_scenes=300)).run()
     assert distance() < 0.12 < before
 
 

@@ -7,9 +7,9 @@ from probscene.derive import derive_complete
 from probscene.inference.count_penalty import PriorCountPenalty
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
 from probscene.inference.pretrain import pretrain
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 
 
 def learnt(dots, penalty, seed=0):
@@ -21,10 +21,10 @@ def learnt(dots, penalty, seed=0):
     objective = ScoreFunction(
         penalty.append_counts(lambda scenes: scenes.derivation.counts(len(dots.grammar.kinds))[:, [red]].float()),
         penalty.add_to(KDELogRatio()),
-        updates=3,
+        ScoreFunctionConfig(updates=3),
     )
     real = torch.full((50, 1), 2.0) + (torch.rand(50, 1) < 0.3)
-    StructureTraining(dots, guide, objective, real, 40, num_scenes=100, seed=seed).run()
+    StructureTraining(dots, guide, objective, real, StructureSchedule(batches=40, num_scenes=100), seed=seed).run()
     counts = derive_complete(dots.grammar, guide.eval(), 2000, dots.max_steps)[0].counts(len(dots.grammar.kinds))
     return tuple(float(counts[:, dots.grammar.kind(name)].float().mean()) for name in ("red", "blue"))
 

@@ -1,5 +1,7 @@
 """The score-function gradient against the exact one, on a grammar that can be enumerated."""
 
+from dataclasses import replace
+
 import pyro
 import pytest
 import torch
@@ -9,7 +11,7 @@ from probscene.inference.divergence import MMD, JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
 from probscene.inference.guides.pcfg import PCFG
 from probscene.inference.guides.scenario import ScenarioGuide
-from probscene.inference.objective import BASELINES, ScoreFunction
+from probscene.inference.objective import BASELINES, ScoreFunction, ScoreFunctionConfig
 from probscene.scenarios import join
 from probscene.structure import StructurePrior
 
@@ -42,7 +44,7 @@ def test_gradient_is_the_exact_one(small, baseline, latents):
     guide = LSTMGuide(small.grammar, 4, hidden=8, num_latents=latents)
     log_q = guide.log_prob(small.derivations)
     exact = gradients((log_q.exp() * small.cost(small.features, None)).sum(), guide)
-    loss = ScoreFunction(small.observe, small.cost, baseline=baseline)
+    loss = ScoreFunction(small.observe, small.cost, ScoreFunctionConfig(baseline=baseline))
     assert_estimates(lambda: gradients(loss(small.program, guide, 4000, real=None), guide), exact)
 
 
@@ -61,8 +63,8 @@ def test_kde_gradient_tends_to_the_enumerated_one(small):
 
 def lagging(loss, average):
     """With a moving average that has not followed the costs."""
-    if loss.baseline == "moving_average":
-        loss.averages, loss.decay = {0: average, 1: average}, 1e-6
+    if loss.config.baseline == "moving_average":
+        loss.averages, loss.config = {0: average, 1: average}, replace(loss.config, decay=1e-6)
     return loss
 
 
@@ -94,9 +96,10 @@ def test_the_gradient_of_the_cost_is_exact_where_derivations_are_redrawn(dots, b
     assert 0.1 < float(q.detach().sum()) < 0.85
     exact = gradients((q * cost_of(derivations.counts(len(dots.grammar.kinds)))).sum() / q.sum(), guide)
     loss = ScoreFunction(
-        number_of_each(dots), lambda g, r: cost_of(g),
-        baseline=baseline, reject_weight=0.0, incompletion_weight=0.0,
-    )  # fmt: skip
+        number_of_each(dots),
+        lambda g, r: cost_of(g),
+        ScoreFunctionConfig(baseline=baseline, reject_weight=0.0, incompletion_weight=0.0),
+    )
     estimate = gradients(lagging(loss, -1.0)(dots, guide, 60_000, real=None), guide)
     assert float(torch.nn.functional.cosine_similarity(estimate, exact, 0)) >= 0.999
     assert float(estimate.norm() / exact.norm()) == pytest.approx(1, abs=0.05)
@@ -117,9 +120,11 @@ def test_scenarios_that_are_redrawn_descend_each_its_own_mean_cost(dots, baselin
     means = torch.stack([(q * cost)[scenario == s].sum() for s in (0, 1)]) / share
     exact = gradients(((share / share.sum()).detach() * means).sum(), guide)
     loss = ScoreFunction(
-        number_of_each(model), lambda g, r: cost_of(g), baseline=baseline,
-        reject_weight=0.0, incompletion_weight=0.0, strata=guide.strata,
-    )  # fmt: skip
+        number_of_each(model),
+        lambda g, r: cost_of(g),
+        ScoreFunctionConfig(baseline=baseline, reject_weight=0.0, incompletion_weight=0.0),
+        strata=guide.strata,
+    )
     estimate = gradients(lagging(loss, -1.0)(model, guide, 60_000, real=None), guide)
     assert float(torch.nn.functional.cosine_similarity(estimate, exact, 0)) >= 0.999
     assert float(estimate.norm() / exact.norm()) == pytest.approx(1, abs=0.05)
@@ -145,9 +150,10 @@ def test_the_gradient_of_all_terms_is_exact_where_derivations_may_not_end(dots, 
     penalty = failing ** (int(threshold) + 1)
     exact = gradients(expected + 0.7 * penalty + 0.5 * 0.2 * (failing / ends) ** 2, guide)
     loss = ScoreFunction(
-        number_of_each(dots), lambda g, r: (g * kinds).sum(1),
-        reject_weight=0.7, reject_threshold=threshold, incompletion_weight=0.2,
-    )  # fmt: skip
+        number_of_each(dots),
+        lambda g, r: (g * kinds).sum(1),
+        ScoreFunctionConfig(reject_weight=0.7, reject_threshold=threshold, incompletion_weight=0.2),
+    )
     runs = torch.stack([gradients(loss(dots, guide, 20_000, real=None), guide) for _ in range(6)])
     assert float(torch.nn.functional.cosine_similarity(runs.mean(0), exact, 0)) >= 0.999
     assert float(runs.mean(0).norm() / exact.norm()) == pytest.approx(1, abs=0.05)
@@ -170,9 +176,10 @@ def test_the_gradient_of_a_shared_mmd_is_exact_where_derivations_may_not_end(dot
     exact = gradients((q @ kernel @ q - 2 * q @ across) / 2 + penalties, guide)
 
     loss = ScoreFunction(
-        number_of_each(dots), MMD(1.0), "moving_average",
-        decay=1e-6, reject_weight=0.7, incompletion_weight=0.2,
-    )  # fmt: skip
+        number_of_each(dots),
+        MMD(1.0),
+        ScoreFunctionConfig(baseline="moving_average", decay=1e-06, reject_weight=0.7, incompletion_weight=0.2),
+    )
     failed = (failing / ends).detach().expand(2)
     q, pairs = q.detach(), torch.cartesian_prod(*2 * [torch.arange(len(features))])
     mean = float(q @ kernel @ q - 2 * q @ across) + float(
@@ -226,9 +233,10 @@ def test_the_gradient_of_each_objective_is_exact_where_derivations_may_not_end(d
     expected = (log_q.exp() * cost).sum() / ends
     exact = gradients(expected + 0.7 * failing**2 + 0.5 * 0.2 * (failing / ends) ** 2, guide)
     loss = ScoreFunction(
-        number_of_each(dots), objective,
-        reject_weight=0.7, reject_threshold=1.0, incompletion_weight=0.2,
-    )  # fmt: skip
+        number_of_each(dots),
+        objective,
+        ScoreFunctionConfig(reject_weight=0.7, reject_threshold=1.0, incompletion_weight=0.2),
+    )
 
     def estimate():
         real = features[torch.multinomial(target, 4000, replacement=True)]
@@ -246,7 +254,9 @@ def test_what_failed_attempts_cost_is_not_scaled(dots):
         pyro.set_rng_seed(7)
         guide = LSTMGuide(dots.grammar, 6, hidden=8)
         loss = ScoreFunction(
-            lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)), scale=scale
+            lambda scenes: torch.zeros(len(scenes.failures), 1),
+            lambda g, r: torch.zeros(len(g)),
+            ScoreFunctionConfig(scale=scale),
         )
         grads.append(gradients(loss(dots, guide, 500, real=None), guide))
     assert grads[0].any() and torch.equal(*grads)
@@ -261,9 +271,10 @@ def test_leaked_probability_is_drawn_back(dots):
     assert failures > 0.05
     exact = gradients(0.5 * 3.0 * failures**2, guide)
     loss = ScoreFunction(
-        lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
-        reject_weight=0.0, incompletion_weight=3.0,
-    )  # fmt: skip
+        lambda scenes: torch.zeros(len(scenes.failures), 1),
+        lambda g, r: torch.zeros(len(g)),
+        ScoreFunctionConfig(reject_weight=0.0, incompletion_weight=3.0),
+    )
     assert_estimates(lambda: gradients(loss(dots, guide, 4000, real=None), guide), exact)
 
 
@@ -274,6 +285,6 @@ def test_an_anchor_draws_toward_its_policy(small):
     log_q = guide.log_prob(small.derivations)
     exact = gradients(0.5 * (log_q.exp() * (log_q - prior.log_prob(small.derivations))).sum(), guide)
     loss = ScoreFunction(
-        small.observe, lambda g, r: torch.zeros(len(g)), prior=prior, prior_kl_weight=0.5
-    )  # fmt: skip
+        small.observe, lambda g, r: torch.zeros(len(g)), ScoreFunctionConfig(prior_kl_weight=0.5), prior=prior
+    )
     assert_estimates(lambda: gradients(loss(small.program, guide, 4000, real=None), guide), exact)

@@ -10,8 +10,8 @@ from probscene.app.fitting.presets import QUICK
 from probscene.errors import ModelError, ProbsceneError
 from probscene.inference.divergence import JensenShannon, KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import MAX_LOG_RATIO, ScoreFunction
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.objective import MAX_LOG_RATIO, ScoreFunction, ScoreFunctionConfig
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.structure import StructurePrior, counts
 
 
@@ -19,7 +19,7 @@ def test_svi_learns_the_target_distribution(small):
     pyro.set_rng_seed(0)
     guide = LSTMGuide(small.grammar, 4, hidden=16)
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
-    loss = ScoreFunction(small.observe, KDELogRatio(0.2, None), updates=2)
+    loss = ScoreFunction(small.observe, KDELogRatio(0.2, None), ScoreFunctionConfig(updates=2))
 
     def distance():
         return 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item()
@@ -63,9 +63,19 @@ def test_each_objective_learns_from_samples(small, objective):
     guide = LSTMGuide(small.grammar, 4, hidden=16)
     config = QUICK.set("divergence.variance=0.2", "divergence.marginal_variance=none").with_divergence(objective)
     training = config.structure
-    loss = ScoreFunction(small.observe, config.make_divergence(), training.baseline, updates=training.updates)
+    loss = ScoreFunction(
+        small.observe,
+        config.make_divergence(),
+        ScoreFunctionConfig(baseline=training.baseline, updates=training.updates),
+    )
     real = small.features[torch.multinomial(small.target, 3000, replacement=True)]
-    StructureTraining(small.program, guide, loss, real, 60, num_scenes=300, learning_rate=training.learning_rate).run()
+    StructureTraining(
+        small.program,
+        guide,
+        loss,
+        real,
+        StructureSchedule(batches=60, num_scenes=300, learning_rate=training.learning_rate),
+    ).run()
     with torch.no_grad():
         assert 0.5 * (guide.log_prob(small.derivations).exp() - small.target).abs().sum().item() < 0.12
 
@@ -73,7 +83,9 @@ def test_each_objective_learns_from_samples(small, objective):
 def test_value_is_the_mean_cost_and_batches_are_reused(small):
     guide = LSTMGuide(small.grammar, 4, hidden=8)
     seen = []
-    loss = ScoreFunction(lambda scenes: seen.append(1) or small.observe(scenes), small.cost, updates=3)
+    loss = ScoreFunction(
+        lambda scenes: seen.append(1) or small.observe(scenes), small.cost, ScoreFunctionConfig(updates=3)
+    )
     values = [loss(small.program, guide, 50, real=None).item() for _ in range(6)]
     assert len(seen) == 2
     assert values[0] == values[1] == values[2] == pytest.approx(values[0])
@@ -83,7 +95,7 @@ def test_value_is_the_mean_cost_and_batches_are_reused(small):
 def test_moving_average_is_the_papers(small):
     """b <- 0.05 new + 0.95 b, from the first batch's mean."""
     guide = LSTMGuide(small.grammar, 4, hidden=8)
-    loss = ScoreFunction(small.observe, small.cost, baseline="moving_average")
+    loss = ScoreFunction(small.observe, small.cost, ScoreFunctionConfig(baseline="moving_average"))
     expected = None
     for _ in range(4):
         loss(small.program, guide, 20, real=None)
@@ -95,9 +107,11 @@ def test_moving_average_is_the_papers(small):
 
 def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
     loss = ScoreFunction(
-        lambda scenes: torch.zeros(len(scenes.failures), 1), lambda g, r: torch.zeros(len(g)),
-        prior=StructurePrior(dots.grammar, Things=counts(1.0)), prior_kl_weight=0.1,
-    )  # fmt: skip
+        lambda scenes: torch.zeros(len(scenes.failures), 1),
+        lambda g, r: torch.zeros(len(g)),
+        ScoreFunctionConfig(prior_kl_weight=0.1),
+        prior=StructurePrior(dots.grammar, Things=counts(1.0)),
+    )
     pyro.set_rng_seed(5)
     loss(dots, LSTMGuide(dots.grammar, 12, hidden=8), 200, real=None)
     something = loss.batch.derivation.lengths > 2
@@ -107,7 +121,7 @@ def test_what_an_anchor_never_does_costs_a_bounded_amount(dots):
 def test_evaluating_the_loss_changes_nothing(small):
     """Neither the batch, nor how many updates it has left, nor a moving average."""
     guide = LSTMGuide(small.grammar, 4, hidden=8)
-    loss = ScoreFunction(small.observe, small.cost, baseline="moving_average", updates=3)
+    loss = ScoreFunction(small.observe, small.cost, ScoreFunctionConfig(baseline="moving_average", updates=3))
     svi = SVI(small.program, guide, Adam({"lr": 1e-3}), loss=loss)
     first = svi.evaluate_loss(40, real=None)
     assert loss.batch is None and loss.averages == {} and first == pytest.approx(2.0, abs=1.5)
@@ -123,7 +137,7 @@ def test_evaluating_the_loss_changes_nothing(small):
 
 def test_other_arguments_start_another_batch(small):
     guide = LSTMGuide(small.grammar, 4, hidden=8)
-    loss = ScoreFunction(small.observe, small.cost, updates=5)
+    loss = ScoreFunction(small.observe, small.cost, ScoreFunctionConfig(updates=5))
     real = small.features, small.features + 1
     drawn = []
     for num, given in ((30, real[0]), (30, real[0].clone()), (20, real[0]), (20, real[1]), (20, real[1])):
@@ -142,7 +156,7 @@ def test_a_guide_that_is_none_is_told_what_is_missing(small):
         loss(small.program, lambda num_scenes: None, 20, real=None)
 
 
-def test_bad_arguments_are_named(small):
+def test_bad_arguments_are_named():
     for arguments in (
         {"baseline": "median"},
         {"updates": 0},
@@ -151,4 +165,4 @@ def test_bad_arguments_are_named(small):
         {"reject_threshold": -1},
     ):
         with pytest.raises(ProbsceneError, match="expected"):
-            ScoreFunction(small.observe, small.cost, **arguments)
+            ScoreFunctionConfig(**arguments)

@@ -11,10 +11,10 @@ from probscene.derive import derive_complete
 from probscene.grammar import Grammar
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
 from probscene.inference.pretrain import pretrain
 from probscene.inference.render_cache import RenderCache
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.model import Groups, SceneModel
 from probscene.sampling import run_program, sample, seed_everything
 from probscene.structure import StructurePrior, counts
@@ -92,7 +92,12 @@ def trainer(dots, cache, batches):
     observe = Observe(dots)
     objective = ScoreFunction(observe if cache is None else cache.wrap(observe), KDELogRatio())
     return observe, StructureTraining(
-        dots, guide, objective, torch.full((50, 2), 2.0), batches, num_scenes=40, render_cache=cache
+        dots,
+        guide,
+        objective,
+        torch.full((50, 2), 2.0),
+        StructureSchedule(batches=batches, num_scenes=40),
+        render_cache=cache,
     )
 
 
@@ -132,9 +137,13 @@ def test_learning_ends_as_near_with_a_tenth_of_the_renders(dots):
         guide = LSTMGuide(dots.grammar, dots.max_steps, hidden=16)
         pretrain(guide, dots.prior, num_derivations=1000, epochs=3, learning_rate=5e-3)
         observe = Observe(dots)
-        objective = ScoreFunction(cache.wrap(observe) if cache else observe, KDELogRatio(), updates=3)
+        objective = ScoreFunction(
+            cache.wrap(observe) if cache else observe, KDELogRatio(), ScoreFunctionConfig(updates=3)
+        )
         real = torch.tensor([[2.0, 1.0]]).repeat(50, 1) + 0.1 * torch.randn(50, 2)
-        StructureTraining(dots, guide, objective, real, 40, num_scenes=100, render_cache=cache).run()
+        StructureTraining(
+            dots, guide, objective, real, StructureSchedule(batches=40, num_scenes=100), render_cache=cache
+        ).run()
         drawn = derive_complete(dots.grammar, guide.eval(), 2000, dots.max_steps)[0].counts(2)
         return drawn.float().mean(0), observe.seen
 

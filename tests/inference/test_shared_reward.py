@@ -4,7 +4,7 @@ import torch
 
 from probscene.app.fitting.presets import QUICK
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
 
 
 def test_a_shared_reward_keeps_a_gradient(small):
@@ -14,7 +14,7 @@ def test_a_shared_reward_keeps_a_gradient(small):
     loss = ScoreFunction(
         lambda scenes: scenes.derivation.counts(len(small.grammar.kinds)).float(),
         mmd.divergence,
-        mmd.structure.baseline,
+        ScoreFunctionConfig(baseline=mmd.structure.baseline),
     )
     for _ in range(2):
         loss(small.program, LSTMGuide(small.grammar, 4, hidden=8), 50, real=small.features[:1] + torch.randn(30, 1))

@@ -5,9 +5,9 @@ from probscene.derive import derive_complete
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
 from probscene.inference.pretrain import pretrain
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 
 
 def learner(small, batches, seed=5, divergence=None, **options):
@@ -16,11 +16,10 @@ def learner(small, batches, seed=5, divergence=None, **options):
     loss = ScoreFunction(
         lambda scenes: scenes.derivation.counts(len(small.grammar.kinds)).float(),
         divergence or KDELogRatio(),
-        baseline="moving_average",
-        updates=2,
+        ScoreFunctionConfig(baseline="moving_average", updates=2),
     )
     real = small.features[torch.multinomial(small.target, 200, replacement=True)]
-    return StructureTraining(small.program, guide, loss, real, batches, num_scenes=40, seed=seed, **options)
+    return StructureTraining(small.program, guide, loss, real, StructureSchedule(batches, 40, **options), seed)
 
 
 @pytest.mark.parametrize("num_real", [None, 50])

@@ -21,8 +21,8 @@ from probscene.inference.features.photographs.training import PretrainedCountTra
 from probscene.inference.features.presence import PresenceNet, PresenceTraining
 from probscene.inference.features.projection import Projected, ProjectionTraining
 from probscene.inference.guides.lstm import LSTMGuide
-from probscene.inference.objective import ScoreFunction
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.inference.training import batch_seed
 from probscene.sampling import seed_everything
 
@@ -76,10 +76,10 @@ def structure(dots, small, divergence=None, **options):
     loss = ScoreFunction(
         lambda scenes: scenes.derivation.counts(len(small.grammar.kinds)).float(),
         divergence or KDELogRatio(),
-        updates=2,
+        ScoreFunctionConfig(updates=2),
     )
     real = small.features[torch.multinomial(small.target, 200, replacement=True)]
-    return StructureTraining(small.program, guide, loss, real, 4, num_scenes=40, seed=5, **options), guide
+    return StructureTraining(small.program, guide, loss, real, StructureSchedule(4, num_scenes=40, **options), 5), guide
 
 
 ALL = {
@@ -178,7 +178,7 @@ def test_pyros_own_loop_takes_the_same_steps(dots, small, cosine):
     trainer.run()
     torch.manual_seed(0)
     other, guide = structure(dots, small)
-    loss, updates, batches = other.objective, other.objective.updates, other.total
+    loss, updates, batches = other.objective, other.objective.config.updates, other.total
 
     def rate(step):
         return 0.5 * (1 + math.cos(math.pi * step / (updates * batches))) if cosine else 1.0

@@ -18,6 +18,7 @@ Axis letters: N images, C classes, h w places, S scopes, R rules, V renders that
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -181,6 +182,11 @@ class PretrainedCountNet(nn.Module):
     def bind(self, fingerprint: str) -> None:
         """Say which images heads and rules are suited to, see ``taught_by``; in hexadecimal."""
         self.taught_by.copy_(torch.tensor(list(bytes.fromhex(fingerprint)), dtype=torch.uint8))
+
+    @property
+    def map_channels(self) -> Sequence[int]:
+        """Of each map."""
+        return self.frozen[0].channels
 
     def places(self, stride: int) -> tuple[int, int]:
         """h and w of places so far apart."""

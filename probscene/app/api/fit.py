@@ -14,12 +14,12 @@ from ..arguments import checked_seed
 from ..evaluation.diagnose import FitDiagnostics, diagnose
 from ..evaluation.evaluate import warn_of_saturated_lists
 from ..fitting import begin as beginning
-from ..fitting.begin import FitRequest, ModelFile, TargetImages
+from ..fitting.begin import FitRequest, ModelFile
 from ..fitting.config import FitConfig
 from ..fitting.pipeline import Begun, Execution, carry_out, open_target
 from ..fitting.presets import preset
 from ..progress import Display
-from ..targets import Target
+from ..targets import Target, TargetImages
 from ..workers.cluster import connected
 from ..workers.processes import end_if_starting
 from .calls import display

@@ -1,6 +1,5 @@
 """``probscene label``: which images to label next, and the sheet to count in."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -8,18 +7,19 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import DataError
-from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.base import FeatureNet, objects_counted
 from probscene.model import SceneModel
 
 from ..arguments import checked_seed, positive
 from ..evaluation.estimate import class_counts
+from ..fitting.begin import ModelFile
 from ..fitting.run import RunFolder, is_run
 from ..labels.partial_labels import PartialLabels, read_partial_labels
 from ..labels.selection import propose
 from ..labels.sheet import Sheet, check_empty, write_sheet
 from ..loading import load_model
 from ..progress import Display, Progress
-from ..targets import Target, open_images
+from ..targets import Target, TargetImages, open_images
 from .calls import display
 
 CONSIDERED = 2000  # images at most that are looked at, evenly spread over all
@@ -27,30 +27,25 @@ AT_ONCE = 16
 
 
 def label(
-    source: RunFolder | SceneModel | Path | str,
-    target: Target,
+    source: RunFolder | SceneModel | ModelFile | Path | str,
+    target: TargetImages | Target,
     out: Path | str,
     number: int = 10,
     labels: Path | str | None = None,
+    *,
     seed: int = 0,
-    skip_bad: bool = False,
-    assets: Path | str | None = None,
     progress: bool = True,
-    value_range: Sequence[float] | None = None,
 ) -> Sheet:
     """Propose which images to label next, see ``labels.selection``, and write the sheet to count in.
 
     Args:
         source: a run, whose network's counts say which images to take, as far as it has some; or a model.
-        target: the images.
+        target: the images. Where it names no range of values of images of 16 bits, a run's is taken.
         out: the folder to write, new or empty.
         number: images to propose; fewer where fewer are left.
         labels: of images that are labelled already, see ``read_partial_labels``; they are not proposed, and the sheet
             asks for the same classes and has their counts, too.
         seed: of the first image.
-        skip_bad: leave out files that do not decode.
-        assets: a folder that a model is drawn with.
-        value_range: of images of 16 bits, see ``ImageFolder``; the run's, if it has one, where None.
 
     Raises:
         ProbsceneError: the folder holds files already, or all images are labelled; see ``read_partial_labels`` and
@@ -60,11 +55,13 @@ def label(
     positive(number, "images")
     checked_seed(seed)
     check_empty(out)
-    run, model = _source(source, None if assets is None else Path(assets))
+    run, model = _source(source)
+    given = target if isinstance(target, TargetImages) else TargetImages(target)
     with display(progress) as show:
+        value_range = given.value_range
         if value_range is None and run is not None:
             value_range = run.record.get("value_range")
-        images = open_images(target, model, skip_bad, show, value_range)
+        images = open_images(given.source, model, bool(given.skip_bad), show, value_range)
         few = None if labels is None else read_partial_labels(Path(labels), model, images, min_images=1)
         rows = _proposed(run, model, images, number, few, seed, show)
     if not rows:
@@ -73,10 +70,15 @@ def label(
     return write_sheet(out, images, rows, classes, model.name, _cells(images, few))
 
 
-def _source(source: RunFolder | SceneModel | Path | str, assets: Path | None) -> tuple[RunFolder | None, SceneModel]:
-    if not isinstance(source, RunFolder | SceneModel):
-        source = RunFolder.at(Path(source)) if is_run(str(source)) else load_model(str(source), assets)
-    return (source, source.model) if isinstance(source, RunFolder) else (None, source)
+def _source(source: RunFolder | SceneModel | ModelFile | Path | str) -> tuple[RunFolder | None, SceneModel]:
+    if isinstance(source, SceneModel):
+        return None, source
+    if not isinstance(source, RunFolder):
+        file = source if isinstance(source, ModelFile) else ModelFile(str(source))
+        if not is_run(str(file.reference)):
+            return None, load_model(str(file.reference), file.assets)
+        source = RunFolder.at(Path(str(file.reference)))
+    return source, source.model
 
 
 def _proposed(
@@ -104,7 +106,7 @@ def _proposed(
     looks, *found = _seen(images, considered, nets, show)
     counts = None
     if found:
-        counts = class_counts(model, tuple(nets[1].names), found[0] * getattr(nets[1], "unit", 1.0))
+        counts = class_counts(model, tuple(nets[1].names), objects_counted(nets[1], found[0]))
     before = torch.tensor([considered.index(row) for row in labelled])
     chosen = propose(number, looks, counts, before, seed)
     return [considered[i] for i in chosen]

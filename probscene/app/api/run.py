@@ -14,14 +14,14 @@ from probscene.sampling import Scenes, sample
 
 from ..arguments import checked_seed, positive
 from ..chunks import chunk_randomness
-from ..datasets.generate import Dataset
+from ..datasets.generate import Dataset, DatasetOptions
 from ..evaluation.evaluate import Evaluation
-from ..evaluation.labels import Labels
+from ..evaluation.labels import Labels, TargetLabels
 from ..files import make_folder
 from ..fitting.plugins import GuideMaker, Plugins, as_divergence, as_features, as_guide_maker
 from ..fitting.run import RunFolder
 from ..fitting.store import check_free
-from ..targets import Target
+from ..targets import Target, TargetImages
 from . import calls
 
 
@@ -80,21 +80,20 @@ class Run(RunFolder):
         num: int,
         out: Path | str,
         format: str | Iterable[str] = "coco",
+        options: DatasetOptions | None = None,
+        *,
         seed: int = 0,
-        workers: int = 1,
+        workers: int | str = 1,
         progress: bool = True,
-        min_visible: float = 0.0,
-        shard: str | None = None,
-        box_margin: int = 0,
-        amodal: bool = False,
-        values: str | Iterable[str] = (),
     ) -> Dataset:
         """Write a labelled dataset of the learnt structures, see ``generate``."""
-        more = {"box_margin": box_margin, "amodal": amodal, "values": values}
-        return calls.generate(self, num, out, format, seed, workers, progress, None, min_visible, shard, **more)
+        return calls.generate(self, num, out, format, options, seed=seed, workers=workers, progress=progress)
 
     def evaluate(
-        self, target: Target | None = None, labels: Path | str | Labels | None = None, **options: Any
+        self,
+        target: TargetImages | Target = None,
+        labels: TargetLabels | Path | str | Labels | None = None,
+        **options: Any,
     ) -> Evaluation:
         """Compare what was learnt with the target, see ``evaluate``."""
         return calls.evaluate(self, target, labels, **options)

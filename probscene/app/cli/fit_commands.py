@@ -75,11 +75,12 @@ def fit(
     from rich.console import Console
 
     from ..api.fit import DEFAULT, fit_and_diagnose, fit_request
-    from ..fitting.begin import ModelFile, TargetImages
+    from ..fitting.begin import ModelFile
     from ..fitting.config import configuration, parameter_choice
     from ..fitting.pipeline import Execution
     from ..fitting.presets import preset as named
     from ..loading import with_scenarios
+    from ..targets import TargetImages
     from ..views.verdict_text import show_parts
 
     config, method = None, parameter_choice(learn, parameters)

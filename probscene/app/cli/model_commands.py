@@ -86,7 +86,9 @@ def label(
     """Propose which images to label next, and write the sheet in which to count."""
     from ..api import label
     from ..arguments import range_given
+    from ..fitting.begin import ModelFile
+    from ..targets import TargetImages
 
-    chosen = range_given(value_range)
-    sheet = label.label(model_or_run, target, out, number, labels, seed, skip_bad, assets, value_range=chosen)
+    images = TargetImages(target, skip_bad, range_given(value_range))
+    sheet = label.label(ModelFile(model_or_run, assets), images, out, number, labels, seed=seed)
     print(f"Count in {len(sheet.names)} pictures: open {sheet.page} in a browser, or fill in {sheet.table}")

@@ -104,7 +104,7 @@ def evaluate(
 
     from ..arguments import number_or_all, range_given
     from ..evaluation import diagnose as verdict
-    from ..evaluation.evaluate import evaluate
+    from ..evaluation.evaluate import ImageComparison, evaluate
     from ..evaluation.labels import read_labels
     from ..files import make_folder, write_json
     from ..fitting.run import RunFolder
@@ -121,7 +121,8 @@ def evaluate(
     with Display() as show:
         images = open_images(target, opened.model, opened.record["skip_bad"], show, chosen)
         truth = None if labels is None else read_labels(labels, opened.model, images, some_labels, min_height)
-        found = evaluate(opened, images, truth, show, num, features=features or (), images=most, visible=visible)
+        compared = ImageComparison(features or (), most)
+        found = evaluate(opened, images, truth, show, num, compared=compared, visible=visible)
         judged = verdict.diagnose(opened, images, show, scenes, found) if scenes != 0 else None
     console = Console(highlight=False)
     if judged is not None:
@@ -145,8 +146,10 @@ def report(
 ) -> None:
     """Write one self-contained HTML page about a run."""
     from ..api import calls
+    from ..evaluation.labels import TargetLabels
 
-    path = calls.report(run, out, labels, num, scenes, some_labels=some_labels, visible=visible)
+    truth = None if labels is None else TargetLabels(labels, some_labels)
+    path = calls.report(run, out, truth, num=num, scenes=scenes, visible=visible)
     print(f"The report is {path}")
 
 
@@ -171,12 +174,14 @@ def compare(
     from rich.console import Console
 
     from ..api import calls
+    from ..evaluation.labels import TargetLabels
     from ..files import make_folder, write_json
     from ..views import tables
 
     if json is not None:
         make_folder(json.parent)
-    found = calls.compare(runs, target, labels, out, num, min_height, some_labels=some_labels, visible=visible)
+    truth = None if labels is None else TargetLabels(labels, some_labels, min_height)
+    found = calls.compare(runs, target, truth, out, num=num, visible=visible)
     tables.show_comparison(found, Console(highlight=False))
     print(f"The picture is {out}")
     if json is not None:

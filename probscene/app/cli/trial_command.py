@@ -76,7 +76,7 @@ def trial(
     from ..api import calls
     from ..arguments import range_given
     from ..trial.tables import show
-    from ..trial.trial import Budget
+    from ..trial.trial import GeneratedSets, TrainingBudget, TrialOptions
 
     named: dict[str, str | Path] = {}
     for words in sets or []:
@@ -86,29 +86,25 @@ def trial(
         if name.strip() in named:
             raise ProbsceneError(f"expected a name for each set of a trial, got {name.strip()!r} twice; rename one.")
         named[name.strip()] = said.strip()
-    found = calls.trial(
-        test,
-        out,
-        named,
+    generated = None
+    if run is not None:
+        generated = GeneratedSets(run, tuple(_words(sources)), generate, min_visible, box_margin)
+    options = TrialOptions(
         hold_out=hold_out,
         real=real,
         numbers=None if real_numbers is None else _numbers(real_numbers),
-        run=run,
-        sources=_words(sources),
-        generated=generate,
-        min_visible=min_visible,
-        box_margin=box_margin,
+        generated=generated,
         classes=None if classes is None else _words(classes),
         detector=detector,
-        budget=Budget(iterations, batch, rate, finetune_fraction, warm_start),
+        budget=TrainingBudget(iterations, batch, rate, finetune_fraction, warm_start),
         size=None if size is None else _size(size),
         seeds=seeds,
         seed=seed,
         baselines=baseline or (),
         resamples=resamples,
-        workers=workers,
         value_range=range_given(value_range),
     )
+    found = calls.trial(test, out, named, options, workers=workers)
     show(found, Console(highlight=False))
     print(f"All figures are in {out / 'results.json'}, the picture is {out / 'results.png'}")
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from probscene.inference.features.base import objects_counted
 from probscene.inference.parameters.calibration import LOW_SKILL
 from probscene.inference.parameters.sites import OPTED_OUT, find_sites
 from probscene.inference.statistics.residual import Grade, ResidualRatio, Sample, residual_ratio, worst_grade
@@ -234,10 +235,10 @@ def _samples(
 
 def _counts(run: RunFolder, features: dict[str, Tensor], seed: int) -> dict[str, str]:
     """The grade of each counted class's numbers, in words."""
-    unit = getattr(run.network(), "unit", 1.0)
+    net = run.network()
     counts: dict[str, np.ndarray] = {}
     for source, rows in features.items():
-        of_classes = class_counts(run.model, run.feature_names, rows * unit)
+        of_classes = class_counts(run.model, run.feature_names, rows if net is None else objects_counted(net, rows))
         if of_classes is not None:
             counts[source] = of_classes.clamp(min=0).round().double().numpy()
     grades: dict[str, str] = {}

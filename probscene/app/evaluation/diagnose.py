@@ -19,7 +19,7 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.features.base import Examples, FeatureNet
+from probscene.inference.features.base import EmbedsLabels, Examples, FeatureNet, needs_images
 from probscene.inference.statistics.energy import MIN_IMAGES
 from probscene.inference.statistics.verdict import StructureVerdict, structure_verdict
 from probscene.policy import Policy
@@ -136,7 +136,8 @@ def diagnose(
         progress("judging", done, total, "")
 
     advance(0)
-    nets = [_ThumbnailNet(net, advance, keep) for keep in (True, False)]
+    made = _LabelThumbnailNet if isinstance(net, EmbedsLabels) else _ThumbnailNet
+    nets = [made(net, advance, keep) for keep in (True, False)]
     draws = [1 if policy.suits else training.draws_per_structure for policy in policies]
     scenes = [_features(run, *source, num, seed) for source in zip(policies, nets, draws, strict=True)]
     real = _real(run, target, net, advance)
@@ -196,22 +197,29 @@ class _ThumbnailNet:
     def __init__(self, net: FeatureNet, callback: Callable[[int], None], keep: bool):
         self.net, self.callback, self.keep = net, callback, keep
         self.names, self.thumbnails = net.names, []
-        if hasattr(net, "embed_from_labels"):
-            self.embed_from_labels = self._embed_from_labels
-            self.uses_labels = not keep and getattr(net, "uses_labels", False)
 
     def embed(self, images: Tensor) -> Tensor:
         self._record(images)
         return self.net.embed(images)
 
-    def _embed_from_labels(self, drawn: Examples) -> Tensor:
-        self._record(drawn.image)
-        return self.net.embed_from_labels(drawn)  # pyright: ignore[reportAttributeAccessIssue]: asked for before
-
     def _record(self, images: Tensor) -> None:
         if self.keep:
             self.thumbnails += [shrunk(image, THUMBNAIL_SIZE).copy() for image in pixels(images)]
         self.callback(len(images))
+
+
+class _LabelThumbnailNet(_ThumbnailNet):
+    """Of a network that embeds renders from their labels."""
+
+    net: EmbedsLabels
+
+    @property
+    def uses_labels(self) -> bool:
+        return not self.keep and not needs_images(self.net)
+
+    def embed_from_labels(self, drawn: Examples) -> Tensor:
+        self._record(drawn.image)
+        return self.net.embed_from_labels(drawn)
 
 
 def _features(run: RunFolder, policy: Policy, net: FeatureNet, draws_per_structure: int, num: int, seed: int) -> Tensor:

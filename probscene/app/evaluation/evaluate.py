@@ -23,6 +23,7 @@ import torch
 import probscene
 from probscene.dataset import Images
 from probscene.errors import ProbsceneError
+from probscene.inference.features.base import objects_counted
 from probscene.inference.statistics.count_metrics import Tally, histogram, pooled_shares, total_variation, wasserstein
 from probscene.policy import Policy
 
@@ -199,6 +200,19 @@ class Evaluation:
         }
 
 
+@dataclass(frozen=True)
+class ImageComparison:
+    """What images are compared by.
+
+    Args:
+        networks: whose features give KID and FID, see ``scene_features.network``; none by default, as it renders.
+        num_images: at most, of each side; all where None.
+    """
+
+    networks: Sequence[str] = ()
+    num_images: int | None = MAX_IMAGES
+
+
 def evaluate(
     run: RunFolder,
     target: Images | None,
@@ -206,8 +220,7 @@ def evaluate(
     progress: Progress,
     num: int = 10000,
     seed: int = 0,
-    features: Sequence[str] = (),
-    images: int | None = MAX_IMAGES,
+    compared: ImageComparison = ImageComparison(),
     visible: Visible | None = None,
 ) -> Evaluation:
     """Count sampled structures of the prior and of the guide, the truth's and the network's estimate.
@@ -216,8 +229,7 @@ def evaluate(
         target: its images; without them there is only the run's own record of what the network saw.
         truth: the labels of the target's images.
         num: structures a source; see ``visible.MAX_RENDERED`` where they are rendered for it, and ``MAX_RENDERS_READ``.
-        features: networks to compare images by, see ``scene_features.network``; none by default, as it renders.
-        images: how many are compared at most, where they are; all where None.
+        compared: what images are compared by, if by anything.
         visible: least visible shares of what is counted in rendered scenes; those of the run where this is None.
 
     Raises:
@@ -226,7 +238,7 @@ def evaluate(
     """
     if num < 1:
         raise ProbsceneError(f"expected a positive number of scenes, got {num}.")
-    if features and target is None:
+    if compared.networks and target is None:
         raise ProbsceneError("expected the target's images to compare features with, got none.")
     policies = {**baseline_policies(run.model), LEARNT: run.guide}
     criterion, notes = visibility(run.model, run, truth, visible)
@@ -238,9 +250,9 @@ def evaluate(
         progress("counting", done, len(policies) * num_counted(criterion, num), "")
 
     columns = list(range(len(run.model.classes))) if truth is None else truth.columns(run.model)
-    compared = {}
-    if features and target is not None:
-        compared = image_distances(run, target, features, progress, images, seed)
+    distances = {}
+    if compared.networks and target is not None:
+        distances = image_distances(run, target, compared.networks, progress, compared.num_images, seed)
     sources, likelihoods = {}, {}
     for name, policy in policies.items():
         found = count_scenes(run.model, policy, num, seed, criterion, advance)
@@ -262,7 +274,7 @@ def evaluate(
     beyond = _unreachable_counts(run, classes, sources, target, criterion is not None)
     errors = {} if truth is None else _errors(run, classes, truth, reading)
     boxes = None if truth is None else truth.boxes
-    return Evaluation(run, path, classes, sources, likelihoods, compared, notes, short, beyond, errors, read, boxes)
+    return Evaluation(run, path, classes, sources, likelihoods, distances, notes, short, beyond, errors, read, boxes)
 
 
 def _unreachable_counts(
@@ -320,7 +332,7 @@ def features_read(run: RunFolder, target: Images | None, progress: Progress) -> 
     net = own_net(run)
     if features is None and target is not None:
         features = features_in(run, target, net, advance)
-    return None if features is None else features * getattr(net, "unit", 1.0)
+    return None if features is None else objects_counted(net, features)
 
 
 def _estimate(run: RunFolder, read: torch.Tensor) -> Source | None:
@@ -363,7 +375,7 @@ def renders_read(
     found = {}
     for name, policy in policies.items():
         features = features_of(run, policy, num, net, seed, advance)
-        read = estimate_counts(run.model, run.feature_names, features * getattr(net, "unit", 1.0))
+        read = estimate_counts(run.model, run.feature_names, objects_counted(net, features))
         assert read is not None
         found[name] = Source(*read)
     return found

@@ -10,6 +10,7 @@ Labels with boxes of COCO, KITTI and YOLO, see ``labels.reading``.
 
 import json
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,6 +57,26 @@ class Labels(NamedTuple):
     def columns(self, model: SceneModel) -> list[int]:
         """Of the model's classes, the C that are labelled, by number."""
         return [model.classes.index(name) for name in self.classes or model.classes]
+
+
+@dataclass(frozen=True)
+class TargetLabels:
+    """Labels of a target's images, and how they are read.
+
+    Args:
+        source: a ``counts.csv``, COCO's ``.json``, ``provenance.jsonl``, KITTI's folder ``label_2`` or YOLO's
+            ``labels``.
+        some: they need not be of all images.
+        min_height: of objects that labels with boxes count, pixels.
+    """
+
+    source: Path | str
+    some: bool = False
+    min_height: float = 0.0
+
+    def read(self, model: SceneModel, target: Images) -> "Labels":
+        """The labels, see ``read_labels``."""
+        return read_labels(Path(self.source), model, target, self.some, self.min_height)
 
 
 def read_labels(path: Path, model: SceneModel, target: Images, some: bool = False, min_height: float = 0.0) -> Labels:

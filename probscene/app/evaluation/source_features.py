@@ -15,7 +15,7 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import ModelError
-from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.base import FeatureNet, LocatesObjects
 from probscene.inference.features.counting.layout import LEAST, objects, scales
 from probscene.inference.statistics.domain_shift import Patches
 from probscene.inference.statistics.residual import Sample
@@ -121,16 +121,16 @@ def num_embedded(run: RunFolder, target: Images, num: int) -> int:
 def located_classes(run: RunFolder, net: FeatureNet) -> tuple[str, ...]:
     """The classes whose objects the network finds; none where it does not say where they are."""
     own = inner(net)
-    there = getattr(own, "classes", ()) if hasattr(own, "cells") else ()
+    there = own.classes if isinstance(own, LocatesObjects) else ()
     return tuple(name for name in run.model.classes if name in there and name not in (*run.model.stuff, *run.unread))
 
 
 def _cells(run: RunFolder, net: FeatureNet, images: Tensor) -> Tensor | None:
     """``(N, C, h, w)`` of the ``located_classes``."""
     names, own = located_classes(run, net), inner(net)
-    if not names:
+    if not names or not isinstance(own, LocatesObjects):
         return None
-    classes, found = own.classes, own.cells(images)  # pyright: ignore[reportAttributeAccessIssue]: asked for before
+    classes, found = own.classes, own.cells(images)
     shape = tuple(found.shape)
     if len(shape) != 4 or shape[:2] != (len(images), len(classes)) or not (found >= 0).all():
         raise ModelError(

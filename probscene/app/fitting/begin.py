@@ -1,7 +1,6 @@
 """The beginning of a fit: a new run, or one that is taken up again. Nothing is learnt here."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from ..loading import drawn_with, folder_digest, lasting_reference, load_model, 
 from ..modules import file_digest, module_digests
 from ..neighbours import neighbours
 from ..progress import Display
-from ..targets import Target, lasting_target, open_images, say_notes
+from ..targets import TargetImages, lasting_target, open_images, say_notes
 from .config import Auto, FitConfig, takers_of_labels
 from .pipeline import Begun, check_target, open_target
 from .plugins import in_memory, is_file_part, part_file
@@ -44,22 +43,6 @@ class ModelFile:
 
     reference: str | None
     assets: Path | None = None
-
-
-@dataclass(frozen=True)
-class TargetImages:
-    """The images to learn from, and how they are read.
-
-    Args:
-        source: a folder, a list of files, or images in memory, see ``open_images``.
-        skip_bad: leave out files that do not decode.
-        value_range: the values of images of 16 bits that are read as black and white, such as ``(0, 4095)``; where
-            None, what is found in the images, see ``ImageFolder``. The run keeps it.
-    """
-
-    source: Target
-    skip_bad: bool | None = None
-    value_range: Sequence[float] | None = None
 
 
 @dataclass(frozen=True)

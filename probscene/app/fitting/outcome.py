@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probscene.inference.features.base import FeatureNet
+from probscene.inference.features.base import FeatureNet, objects_counted
 from probscene.inference.features.photographs.readability import MIN_LABELS, histogram_scores, scores
 from probscene.inference.guides.base import Guide
 from probscene.inference.statistics.energy import bootstrap_test
@@ -142,8 +142,7 @@ def worse_than_labels(labels: PartialLabels, learnt: dict[str, NDArray[np.float6
 
 def _class_counts(net: FeatureNet, features: NDArray[np.float64], which: slice | Tensor) -> dict[str, Any]:
     """By the names of features, what they count ``(N,)``."""
-    unit = getattr(net, "unit", None)
-    unit = np.ones(len(net.names)) if unit is None else unit.double().numpy()
+    unit = objects_counted(net, torch.ones(len(net.names))).double().numpy()
     return dict(zip(np.array(net.names)[which], (features * unit[which]).T, strict=True))
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from probscene.batch import RenderBatch
 from probscene.dataset import grey
 from probscene.derivation import Derivation, group_of
-from probscene.inference.features.base import Examples, FeatureNet, class_table, examples
+from probscene.inference.features.base import EmbedsLabels, Examples, FeatureNet, class_table, examples, needs_images
 from probscene.model import SceneModel
 from probscene.relations import relations
 from probscene.sampling import Scenes, run_program, sample
@@ -99,14 +99,14 @@ class RenderedFeatures:
                 network that goes by labels counts what can be seen, of one drawing.
         """
 
-        embed_from_labels, pictured = getattr(net, "embed_from_labels", None), not getattr(net, "uses_labels", False)
+        pictured = needs_images(net)
 
         def features(scenes: Scenes) -> Tensor:
             with threads(self.threads):
                 starts = range(0, len(scenes.drawing), RENDERED_AT_ONCE)
-                if embed_from_labels is not None:
+                if isinstance(net, EmbedsLabels):
                     parts = (self.labelled(scenes, slice(i, i + RENDERED_AT_ONCE), pictured) for i in starts)
-                    return torch.cat([embed_from_labels(some) for some in parts])
+                    return torch.cat([net.embed_from_labels(some) for some in parts])
                 images = (self._clearest(scenes, slice(i, i + RENDERED_AT_ONCE), draws_per_structure) for i in starts)
                 return torch.cat([net.embed(self._as_read(some)) for some in images])
 

@@ -17,12 +17,12 @@ from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, embed_all
 from probscene.inference.features.counting.net import CountNet
 from probscene.inference.guides.base import Guide
-from probscene.inference.objective import ScoreFunction
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
 from probscene.inference.parameters.reader_counts import ReaderCounts
 from probscene.inference.pretrain import pretrain
 from probscene.inference.render_cache import RenderCache
 from probscene.inference.statistics.energy import bootstrap_test
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.inference.training import Training, batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import sample, seed_everything
@@ -70,8 +70,8 @@ def learn_structure(
     pool, crew = _pool(run, run.model), _crew(run, cluster, training.draws_per_structure)
     observe = observer.resample_and_embed(net, training.draws_per_structure, crew)
     objective = _objective(run, run.model, observe, net, guide, pool)
-    rate, seeds = training.learning_rate, batch_seed(seed, 3)
-    trainer = _trainer(run, run.model, guide, objective, real, training.batches, rate, seeds, pool)
+    schedule = _schedule(training, training.batches, training.learning_rate)
+    trainer = StructureTraining(run.model, guide, objective, real, schedule, batch_seed(seed, 3), pool)
     keep = Checkpointer(run, FIRST, trainer)
     if trainer.done == 0:
         pretraining = run.config.pretrain
@@ -125,8 +125,8 @@ def refine_structure(
         net, real = finder, embed_all(finder, images().batches(RENDERED_AT_ONCE))
     pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True, finder=finder is not None)
     objective = _objective(run, model, observer.resample_and_embed(net, 1, crew), net, guide, pool)
-    rate, seeds = SLOWER * config.structure.learning_rate, batch_seed(seed, 7)
-    trainer = _trainer(run, model, guide, objective, real, config.refine.batches, rate, seeds, pool)
+    schedule = _schedule(config.structure, config.refine.batches, SLOWER * config.structure.learning_rate)
+    trainer = StructureTraining(model, guide, objective, real, schedule, batch_seed(seed, 7), pool)
     seen = _features_of_samples(run, observer, net, guide)
     _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
     which = feature_mask(net)
@@ -218,33 +218,18 @@ def score_function(
         observe: features ``(N, D)`` of a batch of scenes.
         divergence: of these from the target's.
     """
-    return ScoreFunction(
-        observe,
-        divergence,
+    config = ScoreFunctionConfig(
         baseline=training.baseline,
         updates=training.updates,
         scale=training.scale,
-        strata=guide.strata,
         incompletion_weight=training.incompletion_weight,
-        prior=model.pretraining_policy,
         prior_kl_weight=training.prior_kl_weight,
     )
+    return ScoreFunction(observe, divergence, config, prior=model.pretraining_policy, strata=guide.strata)
 
 
-def _trainer(
-    run: RunFolder,
-    model: SceneModel,
-    guide: Guide,
-    objective: ScoreFunction,
-    real: Tensor,
-    batches: int,
-    rate: float,
-    seed: int,
-    pool: RenderCache | None,
-) -> StructureTraining:
-    training = run.config.structure
-    scenes, images = training.num_scenes, training.num_real
-    return StructureTraining(model, guide, objective, real, batches, scenes, images, rate, training.cosine, seed, pool)
+def _schedule(training: ScoreFunctionTraining, batches: int, rate: float) -> StructureSchedule:
+    return StructureSchedule(batches, training.num_scenes, training.num_real, rate, training.cosine)
 
 
 def _run(

@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +40,7 @@ SIDE_MULTIPLE = 32  # of an image's height and width
 DEFAULT_NUMBERS = (10, 20, 50, None)  # of labelled photographs; None for all
 
 
-class Budget(NamedTuple):
+class TrainingBudget(NamedTuple):
     """How each detector is trained; by the detector's recipe where None, see ``detector.RECIPES``.
 
     Attributes:
@@ -58,14 +59,28 @@ class Budget(NamedTuple):
     warm_start: bool = False
 
 
-class Generated(NamedTuple):
-    """What is generated of a run: its sources, images of each, the least visible fraction of labels, boxes' margin."""
+@dataclass(frozen=True)
+class GeneratedSets:
+    """Sets that are generated of a run.
 
-    run: RunFolder
+    Args:
+        run: the fit, or its folder.
+        sources: ``"prior"``, ``"start"`` (what pretraining made) and ``"learnt"``, or some of them.
+        number: images of each.
+        min_visible: objects of which a smaller fraction is visible have no label.
+        box_margin: pixels by which boxes are wider on each side.
+    """
+
+    run: RunFolder | Path | str
     sources: tuple[str, ...] = ("prior", "start", "learnt")
     number: int = 600
     min_visible: float = 0.2
     box_margin: int = 0
+
+    @cached_property
+    def opened(self) -> RunFolder:
+        """The run."""
+        return RunFolder.at(Path(self.run)) if isinstance(self.run, Path | str) else self.run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,12 +105,12 @@ class TrialOptions:
     """
 
     hold_out: int | None = None
-    real: Path | None = None
+    real: Path | str | None = None
     numbers: Iterable[int | None] | None = None
-    generated: Generated | None = None
+    generated: GeneratedSets | None = None
     classes: Iterable[str] | None = None
     detector: str = "efficientnet"
-    budget: Budget = Budget()
+    budget: TrainingBudget = TrainingBudget()
     size: tuple[int, int] | None = None
     seeds: int = 5
     seed: int = 0
@@ -173,7 +188,7 @@ def trial(
         "size": list(size), "seed": seed, "test": digest_of(tested),
     }  # fmt: skip
     if value_range is None and generated is not None:
-        value_range = generated.run.record.get("value_range")
+        value_range = generated.opened.record.get("value_range")
     files = dict.fromkeys(example.path for found in (tested, *loaded.values()) for example in found.examples)
     used, notes = range_of(list(files), value_range)
     if used is not None:
@@ -222,7 +237,7 @@ def trial(
     return found
 
 
-def _recipe(choice: str, budget: Budget):
+def _recipe(choice: str, budget: TrainingBudget):
     """What a detector is trained with."""
     if not 0 < budget.finetune_fraction < 1:
         raise ProbsceneError(f"expected a fine-tuning fraction between 0 and 1, got {budget.finetune_fraction}.")
@@ -245,7 +260,8 @@ def _read(path: Path, classes: Iterable[str] | None, show: Progress, same: bool 
 
 def _photographs(test: Path, options: TrialOptions, show: Progress) -> tuple[LabelledSet, LabelledSet | None]:
     """What is tested on, and the photographs to train on, if there are any."""
-    tested, real = _read(test, options.classes, show), options.real
+    tested = _read(test, options.classes, show)
+    real = None if options.real is None else Path(options.real)
     if options.hold_out is not None:
         photographs, tested = split(tested, options.hold_out, options.seed)
     else:
@@ -260,30 +276,30 @@ def _photographs(test: Path, options: TrialOptions, show: Progress) -> tuple[Lab
     return tested, photographs
 
 
-def _sources(generated: Generated) -> tuple[str, ...]:
+def _sources(generated: GeneratedSets) -> tuple[str, ...]:
     """Those that are asked for; no start where guides begin from the prior."""
     unknown = set(generated.sources) - {"prior", "start", "learnt"}
     if unknown or not generated.sources:
         actual = ", ".join(sorted(unknown)) or "none"
         raise ProbsceneError(f"expected sources of a run among prior, start and learnt, got {actual}.")
-    generated.run.check_finished()
-    same = generated.run.model.pretraining is None
+    generated.opened.check_finished()
+    same = generated.opened.model.pretraining is None
     return tuple(name for name in dict.fromkeys(generated.sources) if not (name == "start" and same))
 
 
-def _check_classes(generated: Generated, classes: tuple[str, ...], same: bool) -> None:
-    there = set(generated.run.model.classes)
+def _check_classes(generated: GeneratedSets, classes: tuple[str, ...], same: bool) -> None:
+    there = set(generated.opened.model.classes)
     if set(classes) - there or (same and there - set(classes)):
         raise DataError(
-            f"expected model {generated.run.model.name!r} to have the classes of the test images "
-            f"({', '.join(classes)}), got {', '.join(generated.run.model.classes)}; rename its classes or those of "
+            f"expected model {generated.opened.model.name!r} to have the classes of the test images "
+            f"({', '.join(classes)}), got {', '.join(generated.opened.model.classes)}; rename its classes or those of "
             "the labels, or name the classes that both have by --classes."
         )
 
 
-def _generate(generated: Generated, into: Path, seed: int, workers: int, show: Progress) -> dict[str, Path]:
+def _generate(generated: GeneratedSets, into: Path, seed: int, workers: int, show: Progress) -> dict[str, Path]:
     """Write what is generated of a run, as far as it is not there; by source its folder."""
-    run, number = generated.run, positive(generated.number, "images to generate")
+    run, number = generated.opened, positive(generated.number, "images to generate")
     options = DatasetOptions(min_visible=generated.min_visible, box_margin=generated.box_margin)
     policies = {"prior": run.model.prior, "start": run.model.pretraining_policy}
     folders = {}

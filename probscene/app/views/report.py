@@ -22,7 +22,7 @@ from probscene.threads import threads
 from ..chunks import chunk_randomness
 from ..evaluation.diagnose import FitDiagnostics, diagnose
 from ..evaluation.evaluate import Evaluation, evaluate
-from ..evaluation.labels import read_labels
+from ..evaluation.labels import TargetLabels
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
 from ..evaluation.sources import ESTIMATE, READ, START
 from ..evaluation.visible import Visible
@@ -62,21 +62,19 @@ def report(
     run: RunFolder,
     show: Display,
     out: Path | None = None,
-    labels: Path | None = None,
+    labels: TargetLabels | None = None,
     num: int = 10000,
     judged_by: int | None = None,
     visible: Visible | None = None,
-    some_labels: bool = False,
 ) -> Path:
     """Write the page.
 
     Args:
         out: ``report.html`` in the run folder where None.
-        labels: of the run's target, see ``read_labels``.
+        labels: of the run's target.
         num: structures sampled a source.
         judged_by: scenes rendered for the verdict, none where 0; see ``diagnose``.
         visible: see ``evaluate``.
-        some_labels: labels need not cover all images.
 
     Returns:
         Where it is.
@@ -94,7 +92,9 @@ def report(
         if labels is not None:
             raise
         absent = str(error)
-    truth = None if labels is None or images is None else read_labels(labels, run.model, images, some_labels)
+    truth = None
+    if labels is not None and images is not None:
+        truth = labels.read(run.model, images)
     evaluation = evaluate(run, images, truth, show, num, visible=visible)
     diagnostics = diagnose(run, images, show, judged_by, evaluation) if images and judged_by != 0 else None
     return write(run, evaluation, images, out, absent, diagnostics)

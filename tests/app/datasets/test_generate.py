@@ -250,5 +250,5 @@ def test_many_images_share_folders_of_a_thousand_unless_one_is_asked_for(run, tm
 def test_a_models_images_are_in_one_folder_where_that_is_asked_for(run, tmp_path, monkeypatch):
     monkeypatch.setattr("probscene.app.datasets.folder.MAX_FLAT_IMAGES", 3)
     for flat in (False, True):
-        probscene.generate(run.model, 4, tmp_path / str(flat), format="images", progress=False, flat=flat)
+        probscene.generate(run.model, 4, tmp_path / str(flat), "images", DatasetOptions(flat=flat), progress=False)
         assert (tmp_path / str(flat) / "images" / "000003.png").exists() == flat

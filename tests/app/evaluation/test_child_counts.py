@@ -13,7 +13,7 @@ import torch
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.evaluate import evaluate
-from probscene.app.evaluation.labels import counts_of_dataset, read_labels
+from probscene.app.evaluation.labels import TargetLabels, counts_of_dataset, read_labels
 from probscene.app.evaluation.likelihood import likelihood
 from probscene.app.evaluation.structure_counts import group_label
 from probscene.app.fitting.run import RunFolder
@@ -169,7 +169,7 @@ def test_the_report_has_charts_of_what_depends_on_context(plates, found, tmp_pat
     assert "log q of the labelled structures" in text and "impossible" in text
     from probscene.app.progress import Display
 
-    labelled = report(plates.run, Display(), tmp_path / "s.html", plates.lines, num=200, judged_by=0)
+    labelled = report(plates.run, Display(), tmp_path / "s.html", TargetLabels(plates.lines), num=200, judged_by=0)
     assert "log q of the labelled structures" in labelled.read_text(encoding="utf-8")
 
 

@@ -17,7 +17,7 @@ from rich.console import Console
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.compare import compare
 from probscene.app.evaluation.count_errors import count_errors
-from probscene.app.evaluation.evaluate import evaluate, network_counts
+from probscene.app.evaluation.evaluate import ImageComparison, evaluate, network_counts
 from probscene.app.evaluation.labels import Labels, counts_of_dataset
 from probscene.app.evaluation.sources import Source
 from probscene.app.evaluation.structure_counts import StructureCounts, sample_counts
@@ -200,7 +200,7 @@ def test_where_fits_set_out_from_another_policy_it_is_a_source(fitted, target, t
     run = RunFolder.at(fitted)
     start = load_model(str(run.record["model"])).target(0).prior
     run._model = replace(run.model, pretraining=start)
-    found = evaluate(run, opened(target.images), None, quiet, num=200, features=["run"], images=8)
+    found = evaluate(run, opened(target.images), None, quiet, num=200, compared=ImageComparison(["run"], 8))
     assert list(found.sources) == ["prior", "start", "learnt", "estimate"]
     assert np.array_equal(found.sources["start"].counts, structure_counts(run.model, start, 200, 0))
     assert list(found.distances()["estimate"]) == ["prior", "start", "learnt"] == list(found.images["run"])[:3]

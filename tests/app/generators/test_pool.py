@@ -30,7 +30,7 @@ SCENES = 24
         ("leak", {"memory": 60.0}), ("", {"restart_after": 5}), ("", {"workers": 1}), ("", {"workers": 5}),
     ],
 )  # fmt: skip
-def test_the_bytes_are_those_of_an_undisturbed_run(
+def test_the_bytes_are_those_of_an_undisturbed_run(  # noqa: PLR0913 - fixtures and parameters
     drawn, request_of, fault, fresh, running, command, same, name, settings
 ):
     request = request_of(SCENES)

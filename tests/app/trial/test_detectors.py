@@ -13,11 +13,11 @@ import probscene as ps
 from probscene.app.trial.detector import RECIPES, build
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures, Stage, augmented, detect, fitted, order, train
-from probscene.app.trial.trial import Budget, TrialOptions, trial
+from probscene.app.trial.trial import TrainingBudget, TrialOptions, trial
 from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
-SMALL = {"budget": Budget(iterations=2), "seeds": 2, "resamples": 20, "size": (64, 64)}
+SMALL = {"budget": TrainingBudget(iterations=2), "seeds": 2, "resamples": 20, "size": (64, 64)}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_detector_learns_what_is_drawn(drawn, tmp_path):
     found = ps.trial(
         drawn / "test", tmp_path / "out", {"drawn": drawn / "train"},
-        seeds=1, resamples=50, size=(64, 64), budget=Budget(iterations=50), progress=False,
+        TrialOptions(seeds=1, resamples=50, size=(64, 64), budget=TrainingBudget(iterations=50)), progress=False,
     )  # fmt: skip
     assert found.precision("drawn").value > 0.6
     record = json.loads((tmp_path / "out" / "results.json").read_text())

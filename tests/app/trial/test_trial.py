@@ -10,13 +10,13 @@ import torch
 from probscene.app.datasets.generate import DatasetOptions, generate_scenes
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
-from probscene.app.trial.trial import Budget, TrialOptions, trial
+from probscene.app.trial.trial import TrainingBudget, TrialOptions, trial
 from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.inference.guides.lstm import LSTMGuide
 
 from .conftest import change, draw_set
 
-SMALL = {"budget": Budget(iterations=2), "seeds": 2, "resamples": 20, "size": (64, 64)}
+SMALL = {"budget": TrainingBudget(iterations=2), "seeds": 2, "resamples": 20, "size": (64, 64)}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -80,7 +80,7 @@ def test_sets_can_be_added_and_not_changed(undisturbed, drawn, sets, tmp_path):
     with pytest.raises(RunError, match="'four' as .* was trained on"):
         trial(drawn / "test", out, {**sets, "four": f"{drawn / 'train'}:3"}, TrialOptions(**SMALL))
     with pytest.raises(RunError, match=r"was begun with \(recipe"):
-        trial(drawn / "test", out, sets, TrialOptions(**{**SMALL, "budget": Budget(iterations=4)}))
+        trial(drawn / "test", out, sets, TrialOptions(**{**SMALL, "budget": TrainingBudget(iterations=4)}))
     assert contents(out) == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").touch()
@@ -89,7 +89,7 @@ def test_sets_can_be_added_and_not_changed(undisturbed, drawn, sets, tmp_path):
 
 
 def test_a_chain_goes_on_from_the_row_before(drawn, sets, tmp_path):
-    warm_start = {**SMALL, "budget": Budget(iterations=2, warm_start=True), "seeds": 1}
+    warm_start = {**SMALL, "budget": TrainingBudget(iterations=2, warm_start=True), "seeds": 1}
     trial(drawn / "test", tmp_path / "whole", sets, TrialOptions(**warm_start))
     with pytest.raises(Stop):
         trial(drawn / "test", tmp_path / "parts", sets, TrialOptions(**warm_start), show=stopping(1))
@@ -149,8 +149,8 @@ def test_test_images_in_a_set_are_named(drawn, tmp_path):
         ({"size": (60, 64)}, "multiples of 32, got 64x60"),
         ({"detector": "yolo"}, "efficientnet or maskrcnn=FILE"),
         ({"detector": "maskrcnn=/nowhere"}, "file of weights"),
-        ({"budget": Budget(learning_rate=-1.0)}, "positive learning rate"),
-        ({"budget": Budget(finetune_fraction=1.0)}, "between 0 and 1"),
+        ({"budget": TrainingBudget(learning_rate=-1.0)}, "positive learning rate"),
+        ({"budget": TrainingBudget(finetune_fraction=1.0)}, "between 0 and 1"),
         ({"numbers": [10]}, "--real-numbers, got neither"),
         ({"hold_out": 2, "real": Path("x")}, "got both"),
         ({"hold_out": 60}, "hold out 1 to 5"),

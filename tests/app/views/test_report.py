@@ -16,6 +16,7 @@ import pyro.distributions as dist
 import pytest
 from PIL import Image
 
+from probscene.app.evaluation.labels import TargetLabels
 from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.progress import Display
@@ -193,7 +194,7 @@ def test_names_are_escaped_and_a_target_that_is_gone_leaves_a_gap(fitted, target
     assert "<i>gone, which is not there" in page.text and "<b>&amp;" in page.text
     assert page.text.count("before learning") == 1 and "Target: some" not in page.text
     with pytest.raises(DataError, match="not there"):
-        report(RunFolder.at(folder), Display(), labels=target.labels, num=100, judged_by=0)
+        report(RunFolder.at(folder), Display(), labels=TargetLabels(target.labels), num=100, judged_by=0)
 
 
 def test_a_run_without_log_and_times_has_a_report_and_an_unfinished_one_has_none(fitted, tmp_path):

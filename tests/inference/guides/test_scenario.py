@@ -9,8 +9,8 @@ from probscene.enumeration import enumerate_derivations
 from probscene.grammar import Grammar
 from probscene.inference.divergence import KDELogRatio
 from probscene.inference.guides.scenario import ScenarioGuide
-from probscene.inference.objective import ScoreFunction
-from probscene.inference.structure_training import StructureTraining
+from probscene.inference.objective import ScoreFunction, ScoreFunctionConfig
+from probscene.inference.structure_training import StructureSchedule, StructureTraining
 from probscene.scenarios import JointGrammar
 from probscene.scene import SceneGraph
 from probscene.structure import StructurePrior, counts
@@ -53,9 +53,12 @@ def test_guides_of_two_scenarios_come_to_the_truth_together():
     drawn, _ = torch.sort(torch.multinomial(truth, 3000, replacement=True))
     real, before = counted(every[drawn]), distance()
     objective = ScoreFunction(
-        lambda scenes: counted(scenes.derivation), KDELogRatio(0.2, None), updates=3, strata=guide.strata
+        lambda scenes: counted(scenes.derivation),
+        KDELogRatio(0.2, None),
+        ScoreFunctionConfig(updates=3),
+        strata=guide.strata,
     )
-    StructureTraining(program, guide, objective, real, 60, num_scenes=300).run()
+    StructureTraining(program, guide, objective, real, StructureSchedule(batches=60, num_scenes=300)).run()
     assert distance() < 0.15 < 0.5 < before
 
 
@@ -74,7 +77,10 @@ def test_each_stratum_has_its_own_baseline():
         others = (cost.sum() - cost) / (len(cost) - 1)
         assert torch.allclose(batch.advantage[strata == stratum], cost - others, atol=1e-4)
     moving = ScoreFunction(
-        objective.observe, objective.divergence, baseline="moving_average", decay=0.5, strata=guide.strata
+        objective.observe,
+        objective.divergence,
+        ScoreFunctionConfig(baseline="moving_average", decay=0.5),
+        strata=guide.strata,
     )
     means = []
     for _ in range(2):
