@@ -31,7 +31,7 @@ NUM_SCENES = 200  # scenes of which a model's sites are found
 MIN_VALUES, MAX_POINT_MASS = 50, 0.05  # values of a site, and the share of them that are one, that show a point mass
 U_EPS = 1e-6  # from 0 and 1; the logit of what is nearer is no number
 LEARN = "learn"  # of a site's ``infer``
-OPTED_OUT = "the program says so"  # why a site keeps its prior where that is False
+OPTED_OUT = "the program fixes it with infer={'learn': False}"  # why a site keeps its prior where that is False
 
 
 @dataclass(frozen=True)

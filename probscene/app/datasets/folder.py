@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from probscene.errors import DataError, MachineError, ProbsceneError
 
 from ..chunks import CHUNK
-from .formats import found
+from .formats import detect_formats
 from .places import PARTS, place_at
 from .provenance import image_name
 
@@ -183,7 +183,7 @@ class DatasetFolder:
             raise DataError(
                 f"expected lines of provenance in {self.place}/{LINES}, got something else; name another folder."
             ) from error
-        settings |= {"num": num, "format": ",".join(found(self.place.exists))}
+        settings |= {"num": num, "format": ",".join(detect_formats(self.place.exists))}
         return settings | {"flat": line["image"] == image_name(line["index"], True)}
 
     def _compare(self, before: dict[str, Any]) -> None:

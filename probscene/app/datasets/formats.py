@@ -21,7 +21,8 @@ from collections.abc import Callable, Iterable
 from probscene.errors import ProbsceneError
 
 FORMATS = ("coco", "panoptic", "yolo", "yolo-seg", "yolo-obb", "yolo-pose", "kitti", "webdataset", "depth", "images")
-_MARKS = {
+# By which a finished dataset is known to have a format: without one a second call would see other settings.
+MARKER_FILES = {
     "coco": "annotations.json",
     "panoptic": "panoptic.json",
     "yolo": "data.yaml",
@@ -34,7 +35,7 @@ _MARKS = {
 }
 
 
-def chosen(format: str | Iterable[str]) -> tuple[str, ...]:
+def parse_formats(format: str | Iterable[str]) -> tuple[str, ...]:
     """The formats that are asked for, each once, in the order of ``FORMATS``.
 
     Args:
@@ -51,13 +52,13 @@ def chosen(format: str | Iterable[str]) -> tuple[str, ...]:
     return _normal(names)
 
 
-def found(exists: Callable[[str], bool]) -> tuple[str, ...]:
-    """The formats of a finished dataset, as ``chosen`` gives them.
+def detect_formats(exists: Callable[[str], bool]) -> tuple[str, ...]:
+    """The formats of a finished dataset, as ``parse_formats`` gives them.
 
     Args:
         exists: whether the dataset has a file or folder of a name.
     """
-    names = [name for name, mark in _MARKS.items() if exists(mark)]
+    names = [name for name, mark in MARKER_FILES.items() if exists(mark)]
     return _normal([*names, *(["images"] if exists("images") else [])])
 
 

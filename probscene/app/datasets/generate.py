@@ -33,7 +33,7 @@ from ..workers.cluster import Cluster
 from ..workers.processes import spread
 from . import amodal, attributes, coco, depth, kitti, panoptic, shards, yolo
 from .folder import DEFAULT_SETTINGS, LINES, WHOLE, DatasetFolder, Shard, check_begun
-from .formats import chosen
+from .formats import parse_formats
 from .places import place_at
 from .provenance import image_name, provenance
 
@@ -139,7 +139,7 @@ def generate(
     """
     if isinstance(workers, int) and workers < 1:
         raise ProbsceneError(f"expected a positive number of workers, got {workers}.")
-    job = Job(run.model, run.guide, num, out, seed, chosen(format), options, run.guide_hash())
+    job = Job(run.model, run.guide, num, out, seed, parse_formats(format), options, run.guide_hash())
     if workers == 1:
         return job.run(job.make_all, progress)
     if run.objects:
@@ -182,7 +182,7 @@ def generate_scenes(
 
     The folder's settings name the model and not the policy: write those of another policy to another folder.
     """
-    job = Job(model, policy, num, out, seed, chosen(format), options)
+    job = Job(model, policy, num, out, seed, parse_formats(format), options)
     return job.run(job.make_all, progress)
 
 

@@ -27,6 +27,7 @@ from .source_features import ALL, LEARNT, NUM_IMAGES, PRIOR, STRUCTURE, TARGET, 
 MAX_ROWS = 1000  # of each source
 KINDS = ("structure", "layout", "looks")
 ABSENT, UNSURE, UNREAD = "not judged", "cannot be told", "cannot be read"
+FIXED = (OPTED_OUT, "the program says so")  # the latter in records of before 0.2
 AGREEING_FLOORS = 2.0  # distance of a site's readings in the prior's renders and in the target, up to which they agree
 
 
@@ -149,7 +150,7 @@ def doubtful_sites(run: RunFolder) -> tuple[str, ...]:
     say that it is to be kept, nor is the same read, with some skill, in the prior's renders and in the target."""
     records = {site["name"]: site for site in run.parameters.get("sites", [])}
     reasons = prior_sites(run)
-    return tuple(name for name in reasons if reasons[name] != OPTED_OUT and not _agrees(records.get(name, {})))
+    return tuple(name for name in reasons if reasons[name] not in FIXED and not _agrees(records.get(name, {})))
 
 
 def _agrees(site: dict[str, Any]) -> bool:

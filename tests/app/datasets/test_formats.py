@@ -22,7 +22,7 @@ from pycocotools import mask as rle
 from pycocotools.coco import COCO
 
 from probscene.app.datasets import kitti, yolo
-from probscene.app.datasets.formats import FORMATS, chosen
+from probscene.app.datasets.formats import FORMATS, parse_formats
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.loading import load_model
 from probscene.derive import derive
@@ -271,8 +271,8 @@ def test_an_unknown_format_is_one_error_that_names_them(model, tmp_path, format)
 
 @given(st.lists(st.sampled_from(FORMATS), min_size=1))
 def test_formats_are_a_set(names):
-    same = chosen(names)
-    assert same == chosen(",".join(names)) == chosen(" , ".join(reversed(names))) == chosen(same)
+    same = parse_formats(names)
+    assert same == parse_formats(",".join(names)) == parse_formats(" , ".join(reversed(names))) == parse_formats(same)
     assert {*names} - {*same} <= {"images"} and {*same} <= {*names}
 
 

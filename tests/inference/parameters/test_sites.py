@@ -8,7 +8,7 @@ import torch
 
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
-from probscene.inference.parameters.sites import (
+from probscene.inference.parameters.sites import OPTED_OUT, (
     Site,
     find_sites,
     occurs_once,
@@ -31,7 +31,7 @@ def test_every_site_says_whether_it_can_be_learnt(trays):
     assert found["tray.x"] == Site("tray.x", ("tray",))
     assert found["ball.shade"] == Site("ball.shade", balls)
     assert found["tray.wood"].keeps == "it is discrete"
-    assert found["ball.fixed"].keeps == "the program says so"
+    assert found["ball.fixed"].keeps == OPTED_OUT
     assert found["ball.odd"].keeps == "Beta has no inverse CDF"
     assert found["decoration.x"].keeps == "it belongs to no node of the scene"
     assert found["hidden.depth"].keeps == "it belongs to no node that has a class"
@@ -57,7 +57,7 @@ def test_sites_of_one_name_are_one_of_all_scenarios(rooms):
     assert set(found) == {site_name(rooms.grammar, name) for name in programs}
     assert found["ball.away"] == Site("ball.away", ("red", "blue")) and found["tray.x"] == Site("tray.x", ("tray",))
     assert found["scene.bright"] == Site("scene.bright", ()) and found["floor.turn"] == Site("floor.turn", ())
-    assert found["ball.fixed"].keeps == "the program says so"
+    assert found["ball.fixed"].keeps == OPTED_OUT
     assert found["lamp.height"].keeps == "scenario 'trays' does not have it"
     assert [name for name in found if name.startswith("ball")] == [
         f"ball.{x}" for x in ("away", "size", "shade", "fixed", "odd", "capped")
@@ -115,6 +115,6 @@ def test_a_photos_sites_are_the_scenes_own(smeared):
     assert set(found) == {"photo.exposure", "photo.blur", "photo.noise", "photo.seed", "disc.x"}
     for name in ("photo.exposure", "photo.blur", "photo.noise"):
         assert found[name] == Site(name, ()) and found[name].of_scene
-    assert found["photo.seed"].keeps == "the program says so"
+    assert found["photo.seed"].keeps == OPTED_OUT
     u = quantiles_of(smeared, sample(smeared, smeared.prior, 400))["photo.blur"]
     assert u.shape == (400, 1) and abs(float(u.mean()) - 0.5) < 0.05
