@@ -8,7 +8,8 @@ import torch
 
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
-from probscene.inference.parameters.sites import OPTED_OUT, (
+from probscene.inference.parameters.sites import (
+    OPTED_OUT,
     Site,
     find_sites,
     occurs_once,
