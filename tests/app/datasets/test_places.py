@@ -53,7 +53,7 @@ def test_an_address_holds_what_a_folder_does(run, bucket, tmp_path, format):
     assert generate(run, 70, f"{bucket}/made", seed=3, format=format).made == 0
 
 
-def test_it_goes_on_where_it_was_interrupted_and_what_is_damaged_is_made_again(run, tmp_path, bucket):
+def test_it_goes_on_where_it_was_interrupted_and_what_is_damaged_is_made_again(run, tmp_path, bucket, ready_workers):
     address = f"{bucket}/out"
 
     def stop(number, _):
