@@ -1,6 +1,5 @@
 """A target folder, and a run that the command line has fitted to it in a few seconds."""
 
-import multiprocessing
 import os
 import signal
 import struct
@@ -20,7 +19,6 @@ from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import counts_of_dataset
 from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
-from probscene.inference.features.pretrained import EfficientNetLite
 
 DISCS = Path(__file__).with_name("discs.py")
 STRUCTURE = {
@@ -65,13 +63,8 @@ def _own_cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_and_small_images_are_looked_at():
-    """By a verdict; EfficientNet takes a fifth of the pixels, which tells these models' scenes apart as well."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
-        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
-        yield
+def _quick_verdicts(few_and_small_images):
+    pass
 
 
 def probscene(*words) -> SimpleNamespace:
@@ -85,11 +78,23 @@ def call() -> Callable[..., SimpleNamespace]:
     return probscene
 
 
-@pytest.fixture(scope="session")
-def ready() -> ForkServerContext:
+class Ready(ForkServerContext):
     """Makes processes that have imported everything and begun nothing: they start at once, where one that is spawned
-    imports for seconds first."""
-    context = multiprocessing.get_context("forkserver")
+    imports for seconds first. Like such a one they have the environment of the moment."""
+
+    def Process(self, *, target, args=(), **more):
+        return super().Process(target=_with_environment, args=(dict(os.environ), target, args), **more)
+
+
+def _with_environment(environment, target, args):
+    os.environ.clear()
+    os.environ.update(environment)
+    target(*args)
+
+
+@pytest.fixture(scope="session")
+def ready() -> Ready:
+    context = Ready()
     context.set_forkserver_preload([__name__, "probscene.app.api.fit", "probscene.app.datasets.scene_dataset"])
     forkserver.ensure_running()  # now: what starts workers holds interrupts, and all processes would hold them
     return context
@@ -99,7 +104,7 @@ class Command:
     """The command line in a process of its own: ``process``, and once it has ``ended()`` its ``code``, ``out`` and
     ``err``."""
 
-    def __init__(self, context: ForkServerContext, folder: Path, words: list[str], first: tuple):
+    def __init__(self, context: Ready, folder: Path, words: list[str], first: tuple):
         self._printed = folder / "out", folder / "err"
         self.process = context.Process(target=_command, args=(self._printed, words, *first))
         self.process.start()

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 import probscene as ps
 from probscene.app.cli import app
 from probscene.app.fitting.config import configuration
-from probscene.inference.features.pretrained import EfficientNetLite
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLETOP = EXAMPLES / "tabletop.py"
@@ -54,13 +53,8 @@ def _own_cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_and_small_images_are_looked_at():
-    """By a verdict."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
-        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
-        yield
+def _quick_verdicts(few_and_small_images):
+    pass
 
 
 @pytest.fixture(scope="session")
