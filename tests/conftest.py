@@ -34,6 +34,18 @@ def _fresh_pyro():
     pyro.clear_param_store()
 
 
+@pytest.fixture(scope="module")
+def few_and_small_images():
+    """A verdict looks at these; EfficientNet takes a fifth of the pixels, which tells small scenes apart as well."""
+    from probscene.inference.features.pretrained import EfficientNetLite
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
+        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
+        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
+        yield
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of outside data: ``PROBSCENE_DATA``, or ``shared/data`` beside the checkout."""

@@ -1,7 +1,12 @@
 """A target folder, and a run that the command line has fitted to it in a few seconds."""
 
+import os
+import signal
 import struct
+import sys
 from collections.abc import Callable
+from multiprocessing import forkserver
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,12 +14,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from probscene.app.cli import app
+from probscene.app.cli import app, main
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.labels import counts_of_dataset
 from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
-from probscene.inference.features.pretrained import EfficientNetLite
 
 DISCS = Path(__file__).with_name("discs.py")
 STRUCTURE = {
@@ -59,13 +63,8 @@ def _own_cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_and_small_images_are_looked_at():
-    """By a verdict; EfficientNet takes a fifth of the pixels, which tells these models' scenes apart as well."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
-        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
-        yield
+def _quick_verdicts(few_and_small_images):
+    pass
 
 
 def probscene(*words) -> SimpleNamespace:
@@ -77,6 +76,70 @@ def probscene(*words) -> SimpleNamespace:
 @pytest.fixture(scope="session")
 def call() -> Callable[..., SimpleNamespace]:
     return probscene
+
+
+class Ready(ForkServerContext):
+    """Makes processes that have imported everything and begun nothing: they start at once, where one that is spawned
+    imports for seconds first. Like such a one they have the environment of the moment."""
+
+    def Process(self, *, target, args=(), **more):
+        return super().Process(target=_with_environment, args=(dict(os.environ), target, args), **more)
+
+
+def _with_environment(environment, target, args):
+    os.environ.clear()
+    os.environ.update(environment)
+    target(*args)
+
+
+@pytest.fixture(scope="session")
+def ready() -> Ready:
+    context = Ready()
+    context.set_forkserver_preload([__name__, "probscene.app.api.fit", "probscene.app.datasets.scene_dataset"])
+    forkserver.ensure_running()  # now: what starts workers holds interrupts, and all processes would hold them
+    return context
+
+
+class Command:
+    """The command line in a process of its own: ``process``, and once it has ``ended()`` its ``code``, ``out`` and
+    ``err``."""
+
+    def __init__(self, context: Ready, folder: Path, words: list[str], first: tuple):
+        self._printed = folder / "out", folder / "err"
+        self.process = context.Process(target=_command, args=(self._printed, words, *first))
+        self.process.start()
+
+    def ended(self) -> "Command":
+        self.process.join(300)
+        self.code, (self.out, self.err) = self.process.exitcode, (file.read_text() for file in self._printed)
+        return self
+
+
+def _command(printed, words, first=None, *arguments):
+    for descriptor, file in enumerate(printed, 1):
+        with file.open("w") as opened:
+            os.dup2(opened.fileno(), descriptor)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so its children
+    if first is not None:
+        first(*arguments)
+    sys.argv[:] = ["probscene", *words]
+    main()
+
+
+@pytest.fixture
+def command(ready, tmp_path_factory) -> Callable[..., Command]:
+    """``command(*words, first=(function, *arguments))`` starts the command line, after a call, in another process."""
+
+    def start(*words, first=()):
+        return Command(ready, tmp_path_factory.mktemp("printed"), [str(word) for word in words], first)
+
+    return start
+
+
+@pytest.fixture
+def ready_workers(ready, monkeypatch):
+    """Workers are made so; that they can be spawned as well is for the tests of worker processes."""
+    monkeypatch.setattr("probscene.app.workers.processes.get_context", lambda _: ready)
 
 
 @pytest.fixture(scope="session")

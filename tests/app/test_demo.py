@@ -23,6 +23,7 @@ SHORT = QUICK.set(
         "features.width": (4, 8, 8),
         "structure.batches": 2,
         "structure.num_scenes": 20,
+        "refine.batches": 2,
         "pretrain.derivations": 50,
         "pretrain.epochs": 1,
         "parameters.reader_steps": 4,

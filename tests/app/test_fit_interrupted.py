@@ -1,61 +1,57 @@
 """Fits that are interrupted or killed, and go on."""
 
+import os
 import shlex
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-
-CHILD = """
-import os, signal, sys
-from probscene.app import cli, files
 from probscene.app.fitting import store as checkpoints
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so its children
-kind, stage, number = getattr(signal, sys.argv[1]), sys.argv[2], int(sys.argv[3])
-checkpoints.SAVE_EVERY = 0.0
-line, replace = [{}], os.replace
 
-def at_once():
-    if line[0].get("stage") == stage and line[0].get("step", line[0].get("batch")) >= number:
-        os.kill(os.getpid(), kind)
+def send_in_the_middle(kind: signal.Signals, stage: str, number: int) -> None:
+    """To this process, in the middle of a stage of its fit."""
+    checkpoints.SAVE_EVERY = 0.0
+    line, replace = [{}], os.replace
 
-keep = checkpoints.Checkpointer.__call__
-def keeping(self, said):
-    line[0] = said
-    keep(self, said)
-    if kind != signal.SIGKILL:
-        at_once()
+    def at_once():
+        if line[0].get("stage") == stage and line[0].get("step", line[0].get("batch")) >= number:
+            os.kill(os.getpid(), kind)
 
-def replacing(source, path):  # the worst moment: the log is ahead, the checkpoint written and not yet in its place
-    if str(path).endswith("checkpoint.safetensors"):
-        at_once()
-    replace(source, path)
+    keep = checkpoints.Checkpointer.__call__
 
-checkpoints.Checkpointer.__call__, os.replace = keeping, replacing
-del sys.argv[1:4]
-cli.main()
-"""
+    def keeping(self, said):
+        line[0] = said
+        keep(self, said)
+        if kind != signal.SIGKILL:
+            at_once()
 
+    def replacing(source, path):  # the worst moment: the log is ahead, the checkpoint written and not yet in its place
+        if str(path).endswith("checkpoint.safetensors"):
+            at_once()
+        replace(source, path)
 
-def child(kind: str, stage: str, number: int, words) -> subprocess.CompletedProcess:
-    """The command line in a process of its own that gets a signal in the middle of a stage."""
-    command = [sys.executable, "-c", CHILD, kind, stage, str(number), *map(str, words)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    checkpoints.Checkpointer.__call__, os.replace = keeping, replacing
 
 
-def test_killed_twice_it_goes_on_to_the_same_guide(call, discs, target, fitted, tmp_path):
+@pytest.fixture
+def child(command):
+    """``child(kind, stage, number, words)``: the command line in a process that gets a signal amid a stage."""
+
+    def run(kind, stage, number, words):
+        return command(*words, first=(send_in_the_middle, getattr(signal, kind), stage, number)).ended()
+
+    return run
+
+
+def test_killed_twice_it_goes_on_to_the_same_guide(call, child, discs, target, fitted, tmp_path):
     out = tmp_path / "run"
     first = child("SIGKILL", "features", 32, ["fit", discs.file, "--target", target.images, "--out", out,
                                               *discs.settings])  # fmt: skip
-    assert first.returncode == -signal.SIGKILL, first.stderr
+    assert first.code == -signal.SIGKILL, first.err
     assert (out / "features-checkpoint.safetensors").exists() and not (out / "features.safetensors").exists()
     second = child("SIGKILL", "structure", 3, ["fit", "--resume", "--out", out])
-    assert second.returncode == -signal.SIGKILL, second.stderr
+    assert second.code == -signal.SIGKILL, second.err
     assert (out / "guide-checkpoint.safetensors").exists() and not (out / "guide.safetensors").exists()
     assert call("fit", "--resume", "--out", out).code == 0
     for name in ("features.safetensors", "guide.safetensors", "log.jsonl"):
@@ -63,12 +59,12 @@ def test_killed_twice_it_goes_on_to_the_same_guide(call, discs, target, fitted, 
 
 
 @pytest.mark.parametrize("kind", ["SIGINT", "SIGTERM"])
-def test_interrupted_it_says_how_to_go_on_and_does(call, discs, target, fitted, tmp_path, kind):
+def test_interrupted_it_says_how_to_go_on_and_does(call, child, discs, target, fitted, tmp_path, kind):
     out = tmp_path / "a run"
     words = ["fit", discs.file, "--target", target.images, "--out", out, *discs.settings]
     interrupted = child(kind, "structure", 2, words)
-    assert interrupted.returncode == 1 and "Traceback" not in interrupted.stderr
-    last = interrupted.stderr.splitlines()[-1]
+    assert interrupted.code == 1 and "Traceback" not in interrupted.err
+    last = interrupted.err.splitlines()[-1]
     assert last == f"Interrupted; go on with: {shlex.join(['probscene', *map(str, words), '--resume'])}"
     assert call(*shlex.split(last.partition("probscene ")[2])).code == 0
     assert (out / "guide.safetensors").read_bytes() == (fitted / "guide.safetensors").read_bytes()

@@ -1,5 +1,6 @@
 """Each example of a part of one's own, in a fit of a few seconds: by the command line and from Python."""
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +12,6 @@ from typer.testing import CliRunner
 import probscene as ps
 from probscene.app.cli import app
 from probscene.app.fitting.config import configuration
-from probscene.app.modules import import_file
-from probscene.inference.features.pretrained import EfficientNetLite
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLETOP = EXAMPLES / "tabletop.py"
@@ -54,13 +53,8 @@ def _own_cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_and_small_images_are_looked_at():
-    """By a verdict."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
-        patch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 60)
-        patch.setattr("probscene.app.evaluation.diagnose.NUM_SCENES", 60)
-        yield
+def _quick_verdicts(few_and_small_images):
+    pass
 
 
 @pytest.fixture(scope="session")
@@ -70,12 +64,13 @@ def call():
 
 @pytest.fixture
 def script(monkeypatch, capsys):
-    """``script(file, *words)``: its ``main`` here, without seconds of imports, as ``subprocess.run`` gives it."""
+    """``script(file, *words)``: it runs as a script here, without seconds of imports; what comes is a process's."""
 
     def run(file, *words):
         monkeypatch.setattr(sys, "argv", [str(file), *map(str, words)])
+        code = 0
         try:
-            code = import_file(file).main()
+            runpy.run_path(str(file), run_name="__main__")
         except SystemExit as end:
             code = end.code
         said = capsys.readouterr()

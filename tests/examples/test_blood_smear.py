@@ -1,9 +1,7 @@
 """The example with real photographs: it runs as a script on a folder, and its cells lie and look as they should."""
 
 import csv
-import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -24,11 +22,6 @@ FILE = ROOT / "examples" / "blood_smear.py"
 COUNTED = FILE.with_name("blood_smear_counted.csv")
 MODEL, SOURCE = load_model(str(FILE)), runpy.run_path(str(FILE))
 CLASSES = ("rbc", "wbc", "platelet")
-
-
-def run(*words):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    return subprocess.run([sys.executable, FILE, *map(str, words)], env=environment, capture_output=True, text=True)
 
 
 def photographs(folder: Path, number: int) -> Path:
@@ -58,9 +51,9 @@ def test_grammar_program_and_looks_are_sound():
     assert MODEL.classes == CLASSES
 
 
-def test_the_script_sets_photographs_above_scenes(tmp_path):
+def test_the_script_sets_photographs_above_scenes(tmp_path, script):
     out = tmp_path / "beside.png"
-    done = run(photographs(tmp_path / "photographs", 9), "--out", out)
+    done = script(FILE, photographs(tmp_path / "photographs", 9), "--out", out)
     assert done.returncode == 0, done.stderr
     height, width = MODEL.canvas
     rows = cv2.imread(str(out)).reshape(4, height, 4, width, 3).transpose(0, 2, 1, 3, 4).reshape(16, -1)

@@ -1,8 +1,5 @@
 """Crops of frames against slices of frames that another library has scaled, and their labels against brute force."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -16,11 +13,6 @@ from probscene.dataset import ImageFolder
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "kit_ais.py"
 CARS = [(100, 90), (355, 150), (601, 299), (612, 20), (20, 200)]  # middles, pixels of the frame
-
-
-def run(*words):
-    environment = {**os.environ, "PYTHONPATH": str(EXAMPLE.parents[1]), "OMP_NUM_THREADS": "1"}
-    return subprocess.run([sys.executable, EXAMPLE, *words], env=environment, capture_output=True, text=True)
 
 
 def label(file, size, cars=CARS, length=30):
@@ -43,8 +35,8 @@ def frames(tmp_path):
     return folder
 
 
-def test_crops_and_their_counts(frames, tmp_path):
-    done = run(frames, "--out", tmp_path / "out", "--stride", "100", "--held-out", "B3")
+def test_crops_and_their_counts(frames, tmp_path, script):
+    done = script(EXAMPLE, frames, "--out", tmp_path / "out", "--stride", "100", "--held-out", "B3")
     assert done.returncode == 0, done.stderr
     # 18 / 30 would make the first sequence's frames 192 pixels high, so they become 256; the second's become 336.
     for part, names, scale in (("fit", ["A9", "A10"], 256 / 320), ("held_out", ["B3"], 18 / 30)):

@@ -156,7 +156,7 @@ def test_killed_in_mid_run_it_goes_on_to_the_same_bytes(run, undisturbed, tmp_pa
     assert contents(out) == contents(undisturbed)
 
 
-def test_a_killed_worker_is_one_clear_message(run, undisturbed, tmp_path):
+def test_a_killed_worker_is_one_clear_message(run, undisturbed, tmp_path, ready_workers):
     def kill(done, num):
         for process in multiprocessing.active_children() if done else ():
             process.kill()
@@ -169,7 +169,7 @@ def test_a_killed_worker_is_one_clear_message(run, undisturbed, tmp_path):
     assert contents(undisturbed)["images/000129.png"] == contents(tmp_path / "out")["images/000129.png"]
 
 
-def test_a_workers_error_is_the_same_as_without_workers(tmp_path):
+def test_a_workers_error_is_the_same_as_without_workers(tmp_path, ready_workers):
     endless = a_run(tmp_path / "run", 50.0)
     write_json(endless.path / "run.json", endless.record | {"within_support": False})
     endless = RunFolder.at(endless.path)

@@ -396,7 +396,7 @@ def test_annotations_have_the_programs_own_values(drawn):
 ALL = {"format": "coco,panoptic,yolo,yolo-seg,yolo-obb,yolo-pose,webdataset", "amodal": True, "values": "car.x,light"}
 
 
-def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path, monkeypatch):
+def test_the_same_bytes_by_two_workers_and_after_an_interruption(call, tmp_path, monkeypatch, ready_workers):
     """With every option, those of other files too."""
     options = DatasetOptions(amodal=True, values=ALL["values"], min_visible=0.3, box_margin=3)
     every = {"format": ALL["format"], "options": options}

@@ -44,16 +44,16 @@ def there(address):
     return {name.removeprefix(f"{root}/"): files.cat_file(name) for name in files.find(root)}
 
 
-@pytest.mark.parametrize("format", ["images", "webdataset", FORMATS])
-def test_an_address_holds_what_a_folder_does(run, bucket, tmp_path, format):
-    made = generate(run, 70, f"{bucket}/made", seed=3, format=format)
-    assert made.made == 70 and made.finished and made.path == f"{bucket}/made"
-    generate(run, 70, tmp_path / "out", seed=3, format=format)
+@pytest.mark.parametrize(("format", "num"), [("images", 70), ("webdataset", 70), (FORMATS, 10)])
+def test_an_address_holds_what_a_folder_does(run, bucket, tmp_path, format, num):
+    made = generate(run, num, f"{bucket}/made", seed=3, format=format)
+    assert made.made == num and made.finished and made.path == f"{bucket}/made"
+    generate(run, num, tmp_path / "out", seed=3, format=format)
     assert there(f"{bucket}/made") == contents(tmp_path / "out")
-    assert generate(run, 70, f"{bucket}/made", seed=3, format=format).made == 0
+    assert generate(run, num, f"{bucket}/made", seed=3, format=format).made == 0
 
 
-def test_it_goes_on_where_it_was_interrupted_and_what_is_damaged_is_made_again(run, tmp_path, bucket):
+def test_it_goes_on_where_it_was_interrupted_and_what_is_damaged_is_made_again(run, tmp_path, bucket, ready_workers):
     address = f"{bucket}/out"
 
     def stop(number, _):
@@ -61,13 +61,13 @@ def test_it_goes_on_where_it_was_interrupted_and_what_is_damaged_is_made_again(r
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        generate(run, 70, address, seed=3, format="coco,kitti", progress=stop)
-    assert "annotations.json" not in there(address) and len(there(address)) == 64 * 4 + 2
+        generate(run, 70, address, seed=3, format="coco", progress=stop)
+    assert "annotations.json" not in there(address) and len(there(address)) == 64 + 2
     files, root = url_to_fs(address)
-    assert generate(run, 70, address, seed=3, format="coco,kitti", options=DatasetOptions(shard="1/2")).made == 6
+    assert generate(run, 70, address, seed=3, format="coco", options=DatasetOptions(shard="1/2")).made == 6
     files.pipe_file(f"{root}/images/000064.png", b"half")
-    assert generate(run, 70, address, seed=3, format="coco,kitti", workers=2).made == 6
-    generate(run, 70, tmp_path / "out", seed=3, format="coco,kitti")
+    assert generate(run, 70, address, seed=3, format="coco", workers=2).made == 6
+    generate(run, 70, tmp_path / "out", seed=3, format="coco")
     assert there(address) == contents(tmp_path / "out")
 
 

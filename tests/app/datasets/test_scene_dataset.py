@@ -42,9 +42,8 @@ def samples() -> list:
     return list(SceneDataset(PLATES, NUM, seed=5))
 
 
-def loaded(dataset: SceneDataset, batch_size: int, workers: int, batches: int | None = None) -> list:
+def loaded(dataset: SceneDataset, batch_size: int, workers: int, context, batches: int | None = None) -> list:
     """What a loader gives, sample by sample."""
-    context = "spawn" if workers else None
     loader = DataLoader(
         dataset, batch_size, collate_fn=SceneDataset.collate, num_workers=workers, multiprocessing_context=context
     )
@@ -106,18 +105,18 @@ def test_grey_images_have_three_equal_channels(model, tmp_path):
 
 
 @pytest.mark.parametrize(("batch_size", "workers"), [(8, 2), (24, 3)])
-def test_same_order_for_any_number_of_workers(samples, workers, batch_size):
+def test_same_order_for_any_number_of_workers(samples, workers, batch_size, ready):
     dataset = SceneDataset(PLATES, NUM, seed=5, batch_size=batch_size)
-    assert same(loaded(dataset, batch_size, workers), samples)
+    assert same(loaded(dataset, batch_size, workers, "spawn" if workers == 2 else ready), samples)
     assert not multiprocessing.active_children()
 
 
-def test_without_the_batch_size_the_same_samples(samples):
+def test_without_the_batch_size_the_same_samples(samples, ready):
     dataset = SceneDataset(PLATES, NUM, seed=5)
-    found = loaded(dataset, 7, 2)
+    found = loaded(dataset, 7, 2, ready)
     assert not same(found, samples)
     assert same(sorted(found, key=lambda sample: sample[1]["image_id"]), samples)
-    assert same(loaded(dataset, 64, 2), samples)
+    assert same(loaded(dataset, 64, 2, ready), samples)
 
 
 @given(st.integers(1, 200), st.integers(1, 5), st.integers(1, 100) | st.none())
@@ -163,10 +162,10 @@ def test_epochs_go_on_where_the_one_before_ended(samples):
     assert same(list(short), second[:3])  # a chunk is never begun twice
 
 
-def test_an_endless_dataset(samples):
+def test_an_endless_dataset(samples, ready):
     dataset = SceneDataset(PLATES, seed=5, batch_size=4)
     assert same(list(islice(dataset, NUM)), samples)
-    assert same(loaded(dataset, 4, 2, batches=20), samples[:80])
+    assert same(loaded(dataset, 4, 2, ready, batches=20), samples[:80])
     dataset.set_epoch(2)
     assert next(iter(dataset))[1]["image_id"] == 2 * 2**26
     with pytest.raises(TypeError, match="give SceneDataset a num"):
@@ -174,10 +173,10 @@ def test_an_endless_dataset(samples):
     assert dataset
 
 
-def test_workers_that_persist_see_the_epoch():
+def test_workers_that_persist_see_the_epoch(ready):
     dataset = SceneDataset(PLATES, 8, batch_size=4)
     loader = DataLoader(
-        dataset, 4, collate_fn=SceneDataset.collate, num_workers=1, multiprocessing_context="spawn",
+        dataset, 4, collate_fn=SceneDataset.collate, num_workers=1, multiprocessing_context=ready,
         persistent_workers=True,
     )  # fmt: skip
     ids = []
@@ -218,8 +217,8 @@ def test_a_fork_after_rendering_is_a_clear_error(samples):
         list(loader)
 
 
-def test_a_model_that_no_other_process_can_load_is_a_clear_error(model):
-    loader = DataLoader(SceneDataset(model, 4), num_workers=1, multiprocessing_context="spawn")
+def test_a_model_that_no_other_process_can_load_is_a_clear_error(model, ready):
+    loader = DataLoader(SceneDataset(model, 4), num_workers=1, multiprocessing_context=ready)
     with pytest.raises(ModelError, match="name its file"):
         list(loader)
     assert len(list(SceneDataset(model, 4))) == 4

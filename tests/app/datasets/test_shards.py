@@ -1,15 +1,10 @@
 """Shards: several calls, of several machines, make one dataset; its bytes are those of one process."""
 
-import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
-import probscene
 from probscene.app.datasets.generate import DatasetOptions, generate
 from probscene.app.datasets.places import LocalPlace
 from probscene.errors import DataError, ProbsceneError
@@ -44,30 +39,27 @@ def test_the_whole_makes_what_shards_lack(run, undisturbed, tmp_path):
     assert contents(tmp_path / "out") == contents(undisturbed)
 
 
-def test_shards_at_once_one_of_them_killed_and_run_again(run, tmp_path):
+def test_shards_at_once_one_of_them_killed_and_run_again(run, command, tmp_path):
     out, num, shards = tmp_path / "out", 390, 3
-    environment = {**os.environ, "PYTHONPATH": str(Path(probscene.__file__).parents[1])}
-    command = [sys.executable, "-m", "probscene", "generate", run.path, "--num", num, "--out", out]
 
     def start(number):
-        shard = [*map(str, command), "--seed", "3", "--shard", f"{number}/{shards}"]
-        return subprocess.Popen(shard, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        shard = ("--seed", "3", "--shard", f"{number}/{shards}")
+        return command("generate", run.path, "--num", num, "--out", out, *shard)
 
     crew = [start(number) for number in range(shards)]
     killed, waiting = (1,), {1}
     while waiting:
         for number in sorted(waiting):
-            if crew[number].poll() is not None or list(out.glob(f"images/{64 * number:06d}.png")):
-                crew[number].send_signal(signal.SIGKILL)
+            if not crew[number].process.is_alive() or list(out.glob(f"images/{64 * number:06d}.png")):
+                crew[number].process.kill()
                 waiting.remove(number)
         time.sleep(0.01)
-    for number, process in enumerate(crew):
-        said, _ = process.communicate(timeout=300)  # on a busy machine one may end before it is killed
-        assert process.returncode == 0 or (number in killed and process.returncode == -signal.SIGKILL), said
+    for number, shard in enumerate(crew):
+        shard.ended()  # on a busy machine one may do so before it is killed
+        assert shard.code == 0 or (number in killed and shard.code == -signal.SIGKILL), shard.err
     again = [start(number) for number in killed]
-    for process in again:
-        said, _ = process.communicate(timeout=300)
-        assert process.returncode == 0 and "without --shard" in said
+    for shard in again:
+        assert shard.ended().code == 0 and "without --shard" in shard.out + shard.err
     assert generate(run, num, out, seed=3).made == 0
     generate(run, num, tmp_path / "whole", seed=3)
     assert contents(out) == contents(tmp_path / "whole")

@@ -83,7 +83,7 @@ def places(policy, model):
     return sample(model, policy, 40).parameters["x"]
 
 
-def test_all_that_draws_takes_learnt_parameters(both, call, tmp_path):
+def test_all_that_draws_takes_learnt_parameters(both, call, tmp_path, ready_workers):
     before, run = RunFolder.at(both), learnt(both, tmp_path / "copy")
     assert not torch.equal(places(run.guide, run.model), places(before.model.prior, before.model))
     assert torch.equal(places(run.model.prior, run.model), places(before.model.prior, before.model))
@@ -229,7 +229,7 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     }
     settings |= {"pretrain.derivations": 300, "parameters.reader_steps": 250, "parameters.steps": 250}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 60, "parameters.round_steps": 100}
-    settings |= {"parameters.energy_steps": 5, "parameters.energy_scenes": 40}
+    settings |= {"parameters.energy_steps": 5, "parameters.energy_scenes": 40, "refine.batches": 2}
     config = preset("quick").set("features=count", settings)
     execution = Execution(1, cache=False, progress=False)
     run = fit(dots(False), tmp_path / "target" / "images", config, out=tmp_path / "run", execution=execution)

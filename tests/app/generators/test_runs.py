@@ -54,7 +54,7 @@ def run(copied, tmp_path):
     return run
 
 
-def test_datasets_are_the_same_by_any_number_of_processes(run, tmp_path, fault, fresh):
+def test_datasets_are_the_same_by_any_number_of_processes(run, tmp_path, fault, fresh, ready_workers):
     generate(run, 140, tmp_path / "one", seed=3, format=("coco", "kitti"))
     fresh()
     fault("crash")

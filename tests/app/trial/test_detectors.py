@@ -36,7 +36,7 @@ def test_a_detector_learns_what_is_drawn(drawn, tmp_path):
     assert record["rows"]["drawn"]["coco"]["AP50"] == pytest.approx(figure["value"], abs=1e-6)
 
 
-def test_two_workers_give_the_same_bytes(drawn, tmp_path):
+def test_two_workers_give_the_same_bytes(drawn, tmp_path, ready_workers):
     for workers in (1, 2):
         sets, options = {"two": f"{drawn / 'train'}:2"}, TrialOptions(**SMALL)
         trial(drawn / "test", tmp_path / str(workers), sets, options, workers=workers)

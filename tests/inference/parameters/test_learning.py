@@ -1,5 +1,6 @@
 """Parameters learnt from values, and from images."""
 
+import copy
 from functools import partial
 
 import pytest
@@ -9,6 +10,7 @@ from torch.distributions import Categorical
 
 from probscene.inference.features.base import class_table, examples
 from probscene.inference.features.counting.net import CountNet
+from probscene.inference.parameters import learning as of_images
 from probscene.inference.parameters import missed_objects as missing
 from probscene.inference.parameters import reader
 from probscene.inference.parameters.backbone import RenderBackbone
@@ -22,6 +24,12 @@ from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.schedule import LIKELIHOOD, REFIT, SCENES, WEIGHTS, ParameterSchedule
 from probscene.inference.parameters.skill import Skill
 from probscene.renderers.sprites import SpriteRenderer
+
+
+@pytest.fixture(autouse=True)
+def _few_renders(monkeypatch):
+    for name in ("CALIBRATION_RENDERS", "BUILDER_RENDERS", "MISSED_RENDERS"):
+        monkeypatch.setattr(of_images, name, 60)
 
 
 def rows(number=300, sd=0.01, noise=0.0, seed=0):
@@ -171,7 +179,9 @@ def test_of_a_site_of_scenes_a_reader_is_told_the_priors_values_alone(trays, mon
     """Whatever the guide draws, else it would guess toward that; and it sees scenes that the guide draws."""
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
-    schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=1, rounds=0, energy_steps=0, reader_images=2)
+    schedule = ParameterSchedule(
+        reader_steps=1, scene_renders=200, steps=1, rounds=0, energy_steps=0, weighted_scenes=0, reader_images=2
+    )
     counts, images = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8)), torch.zeros(30, 3, 64, 64).byte()
     learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, lambda: images, schedule)
     learning.run()
@@ -245,16 +255,14 @@ def test_trainings_are_judged_by_scenes_as_they_would_come_out(trays, monkeypatc
     assert learning.prior_sites == {"floor.turn"} and next(would_keep, None) is None
 
 
-@pytest.mark.parametrize("phase", [LIKELIHOOD, REFIT, WEIGHTS])
-def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
+def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
     """In the middle of likelihood, which looks at objects that the guide of before was missing; and of the last
     phases, in whose renders some sites have their prior."""
+    phases = [LIKELIHOOD, REFIT, WEIGHTS]
     monkeypatch.setattr(reader, "SCORE_THRESHOLDS", (0.1,))  # an untrained reader finds something
     monkeypatch.setattr(Skill, "readable", property(lambda skill: ~skill.share.isnan()))
     monkeypatch.setattr(missing, "MIN_OBJECTS", 1)
     monkeypatch.setattr(missing, "MIN_DISTANCE", 0.0)
-    for renders in ("CALIBRATION_RENDERS", "BUILDER_RENDERS", "MISSED_RENDERS"):
-        monkeypatch.setattr(f"probscene.inference.parameters.learning.{renders}", 60)
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     few = {"scene_renders": 60, "round_scene_renders": 4, "energy_steps": 0, "weighted_scenes": 60}
     few |= {"reader_steps": 1, "steps": 2, "step_images": 20, "rounds": 1, "round_reader_steps": 1}
@@ -282,26 +290,28 @@ def test_learning_of_images_goes_on_to_the_same_bits(phase, trays, monkeypatch):
         asked.append(learning.phases[learning.phase])
         return {"scene.bright"}
 
-    class Interrupted(Exception):
-        pass
+    states = {}
 
-    def interrupt(training, _):
-        if training.phase >= training.phases.index(LIKELIHOOD) + 3 and training.phases[training.phase] == phase:
+    def keep(training, _):
+        phase = training.phases[training.phase]
+        late = training.phase >= training.phases.index(LIKELIHOOD) + 3
+        if late and phase in phases and phase not in states:
             assert phase != LIKELIHOOD or (len(training.missed.label) and training.inner.images == 20)
             assert 0 < training.inner.done < training.inner.total
-            raise Interrupted
+            states[phase] = copy.deepcopy(training.state())
 
-    whole, first, second = begun(), begun(), begun()
-    whole.run()
+    whole = begun()
+    whole.run(keep)
     assert kept and all("scene.bright" in each for each in kept)  # where the rest is learnt
-    with pytest.raises(Interrupted):
-        first.run(interrupt)
-    second.restore(first.state())
-    second.run()
-    for one, other in zip(whole.guide.net.parameters(), second.guide.net.parameters(), strict=True):
-        assert torch.equal(one, other)
-    assert whole.prior_sites == second.prior_sites == {"scene.bright"}
-    assert asked == [REFIT] * 2  # of the whole, and once of the other
+    assert list(states) == phases
+    for state in states.values():
+        second = begun()
+        second.restore(state)
+        second.run()
+        for one, other in zip(whole.guide.net.parameters(), second.guide.net.parameters(), strict=True):
+            assert torch.equal(one, other)
+        assert whole.prior_sites == second.prior_sites == {"scene.bright"}
+    assert asked == [REFIT] * 2  # of the whole, and of the one that was not so far
 
 
 def _labels(render, classes, scenes):

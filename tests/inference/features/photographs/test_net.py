@@ -266,14 +266,21 @@ def test_pseudo_labels_are_whole_objects_or_none(dots):
         assert (found[:, :, 1, 3, 10] == 0).all() and (found[:, :, 1, 3, 3] == 1).all()
 
 
-def test_heads_teach_themselves_what_they_half_see(learnt, dots, draw_twice):
-    """Paler discs, which heads find in part, are found more nearly whole after an epoch on them."""
+@pytest.fixture(scope="module")
+def taught(learnt, dots, draw_twice):
+    """The training with another epoch on paler discs, which heads find in part; and these."""
     torch.manual_seed(7)
     drawn = draw_twice(30)
     pale = (drawn.image.float() * 0.15).byte()
     taught = training(dots, draw_twice, 80, 15, 64, 8, photographs=pale)
     taught.restore(learnt[0].state())
     taught.run()
+    return taught, drawn, pale
+
+
+def test_heads_teach_themselves_what_they_half_see(learnt, taught):
+    """They find it more nearly whole then."""
+    taught, drawn, pale = taught
     assert taught.total == 16 and taught.done == 16
     true = taught.net.true_counts(drawn)[:, LARGE].mean(0)
     before, after = (read_of(net, pale)[:, LARGE].mean(0) for net in (learnt[0].net, taught.net))
@@ -285,11 +292,7 @@ def read_of(net: PretrainedCountNet, images: torch.Tensor) -> torch.Tensor:
     return net.readings(net.compute_maps(images))[0][:, :, RULES.index(Rule("sum"))]
 
 
-def test_how_far_heads_are_apart_is_noted_before_they_teach_one_another(learnt, dots, draw_twice):
-    torch.manual_seed(3)
-    images = draw_twice(6).image
-    taught = training(dots, draw_twice, 80, 15, 64, 8, photographs=images)
-    taught.restore(learnt[0].state())
-    taught.run()
+def test_how_far_heads_are_apart_is_noted_before_they_teach_one_another(learnt, taught):
+    taught, _, images = taught
     before = disagreement(learnt[0].net.readings([part.half() for part in learnt[0].net.compute_maps(images)])[1])
-    assert taught.done == 16 and torch.equal(taught.net.apart, before)
+    assert torch.equal(taught.net.apart, before)
