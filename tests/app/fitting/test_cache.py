@@ -5,9 +5,11 @@ import shutil
 from dataclasses import replace
 
 import pytest
+import torch
 
 import probscene as ps
 from probscene.app.fitting.cache import NetworkCache
+from probscene.app.fitting.store import state_of
 
 FILES = ("features.safetensors", "real.safetensors", "guide.safetensors", "log.jsonl")
 
@@ -73,22 +75,21 @@ def test_what_learns_from_it_does_not_matter(fit, discs, whole):
         assert fit(discs.file, *more)[1], more
 
 
-OTHERS = {
-    "seed": ["--seed", "1"],
-    "schedule": ["--set", "features.schedule.steps=40"],
-    "size": ["--set", "features.width=4,4,8"],
-    "threads": ["--threads", "2"],
-    "network": ["--features", "presence", "--set", "features.images=40", "--set", "features.epochs=1"],
-}
-
-
-@pytest.mark.parametrize("what", OTHERS)
-def test_another_one_is_another_entry(fit, discs, whole, what):
-    unread = ("features",) if what == "network" else ()
-    words = [word for word in discs.without("parameters", *unread) if word != "--no-cache"] + ["--learn", "structure"]
-    assert not fit(discs.file, *OTHERS[what], words=words)[1]
-    assert fit(discs.file, *OTHERS[what], words=words)[1]
+def test_another_network_is_another_entry(fit, discs, whole):
+    words = [word for word in discs.without("parameters", "features") if word != "--no-cache"]
+    words += ["--learn", "structure", "--features", "presence"]
+    words += ["--set", "features.images=40", "--set", "features.epochs=1"]
+    assert not fit(discs.file, words=words)[1]
+    assert fit(discs.file, words=words)[1]
     assert len(list((whole / "features").glob("*.safetensors"))) == 2
+
+
+@pytest.mark.parametrize("setting", ["features.schedule.steps=40", "features.width=4,4,8"])
+def test_another_setting_of_the_network_is_another_entry(python_of, setting):
+    run, net = python_of
+    other = type(run)(run.path, run.record, run.model)
+    other.config = run.config.set(setting)
+    assert NetworkCache(other, net).key != NetworkCache(run, net).key
 
 
 def test_another_file_is_another_entry(fit, discs, whole, tmp_path):
@@ -134,17 +135,23 @@ def test_features_in_a_file_are_known_by_its_bytes_and_their_weights(fit, discs,
     assert not fit(discs.file, *own, words=words)[1]
 
 
-def test_other_assets_are_another_entry(whole, python_of, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "value"), [("assets", "digits of another folder"), ("model_sha256", "0"), ("threads", 3), ("seed", 1)]
+)
+def test_what_a_run_records_makes_another_entry(python_of, name, value):
+    run, net = python_of
+    other = type(run)(run.path, run.record | {name: value}, run.model)
+    assert NetworkCache(other, net).key != NetworkCache(run, net).key
+
+
+def test_the_target_that_a_network_learns_from_makes_another_entry(python_of, tmp_path):
     run, net = python_of
     key = NetworkCache(run, net).key
-    for name, value in (("assets", "digits of another folder"), ("model_sha256", "0"), ("threads", 3)):
-        other = type(run)(run.path, run.record | {name: value}, run.model)
-        assert NetworkCache(other, net).key != key, name
     assert NetworkCache(run, net, target="1f").key != key
     assert NetworkCache(run, net, tmp_path).key == key
 
 
-def test_a_folder_of_assets_is_known_by_all_that_it_holds(whole, python_of, tmp_path, monkeypatch):
+def test_a_folder_of_assets_is_known_by_all_that_it_holds(python_of, tmp_path, monkeypatch):
     run, net = python_of
     folder = tmp_path / "assets"
     folder.mkdir()
@@ -192,9 +199,20 @@ def damages():
 
 
 @pytest.mark.parametrize("damage", damages(), ids=lambda each: each.__name__)
-def test_a_damaged_one_is_trained_anew_and_mended(fit, discs, whole, fitted, damage):
-    (file,), (log,) = ((whole / "features").glob(f"*.{end}") for end in ("safetensors", "jsonl"))
-    damage(file, log)
+def test_a_damaged_one_is_as_if_it_were_not_there_and_is_mended(python_of, tmp_path, damage):
+    run, net = python_of
+    cache, tensors, lines = NetworkCache(run, net, tmp_path), state_of(net), ["one", "other"]
+    cache.save(tensors, lines)
+    damage(cache.file, cache.file.with_suffix(".jsonl"))
+    assert cache.load() is None
+    cache.save(tensors, lines)
+    found = cache.load()
+    assert found.lines == lines and all(torch.equal(found.tensors[name], tensors[name]) for name in tensors)
+
+
+def test_a_damaged_one_is_trained_anew(fit, discs, whole, fitted):
+    (file,) = (whole / "features").glob("*.safetensors")
+    file.write_bytes(b"")
     run, taken = fit(discs.file)
     assert not taken and same(run, fitted)
     assert fit(discs.file)[1]
