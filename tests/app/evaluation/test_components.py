@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation import source_features
 from probscene.app.evaluation.components import (
@@ -28,21 +27,22 @@ from probscene.app.evaluation.components import (
 from probscene.app.evaluation.diagnose import diagnose
 from probscene.app.evaluation.explain import component_remedy, structure_remedy
 from probscene.app.fitting.config import LIKELIHOOD, META_SIM, TILTING, FitConfig
-from probscene.app.fitting.pipeline import Execution
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.views import verdict_text
 from probscene.dataset import ImageFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar
-from probscene.inference.features.counting.net import CountNet
 from probscene.inference.statistics.residual import Grade, worst_grade
 from probscene.inference.statistics.verdict import Verdict
 from probscene.model import SceneModel, scene_model
 from probscene.structure import StructurePrior, counts, weights
 
+from .colours import ColourFeatures, Colours
+
 GRAMMAR = Grammar("Scene -> Dots\nDots -> Dot Dots | ε\nDot -> red | blue")
 PRIOR = StructurePrior(GRAMMAR, Dots=counts(0, 1, 1, 1), Dot=weights(1, 1))
+RADIUS = 2.5  # of dots that hardly ever hide one another
 TRUTH = StructurePrior(GRAMMAR, Dots=counts(0, 1, 1, 4), Dot=weights(1, 1))
 
 
@@ -57,8 +57,8 @@ def dots(spread: float = 0.0, of_blue: float | None = None, bright: float = 1.0)
         far = spread if of_blue is None else of_blue
         red, blue = (1.0 * bright, 0.2 * bright, 0.2 * bright), (0.2 * bright, 0.2 * bright, 1.0 * bright)
         return scene.draw(
-            Sprites.disc("red", x, 32.0 + spread * off, radius=4.0, tint=red),
-            Sprites.disc("blue", x, 32.0 + far * off, radius=4.0, tint=blue),
+            Sprites.disc("red", x, 32.0 + spread * off, radius=RADIUS, tint=red),
+            Sprites.disc("blue", x, 32.0 + far * off, radius=RADIUS, tint=blue),
         )
 
     return dots
@@ -77,20 +77,12 @@ def fewer_images():
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
-    """A run on dots in a line that has learnt nothing but to count, and its target."""
+    """A run on dots in a line that has learnt nothing, and its target."""
     folder = tmp_path_factory.mktemp("line")
     generate_scenes(dots(), TRUTH, 240, folder / "target", format="images")
     images = ImageFolder(folder / "target" / "images", (64, 64), 3)
-    settings = {
-        "features.schedule.steps": 200,
-        "features.schedule.images": 8,
-        "features.width": "8,16,32",
-        "structure.batches": 1,
-        "structure.num_scenes": 60,
-    }
-    settings |= {"pretrain.derivations": 100, "pretrain.epochs": 1}
-    config = preset("quick").set("features=count", "parameters=none", settings)
-    fit(dots(24.0), images.path, config, out=folder / "run", execution=Execution(1, cache=False, progress=False))
+    config = preset("quick").set("parameters=none")
+    RunFolder.create(folder / "run", dots(24.0), {"threads": 1, "seed": 0, "config": config.to_record()})
     return SimpleNamespace(path=folder / "run", images=images)
 
 
@@ -98,12 +90,17 @@ def guided(fitted, *, learnt: SceneModel | None, structure=TRUTH):
     """The run as if it had learnt a structure, and to draw it as ``learnt`` does."""
 
     class Guided(RunFolder):
+        features = ColourFeatures()
+
         @property
         def guide(self):
             policy = StructurePrior.__new__(StructurePrior)
             policy.__dict__.update(structure.__dict__)
             policy.suits = None if learnt is None else lambda model: replace(model, program=learnt.program)
             return policy
+
+        def network(self):
+            return Colours(RADIUS)
 
     return Guided.at(fitted.path, model=dots(24.0))
 
@@ -156,7 +153,7 @@ def test_what_looks_unlike_the_target_is_no_better_than_the_prior(fitted):
 
 
 def test_features_that_do_not_say_where_objects_are(fitted, monkeypatch):
-    monkeypatch.delattr(CountNet, "cells")
+    monkeypatch.delattr(Colours, "classes")
     found = diagnose(guided(fitted, learnt=dots()), fitted.images, quiet, 300)
     assert grades(found) == {"structure": Grade.GOOD, "layout": None, "looks": Grade.GOOD}
     assert "do not say where objects are" in printed(found) and found.components.verdict == "not judged"
