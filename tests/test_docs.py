@@ -12,9 +12,7 @@ import typer
 
 import probscene
 from probscene.app.cli import app
-from probscene.app.evaluation import diagnose, source_features
 from probscene.app.modules import import_file
-from probscene.inference.features.pretrained import EfficientNetLite
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -30,6 +28,7 @@ def text(name: str) -> str:
 FEWER = {
     "tutorial.md": {
         '400, "hidden"': '60, "hidden"',
+        '"features": "count"': '"features": "count", "features.width": "4,8,8", "pretrain.derivations": 100',
         '"features.schedule.steps": 300': '"features.schedule.steps": 16',
         '"structure.batches": 20': '"structure.batches": 2',
         '"structure.num_scenes": 100': '"structure.num_scenes": 20',
@@ -44,16 +43,13 @@ FEWER = {
 
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)
-def test_python_prints_what_the_page_says(page, tmp_path, monkeypatch, capsys):
+def test_python_prints_what_the_page_says(page, tmp_path, monkeypatch, capsys, few_and_small_images):
     shorter = page.read_text(encoding="utf-8")
     for words, fewer in FEWER.get(page.name, {}).items():
         assert words in shorter
         shorter = shorter.replace(words, fewer)
     (tmp_path / page.name).write_text(shorter, encoding="utf-8")
     monkeypatch.setenv("PROBSCENE_CACHE", "")  # the script sets it
-    monkeypatch.setattr(source_features, "NUM_IMAGES", 60)
-    monkeypatch.setattr(diagnose, "NUM_SCENES", 60)
-    monkeypatch.setattr(EfficientNetLite.__init__, "__defaults__", (96,))
     monkeypatch.setattr(sys, "argv", ["run_page.py", str(tmp_path / page.name), "--check"])
     assert import_file(ROOT / "docs" / "run_page.py").main() == 0, capsys.readouterr().err
 
