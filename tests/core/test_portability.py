@@ -38,7 +38,7 @@ MODULES = {"fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "posix", 
 SCRIPT = """
 import errno, os, signal, sys
 
-import cv2, rich.progress, scipy, torch, torchvision
+import cv2, rich.progress, torch
 from multiprocessing import resource_tracker
 
 resource_tracker.ensure_running()  # Python's own on this system needs some of the names

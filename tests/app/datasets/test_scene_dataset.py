@@ -104,10 +104,11 @@ def test_grey_images_have_three_equal_channels(model, tmp_path):
     agrees(list(SceneDataset(dull, 5)), tmp_path / "out")
 
 
-@pytest.mark.parametrize(("batch_size", "workers"), [(8, 2), (24, 3)])
+@pytest.mark.parametrize(("batch_size", "workers"), [(8, 1), (8, 2), (24, 3)])
 def test_same_order_for_any_number_of_workers(samples, workers, batch_size, ready):
+    """One that is spawned as well as several that are ready at once."""
     dataset = SceneDataset(PLATES, NUM, seed=5, batch_size=batch_size)
-    assert same(loaded(dataset, batch_size, workers, "spawn" if workers == 2 else ready), samples)
+    assert same(loaded(dataset, batch_size, workers, "spawn" if workers == 1 else ready), samples)
     assert not multiprocessing.active_children()
 
 
