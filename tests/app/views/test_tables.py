@@ -142,7 +142,6 @@ def test_labels_of_bins_never_touch_and_are_those_of_their_bins(bins, size, poin
     with matplotlib.rc_context({"xtick.labelsize": points}):
         figure = Figure(size, layout="constrained")
         axes = figure.add_subplot()
-        axes.bar(range(len(bins)), np.ones(len(bins)))
         axes.set_xlim(-0.6, len(bins) - 0.4)
         figure.draw_without_rendering()
         charts.label_bins(axes, bins)

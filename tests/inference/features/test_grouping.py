@@ -111,12 +111,12 @@ def test_votes_of_objects_say_where_the_middle_is(axis, seed):
 
 
 def test_a_network_counts_by_group_along_either_axis(shelves):
-    """Boxes with discs, side by side: the true counts of nearly every image after a minute."""
+    """Boxes with discs, side by side: the true counts of nearly every image after a short training."""
     view = RenderedFeatures(shelves, threads=1)
     torch.manual_seed(0)
     net = CountNet(shelves.classes, 3, shelves.canvas, (8, 16, 24), groups=shelves.groups)
     assert net.names == ("shelf", "disc 1", "disc 2", "disc 3")
-    CountTraining(net, view.draw, CountSchedule(steps=480, images=8, crops=16), seed=0).run()
+    CountTraining(net, view.draw, CountSchedule(steps=360, images=8, crops=16), seed=0).run()
     batch = view.draw(200)
     scenes = batch.label
     shelf = (scenes == 0).sum(1)
