@@ -96,7 +96,7 @@ def measured(seed: int, args: argparse.Namespace) -> dict:
     panels = []
     for source in ("prior", "structure", "both"):
         policy = copy(run.model.prior if source == "prior" else run.guide)
-        policy.suits = run.guide.suits if source == "both" else None
+        policy.with_parameters = run.guide.with_parameters if source == "both" else None
         scenes, pictures = drawn(run, policy, 1)
         row[source] = lane_errors(scenes) | {"kid": said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
         panels.append(pictures)

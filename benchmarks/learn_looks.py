@@ -114,7 +114,7 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
         else model
     )
     structure = copy(run.guide)
-    structure.suits = None
+    structure.with_parameters = None
     true = quantiles(model, truth, truth.prior, 1)
     others = {
         "prior": quantiles(model, model, structure, 2),
@@ -137,7 +137,7 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
     panels = []
     for source in ("prior", "start", "structure", "both"):
         policy = copy({"prior": model.prior, "start": model.pretraining_policy}.get(source, run.guide))
-        policy.suits = (lambda _: learnt) if source == "both" else None
+        policy.with_parameters = (lambda _: learnt) if source == "both" else None
         _, pictures = drawn(run, policy, 1)
         row["kid"][source] = said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))
         panels += [pictures] if source != "start" else []

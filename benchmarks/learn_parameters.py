@@ -114,12 +114,12 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
     }
     row["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
     panels, tensors = [], run.read_tensors(NAME)
-    suits = None
+    learnt = None
     if tensors:
-        suits = learnt_by(run.model, run.config, run.parameters, run.guide, prefixed(tensors)).with_parameters
+        learnt = learnt_by(run.model, run.config, run.parameters, run.guide, prefixed(tensors)).with_parameters
     for source in SOURCES:
         policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
-        policy.suits = suits if source in ("parameters", "both") else None
+        policy.with_parameters = learnt if source in ("parameters", "both") else None
         scenes, pictures = drawn(run, policy, 1)
         row[source] = row_errors(scenes) | {"kid": said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
         panels += [pictures] if source in SHOWN else []

@@ -166,7 +166,7 @@ def looks(run: RunFolder, frames: ImageFolder, num: int, grid: Path) -> dict:
     policies = baseline_policies(run.model)
     if run.parameters:
         policies["structure"] = copy(run.guide)
-        policies["structure"].suits = None
+        policies["structure"].with_parameters = None
     policies[LEARNT] = run.guide
     drawn_of = {name: drawn(run, policy, 1)[1][:num] for name, policy in policies.items()}
     draw_grid([drawn_of["prior"], drawn_of[LEARNT], real], grid)

@@ -21,12 +21,13 @@ class Policy:
 
     Attributes:
         support: the rules that it may take, masked like illegal ones; all legal ones where None.
-        suits: the model that draws its structures, of a model, such as one with learnt parameters; the same where None.
+        with_parameters: gives the model that draws its structures, of a model, such as one with learnt parameters; the
+            same where None.
     """
 
     grammar: Grammar
     support: Support | None = None
-    suits: Callable[[Any], Any] | None = None
+    with_parameters: Callable[[Any], Any] | None = None
 
     def start(self, num_scenes: int) -> Any:
         """The memory before the first step."""

@@ -60,7 +60,7 @@ class Scenes:
 
 def sample(model: SceneModel, policy: Policy, num_scenes: int, density: bool = True) -> Scenes:
     """Scenes with complete structures from ``policy`` and parameters from the model's program, or from that of
-    ``policy.suits``.
+    ``policy.with_parameters``.
 
     Args:
         density: whether their ``log_prob`` is asked for; of learnt parameters it takes as long as drawing them.
@@ -70,7 +70,8 @@ def sample(model: SceneModel, policy: Policy, num_scenes: int, density: bool = T
         ModelError: see ``run_program``.
     """
     derivation, failures = derive_complete(model.grammar, policy, num_scenes, model.max_steps)
-    return run_program(model if policy.suits is None else policy.suits(model), derivation, None, failures, density)
+    drawn_by = model if policy.with_parameters is None else policy.with_parameters(model)
+    return run_program(drawn_by, derivation, None, failures, density)
 
 
 def run_program(

@@ -34,7 +34,7 @@ STAGES = {
     "pretraining": ("Pretraining", "epochs"),
     "structure": ("Structure", "batches"),
     "parameters": ("Parameters", "steps"),
-    "structure-again": ("Structure again", "batches"),
+    "refinement": ("Refinement", "batches"),
     "outcome": ("Outcome", "scenes"),
     "drawing": ("Drawing a target", "images"),
     "generating": ("Generating", "images"),

@@ -138,7 +138,7 @@ def diagnose(
     advance(0)
     made = _LabelThumbnailNet if isinstance(net, EmbedsLabels) else _ThumbnailNet
     nets = [made(net, advance, keep) for keep in (True, False)]
-    draws = [1 if policy.suits else training.draws_per_structure for policy in policies]
+    draws = [1 if policy.with_parameters else training.draws_per_structure for policy in policies]
     scenes = [_features(run, *source, num, seed) for source in zip(policies, nets, draws, strict=True)]
     real = _real(run, target, net, advance)
     sources = source_features.embed_sources(run, target, net, EfficientNetLite(), advance, images, seed)

@@ -57,7 +57,7 @@ def policies(run: RunFolder) -> dict[str, Policy]:
     alone is all that was learnt, and a guide that was rejected is the prior."""
     learnt, prior = run.guide, run.model.prior
     found = {LEARNT: learnt}
-    if learnt.suits is not None:
+    if learnt.with_parameters is not None:
         found[STRUCTURE] = without_parameters(learnt)
     return found | ({} if learnt is prior else {PRIOR: prior})
 
@@ -65,7 +65,7 @@ def policies(run: RunFolder) -> dict[str, Policy]:
 def without_parameters(policy: Policy) -> Policy:
     """The same policy of structures, whose scenes have the prior's parameters."""
     alone = copy.copy(policy)
-    alone.suits = None
+    alone.with_parameters = None
     return alone
 
 

@@ -33,7 +33,7 @@ def with_parameters(
     """A policy whose scenes have learnt parameters, in place; as it is where none are kept. Arguments as of
     ``learnt_by``."""
     if tensors and record.get("kept") == "learnt":
-        policy.suits = learnt_by(model, config, record, policy, tensors).with_parameters
+        policy.with_parameters = learnt_by(model, config, record, policy, tensors).with_parameters
     return policy
 
 

@@ -72,7 +72,7 @@ def conclude(
     policies: tuple[Policy, ...] = (guide.eval(), run.model.prior)
     for i, policy in enumerate(policies):
         seed_everything(batch_seed(run.record["seed"], 4, i))
-        draws = 1 if policy.suits else run.config.structure.draws_per_structure
+        draws = 1 if policy.with_parameters else run.config.structure.draws_per_structure
         observe, parts, counts = observer.observe(net, draws), [], []
         for first in range(0, number, RENDERED_AT_ONCE):
             scenes = sample(run.model, policy, min(RENDERED_AT_ONCE, number - first), density=False)

@@ -36,11 +36,11 @@ from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import RunFolder
 from .scene_features import fingerprint
 from .store import OTHER, TIMING, Checkpointer, load_state, state_of, timing
-from .structure_stage import AGAIN, FIRST, learn_structure, refine_structure
+from .structure_stage import FIRST, REFINEMENT, learn_structure, refine_structure
 
 STAGES = (
     "reading", "likeness", "looking", "features", "readings", "target", "pretraining", "structure", "parameters",
-    "structure-again", "outcome",
+    "refinement", "outcome",
 )  # fmt: skip
 """Of ``progress.STAGES``, in their order."""
 
@@ -130,7 +130,7 @@ def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, clust
                     learn_parameters(run, observer, net.net, guide, images, show, show.say)
                 refine_structure(run, net.net, real, guide, images, show, cluster)
             message = conclude(run, observer, net.net, real[: len(images())], guide, begun.labels, show)
-    for name in (f"{FIRST}-checkpoint", f"{AGAIN}-checkpoint", READER):
+    for name in (f"{FIRST}-checkpoint", f"{REFINEMENT}-checkpoint", READER):
         (run.path / f"{name}.safetensors").unlink(missing_ok=True)
     if message:
         show.say(message)

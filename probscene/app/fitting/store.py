@@ -271,6 +271,7 @@ def load_state(net: FeatureNet, tensors: dict[str, Tensor]) -> None:
 def timing(run: Storage) -> dict[str, float]:
     """Seconds by stage, as far as they are known."""
     try:
-        return json.loads((run.path / TIMING).read_text(encoding="utf-8"))
+        seconds = json.loads((run.path / TIMING).read_text(encoding="utf-8"))
+        return {"refinement" if stage == "structure-again" else stage: each for stage, each in seconds.items()}
     except (OSError, ValueError):
         return {}

@@ -39,7 +39,7 @@ from .rendered_features import RENDERED_AT_ONCE, Chunk, Observe, RenderedFeature
 from .run import RunFolder
 from .store import Checkpointer
 
-FIRST, AGAIN = "guide", "structure-again"  # of the checkpoints
+FIRST, REFINEMENT = "guide", "refinement"  # of the checkpoints
 BEFORE = "guide-first"  # of the guide that parameters are learnt with
 SLOWER = 0.2  # of the first pass's rate
 
@@ -112,10 +112,10 @@ def refine_structure(
         ProbsceneError: a cost or a parameter is no longer finite.
     """
     config, seed = run.config, run.record["seed"]
-    if guide.suits is None or config.refine is None or not config.refine.batches:
+    if guide.with_parameters is None or config.refine is None or not config.refine.batches:
         return
     seed_everything(batch_seed(seed, 8))
-    model = guide.suits(run.model)
+    model = guide.with_parameters(run.model)
     observer, before = (
         RenderedFeatures(model, run.record["threads"]),
         {k: v.clone() for k, v in guide.state_dict().items()},
@@ -128,7 +128,7 @@ def refine_structure(
     schedule = _schedule(config.structure, config.refine.batches, SLOWER * config.structure.learning_rate)
     trainer = StructureTraining(model, guide, objective, real, schedule, batch_seed(seed, 7), pool)
     seen = _features_of_samples(run, observer, net, guide)
-    _run(trainer, Checkpointer(run, AGAIN, trainer), AGAIN, progress, crew)
+    _run(trainer, Checkpointer(run, REFINEMENT, trainer), REFINEMENT, progress, crew)
     which = feature_mask(net)
     which = slice(None) if which is None else which
     now, then, target = (
@@ -188,8 +188,8 @@ def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> C
     assert net is not None
     if again:
         tensors = prefixed(run.read_tensors(NAME) or {})
-        suits = with_parameters(model, run.config, run.parameters, run.new_guide(), tensors).suits
-        model = model if suits is None else suits(model)
+        policy = with_parameters(model, run.config, run.parameters, run.new_guide(), tensors)
+        model = model if policy.with_parameters is None else policy.with_parameters(model)
     net = (_reader_counts(run, net) if finder else None) or net
     observer = RenderedFeatures(model, run.record["threads"])
     return lambda part: observer.part(part, net, draws_per_structure)

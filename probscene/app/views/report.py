@@ -234,7 +234,7 @@ def scene_values(run: RunFolder) -> dict[str, tuple[list[float], list[float] | N
     sites = {site["name"] for site in run.parameters["sites"] if not site["kinds"]}
     found: list[dict[str, list[float]]] = []
     for policy in (run.model.prior, run.guide) if sites else ():
-        if policy.suits is None and found:
+        if policy.with_parameters is None and found:
             break
         with torch.no_grad(), threads(1), chunk_randomness(0, 0):
             scenes = sample(run.model, policy, QUANTILE_SCENES, density=False)

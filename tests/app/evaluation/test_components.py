@@ -96,7 +96,7 @@ def guided(fitted, *, learnt: SceneModel | None, structure=TRUTH):
         def guide(self):
             policy = StructurePrior.__new__(StructurePrior)
             policy.__dict__.update(structure.__dict__)
-            policy.suits = None if learnt is None else lambda model: replace(model, program=learnt.program)
+            policy.with_parameters = None if learnt is None else lambda model: replace(model, program=learnt.program)
             return policy
 
         def network(self):

@@ -93,7 +93,7 @@ def test_boxes_of_labels_are_held_beside_those_of_scenes(tmp_path):
     generate_scenes(model, PRIOR, 60, tmp_path / "target", 3, "coco")
     target = ImageFolder(tmp_path / "target" / "images", (64, 64), 3)
     guide = StructurePrior(GRAMMAR, Dots=counts(0, 1, 1, 1), Dot=weights(3, 1))
-    guide.suits = lambda model: replace(model, program=learnt.program)
+    guide.with_parameters = lambda model: replace(model, program=learnt.program)
     labels = {"path": str(tmp_path / "target" / "annotations.json")}
     run = SimpleNamespace(model=model, guide=guide, record={"labels": labels}, visible_shares=dict)
     boxes, told = given_boxes(run, target), []

@@ -40,7 +40,7 @@ def test_a_run_keeps_what_it_has_learnt(fitted):
     run = RunFolder.at(fitted)
     assert run.config.parameter_method == run.parameters["method"] == "meta-sim"
     assert [(site["name"], site["learnt"]) for site in run.parameters["sites"]] == [("x", True), ("y", True)]
-    assert run.parameters["kept"] == "learnt" and run.guide.suits is not None
+    assert run.parameters["kept"] == "learnt" and run.guide.with_parameters is not None
     assert run.config.parameters.steps == 4
     log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in log if line["stage"] == "parameters"] == [1, 2, 3, 4]
@@ -50,8 +50,8 @@ def test_all_that_draws_takes_them(fitted, call, tmp_path):
     run = RunFolder.at(fitted)
     seed_everything(0)
     moved = sample(run.model, run.guide, 40).parameters["x"]
-    assert isinstance(run.guide.suits.__self__, ParameterTransform)
-    run.guide.suits = None
+    assert isinstance(run.guide.with_parameters.__self__, ParameterTransform)
+    run.guide.with_parameters = None
     seed_everything(0)
     assert not torch.equal(moved, sample(run.model, run.guide, 40).parameters["x"])
     done = call("generate", run.path, "--num", 70, "--out", tmp_path / "command")

@@ -102,7 +102,7 @@ def test_parameters_that_are_no_better_are_not_used(both, tmp_path):
     run = learnt(both, tmp_path / "copy")
     record = json.loads((run.path / "parameters.json").read_text())
     (run.path / "parameters.json").write_text(json.dumps({**record, "kept": "prior"}))
-    assert RunFolder.at(run.path).guide.suits is None
+    assert RunFolder.at(run.path).guide.with_parameters is None
 
 
 def interrupted_at(training, stop):
@@ -165,13 +165,13 @@ class Node:
 def test_structure_is_learnt_again_by_what_tells_more_of_it(call, discs, target, tmp_path, monkeypatch, found):
     """By the objects that the reader finds, or by the network's sums; on nodes of a cluster as here."""
     anything_is_read(monkeypatch)
-    learn = structure._trainer
+    learn = structure.StructureTraining
     ways = {"here": structure._crew, "nodes": Node} if found else {"here": structure._crew}
     for path, crew in ways.items():
         errors, real = iter((1.0, 2.0) if found else (2.0, 1.0)), []
         with monkeypatch.context() as patch:
             patch.setattr(structure, "_wrong", lambda seen, drawn, errors=errors: next(errors))
-            patch.setattr(structure, "_trainer", lambda *args, real=real: real.append(args[4]) or learn(*args))
+            patch.setattr(structure, "StructureTraining", lambda *args, real=real: real.append(args[3]) or learn(*args))
             patch.setattr(structure, "_crew", crew)
             words = ("fit", discs.file, "--target", target.images, "--out", tmp_path / path, *discs.without(), *LEARN)
             assert call(*words).code == 0
@@ -183,7 +183,7 @@ def test_structure_is_learnt_again_by_what_tells_more_of_it(call, discs, target,
 
 def test_structure_is_learnt_again_in_the_learnt_layout(both):
     lines = [json.loads(line) for line in (both / "log.jsonl").read_text().splitlines()]
-    assert [line["batch"] for line in lines if line["stage"] == "structure-again"] == [1, 2, 3]
+    assert [line["batch"] for line in lines if line["stage"] == "refinement"] == [1, 2, 3]
     site = RunFolder.at(both).parameters["sites"][0]["read"]
     assert {name: len(site[name]) for name in ("prior", "learnt", "target")} == dict.fromkeys(
         site.keys() - {"distance"}, 21
@@ -286,7 +286,7 @@ def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, tar
     run = RunFolder.at(out)
     record = {site["name"]: site for site in run.parameters["sites"]}
     if len(passed) == 2:
-        assert run.parameters["kept"] == "prior" and run.guide.suits is None
+        assert run.parameters["kept"] == "prior" and run.guide.with_parameters is None
         assert "All keep the prior, as learnt scenes come no nearer" in done.err + done.out
         return
     assert (record["x"]["learnt"], record["y"]["learnt"], run.parameters["kept"]) == (False, True, "learnt")
@@ -309,7 +309,7 @@ def test_a_site_that_cannot_be_read_where_the_target_is_keeps_the_prior(call, di
 
 def x_keeps_the_prior(run):
     found = []
-    for model in (run.guide.suits(run.model), run.model):
+    for model in (run.guide.with_parameters(run.model), run.model):
         seed_everything(0)
         found.append(sample(model, run.model.prior, 30).parameters)
     assert torch.equal(found[0]["x"], found[1]["x"]) and not torch.equal(found[0]["y"], found[1]["y"])

@@ -59,7 +59,7 @@ def test_a_run_keeps_what_it_has_learnt(fitted):
         ("y", False, "it is not of the whole scene"),
         ("light", True, ""),
     ]
-    assert run.parameters["kept"] == "learnt" and isinstance(run.guide.suits.__self__, ParameterGuide)
+    assert run.parameters["kept"] == "learnt" and isinstance(run.guide.with_parameters.__self__, ParameterGuide)
     assert run.config.parameters.rounds == 3
     log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in log if line["stage"] == "parameters"] == [1, 2, 3]
@@ -70,7 +70,7 @@ def test_all_that_draws_takes_them(fitted, call, tmp_path):
     guide = run.guide
     seed_everything(0)
     moved = sample(run.model, guide, 40).parameters
-    guide.suits = None
+    guide.with_parameters = None
     seed_everything(0)
     still = sample(run.model, guide, 40).parameters
     assert torch.equal(moved["x"], still["x"]) and not torch.equal(moved["light"], still["light"])
@@ -110,7 +110,7 @@ def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tm
     said = " ".join(done.err.split())
     assert "No site can be moved, so where things stand and how they look keeps the prior." in said
     run = RunFolder.at(out)
-    assert run.parameters["kept"] == "prior" and run.guide.suits is None
+    assert run.parameters["kept"] == "prior" and run.guide.with_parameters is None
     assert run.parameters["sites"][2]["because"] == "how near images look does not depend on it"
 
 

@@ -141,7 +141,7 @@ def lit(low: float, high: float, model) -> SceneModel:
 def test_a_site_of_the_scene_has_quantiles_of_what_it_was_and_what_it_became(learnt, discs):
     model = lit(0.0, 10.0, load_model(str(discs.file)))
     guide = copy.copy(model.prior)
-    guide.suits = (lambda model: lit(4.0, 5.0, load_model(str(discs.file)))) if learnt else None
+    guide.with_parameters = (lambda model: lit(4.0, 5.0, load_model(str(discs.file)))) if learnt else None
     about = {"learnt": False, "skill": None, "because": "it is not of the whole scene"}
     sites = [about | {"name": "light", "kinds": [], "learnt": learnt, "because": ""}]
     sites += [about | {"name": "x", "kinds": ["red"]}, about | {"name": "y", "kinds": []}]
@@ -165,7 +165,7 @@ def test_the_page_of_a_run_without_parameters_says_so(fitted, tmp_path):
 def test_the_page_shows_structure_alone_beside_all_that_was_learnt(fitted, tmp_path):
     shutil.copytree(fitted, tmp_path / "run")
     run = RunFolder.at(tmp_path / "run")
-    run.guide.suits = lambda model: model
+    run.guide.with_parameters = lambda model: model
     made = report(run, Display(), num=100, judged_by=0).read_text(encoding="utf-8")
     captions = [caption.split(":")[0] for caption in re.findall(r'<img alt="([^"]+)"', made)]
     assert captions == ["Prior", "Structure alone", "Structure and parameters", "Target"]
