@@ -199,7 +199,8 @@ def picture(histograms: list[dict[str, np.ndarray]], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
     axes.bar(range(len(histograms[0]["truth"])), histograms[0]["truth"], color="0.85", width=0.9, label="labels")
     for name, colour in (("prior", "tab:orange"), ("start", "tab:purple")):
-        axes.plot(histograms[0][name], "o--", color=colour, label=name)
+        if name in histograms[0]:  # a model whose guides are pretrained on the prior has no start of its own
+            axes.plot(histograms[0][name], "o--", color=colour, label=name)
     for i, found in enumerate(histograms):
         axes.plot(found["learnt"], "o-", color="tab:blue", alpha=0.6, label="learnt" if i == 0 else None)
     axes.set(xlabel="cars in an image", ylabel="share of images", xlim=(-0.6, most - 0.4))
