@@ -53,9 +53,6 @@ LIKELIHOOD = {
     "parameters.round_reader_steps": 6,
     "parameters.round_scene_renders": 16,
     "parameters.round_steps": 4,
-    "parameters.energy_steps": 2,
-    "parameters.energy_scenes": 8,
-    "parameters.weighted_scenes": 24,
     "refine.batches": 2,
 }
 HEADS = {"features.pairs": 24, "features.epochs": 1, "features.photographs": 24}

@@ -11,7 +11,10 @@ from hypothesis import HealthCheck, settings
 
 CI = os.environ.get("CI") == "true"
 # Files that take longest, first.
-LONG = ("test_cluster.py", "test_parameters.py", "test_joint_parameters.py", "test_interrupted.py", "test_docs.py")
+LONG = (
+    "test_cluster.py", "test_stochastic_em.py", "test_engine.py", "test_parameters.py", "test_joint_parameters.py",
+    "test_pretrained_fit.py", "test_meshes.py", "test_interrupted.py", "test_docs.py",
+)  # fmt: skip
 
 torch.set_num_threads(1)
 settings.register_profile(

@@ -4,6 +4,7 @@ Axis letters: L images, M nodes, K objects, S sites of nodes, G sites of scenes.
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -11,19 +12,16 @@ from torch import Tensor
 from probscene.model import SceneModel
 
 from ..training import of_prefix
-from .energy import GuideReadings
-from .global_head import GlobalHead
 from .graph import SceneGraph
-from .likelihood import Values
 from .missed_objects import MissedObjects
 from .reader import Detections, Reader
 from .reader_training import MIN_VISIBLE, SupervisedBatch
+from .recalibration import Recalibration
 from .scene_graph_builder import SceneGraphBuilder, fit_scene_graph_builder
 from .sites import Site, site_mask
 from .skill import MIN_OBJECTS, MIN_SD, Skill
+from .values import Values
 
-LOW_SKILL = 0.5  # below it, it is doubtful whether a site can be read in the target
-HIGH_SKILL = 0.9  # from it on, the error of readings needs no correction
 MAX_MATCH_DISTANCE = 12.0  # pixels from a detection to its object
 
 
@@ -44,21 +42,28 @@ class CalibratedReader:
         self.model, self.reader, self.node_sites, self.scene_sites = model, reader, node_sites, scene_sites
         self.skill: Skill | None = None
         self.num_readings = torch.zeros(0, dtype=torch.int64)
+        self.recalibration = Recalibration.identity(len(node_sites) + len(scene_sites))
 
     def state(self) -> dict[str, Tensor]:
         """All that ``restore`` needs, as named tensors."""
         tensors = {f"reader.{key}": value for key, value in self.reader.state_dict().items()}
         if self.skill is not None:
-            tensors |= {"skill.way": self.skill.way, "skill.share": self.skill.share, "readings": self.num_readings}
+            tensors |= {
+                "skill.geometry": self.skill.geometry,
+                "skill.explained": self.skill.explained,
+                "readings": self.num_readings,
+                "recalibration": torch.stack(self.recalibration),
+            }
         return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """As it was in a ``state``, among other tensors."""
         self.reader.load_state_dict(of_prefix(tensors, "reader."))
         self.reader.eval()
-        if "skill.way" in tensors:
-            self.skill = Skill(tensors["skill.way"], tensors["skill.share"])
+        if "skill.geometry" in tensors:
+            self.skill = Skill(tensors["skill.geometry"], tensors["skill.explained"])
             self.num_readings = tensors["readings"]
+            self.recalibration = Recalibration(*tensors["recalibration"].clone())
 
     def choose_threshold(self, valued: SupervisedBatch) -> tuple[Detections, Tensor]:
         """Choose the score from which on detections count: the lowest with the fewest errors in some renders (objects
@@ -76,20 +81,37 @@ class CalibratedReader:
             mistakes.append(number + int(enough.sum()) - 2 * hit)
         most = min(mistakes) + math.sqrt(min(mistakes))
         as_good = [threshold for threshold, some in zip(self.reader.thresholds, mistakes, strict=True) if some <= most]
-        self.reader.least.fill_(as_good[0])
-        enough = found.score > self.reader.least
+        self.reader.score_threshold.fill_(as_good[0])
+        enough = found.score > self.reader.score_threshold
         return found.select(enough), which[enough]
 
     def calibrate(self, valued: SupervisedBatch, images: Tensor) -> None:
         """Measure its skill on renders of the prior, and how often it detects each class in the target's images."""
         found, which = self.choose_threshold(valued)
         of_nodes = Skill.from_readings(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
-        of_scenes = Skill.from_readings(found.overall, valued.overall)
+        of_scenes = Skill.from_readings(found.scene_raw, valued.scene_u)
         self.skill = Skill(*(torch.cat(pair) for pair in zip(of_nodes, of_scenes, strict=True)))
         objects = self.reader.detect(images).label.bincount(minlength=len(self.model.classes))
         of_class = dict(zip(self.model.classes, objects.tolist(), strict=True))
         number = [sum(of_class.get(kind, 0) for kind in site.kinds) for site in self.node_sites]
         self.num_readings = torch.tensor([*number, *(len(images) for _ in self.scene_sites)], dtype=torch.int64)
+
+    def recalibrate(self, valued: SupervisedBatch) -> None:
+        """Make readings likelihoods by renders like the target, whose u are draws of the prior where they are known."""
+        assert self.skill is not None
+        found = self.reader.detect(valued.drawn.image)
+        which = matched(found, valued)
+        is_it = which >= 0
+        of_nodes = self.skill.select(slice(0, len(self.node_sites)))
+        of_scenes = self.skill.select(slice(len(self.node_sites), None))
+        parts = (
+            Recalibration.from_readings(*skill.read(raw), u, skill.turns)
+            for skill, raw, u in (
+                (of_nodes, found.raw[is_it], valued.u[found.image, which][is_it]),
+                (of_scenes, found.scene_raw, valued.scene_u),
+            )
+        )
+        self.recalibration = Recalibration(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
 
     @property
     def good(self) -> Tensor:
@@ -110,38 +132,6 @@ class CalibratedReader:
         node, scene = self.good.tensor_split([len(self.node_sites)])
         return node.nonzero().flatten(), scene.nonzero().flatten()
 
-    @property
-    def noisy(self) -> Tensor:
-        """Of the sites that are learnt, in the order of ``columns``, which are read with an error of some size."""
-        assert self.skill is not None
-        return self.skill.share[self.good] < HIGH_SKILL
-
-    @property
-    def low_skill_sites(self) -> frozenset[str]:
-        """Names of the sites that are learnt, but read with little skill."""
-        assert self.skill is not None
-        each = zip((*self.node_sites, *self.scene_sites), self.skill.share.tolist(), strict=True)
-        return frozenset(site.name for site, share in each if site in self.good_sites and share < LOW_SKILL)
-
-    def use_refit_head(self) -> GlobalHead:
-        """The head that sites of scenes with low skill are read by from now on."""
-        anew = [site.name in self.low_skill_sites for site in self.scene_sites]
-        self.reader.anew.copy_(torch.tensor(anew))
-        return self.reader.again
-
-    def unidentifiable_sites(self, valued: SupervisedBatch) -> dict[str, float]:
-        """Which low-skill sites cannot be read in renders that look like the target, but have the prior's values of
-        these sites: what the prior's renders show may be hidden there, as a sun behind clouds. By name, the share of
-        the variance that is explained."""
-        assert self.skill is not None
-        found = self.reader.detect(valued.drawn.image)
-        which, (nodes, scenes) = matched(found, valued), self._skills()
-        of_nodes = nodes.explained_variance(found.raw[which >= 0], valued.u[found.image, which][which >= 0])
-        there = Skill(self.skill.way, torch.cat([of_nodes, scenes.explained_variance(found.overall, valued.overall)]))
-        seen = (there.readable | there.share.isnan()).tolist()
-        each = zip((*self.node_sites, *self.scene_sites), there.share.tolist(), seen, strict=True)
-        return {site.name: share for site, share, seen in each if site.name in self.low_skill_sites and not seen}
-
     def why_not(self, site: Site) -> str:
         """Why a site is not learnt; empty where it is."""
         if site in self.good_sites:
@@ -155,12 +145,12 @@ class CalibratedReader:
     def readings(self, images: Tensor) -> dict[str, Tensor]:
         """u of each learnt site as it is read in ``(L, C, H, W)`` uint8 images, of all objects that have it or of all
         scenes."""
-        found, (nodes, scenes) = self.reader.detect(images), self._skills()
+        found, (nodes, scenes) = self.reader.detect(images), self._readers()
         kind = kinds_of(self.model, found.label)
         has = site_mask(self.model.grammar, self.node_sites, kind).unbind(1)
-        each = [u[there] for u, there in zip(nodes.read(found.raw)[0].unbind(1), has, strict=True)]
+        each = [u[there] for u, there in zip(nodes(found.raw)[0].unbind(1), has, strict=True)]
         sites = (*self.node_sites, *self.scene_sites)
-        columns = zip(sites, [*each, *scenes.read(found.overall)[0].unbind(1)], strict=True)
+        columns = zip(sites, [*each, *scenes(found.scene_raw)[0].unbind(1)], strict=True)
         return {site.name: u.clamp(0, 1) for site, u in columns if site in self.good_sites}
 
     def values(
@@ -168,33 +158,23 @@ class CalibratedReader:
         builder: SceneGraphBuilder,
         found: Detections,
         number: int,
-        of: Tensor | None = None,
         missed: MissedObjects | None = None,
-    ) -> tuple[Values, Tensor]:
-        """Scene graphs of the detections in so many images and of imputed missed objects, with the learnt sites; and
-        ``of (K,)`` of each object, ``(L, M)`` int64, -1 where there is none."""
-        skills, (node, scene) = self._skills(), self.columns
-        mean, sd = (part[:, node] for part in skills[0].read(found.raw))
-        scene_mean, scene_sd = (part[:, scene] for part in skills[1].read(found.overall))
-        of, weight = torch.full((len(mean),), -1) if of is None else of, torch.ones(len(mean))
+    ) -> Values:
+        """Scene graphs of the detections in so many images and of imputed missed objects, with the learnt sites."""
+        assert self.skill is not None
+        (of_nodes, of_scenes), (node, scene) = self._readers(), self.columns
+        mean, sd = (part[:, node] for part in of_nodes(found.raw))
+        scene_mean, scene_sd = (part[:, scene] for part in of_scenes(found.scene_raw))
+        weight = torch.ones(len(mean))
         if missed is not None:
             found, u, weight = missed.impute(found, number)
             mean, sd = torch.cat([mean, u]), torch.cat([sd, torch.full_like(u, MIN_SD)])
-            of = torch.cat([of, of.new_full((len(u),), -1)])
-        both = torch.cat([mean, of[:, None].to(mean.dtype), weight[:, None]], 1)
+        both = torch.cat([mean, weight[:, None]], 1)
         kind, parent, both, sd = builder.values(found, number, both, sd)
         has = site_mask(self.model.grammar, tuple(self.node_sites[i] for i in node.tolist()), kind)
-        turns = torch.cat([skills[0].turns[node], skills[1].turns[scene]])
-        mean, sd = (part.where(has, torch.nan) for part in (both[..., :-2], sd))
-        values = Values(kind, parent, mean, sd, scene_mean, scene_sd, turns, both[..., -1].nan_to_num(0.0))
-        return values, both[..., -2].nan_to_num(-1).long()
-
-    def guide_readings(self, builder: SceneGraphBuilder, valued: SupervisedBatch) -> GuideReadings:
-        """Its readings of renders, with the true values."""
-        found = self.reader.detect(valued.drawn.image)
-        read, which = self.values(builder, found, len(valued.kind), matched(found, valued))
-        node, scene = self.columns
-        return GuideReadings(valued.kind, valued.parent, valued.u[..., node], valued.overall[:, scene], read, which)
+        turns, outliers = self.skill.turns[self.good], self.recalibration.outliers[self.good]
+        mean, sd = (part.where(has, torch.nan) for part in (both[..., :-1], sd))
+        return Values(kind, parent, mean, sd, scene_mean, scene_sd, turns, both[..., -1].nan_to_num(0.0), outliers)
 
     def scene_graph_builder(self, valued: SupervisedBatch) -> SceneGraphBuilder:
         """Fitted to some scenes of the prior."""
@@ -213,11 +193,16 @@ class CalibratedReader:
             valued, kinds_of(self.model, torch.arange(len(self.model.classes))), there, self.columns[0]
         )
 
-    def _skills(self) -> tuple[Skill, Skill]:
-        """Of the sites of nodes, and of scenes."""
-        assert self.skill is not None
-        S = len(self.node_sites)
-        return Skill(*(part[:S] for part in self.skill)), Skill(*(part[S:] for part in self.skill))
+    def _readers(self) -> tuple[Callable[[Tensor], tuple[Tensor, Tensor]], Callable[[Tensor], tuple[Tensor, Tensor]]]:
+        """Mean and standard deviation of u, recalibrated, from outputs for nodes and for scenes."""
+        skill, S = self.skill, len(self.node_sites)
+        assert skill is not None
+
+        def of(sites: slice) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+            own = Recalibration(*(part[sites] for part in self.recalibration))
+            return lambda raw: own.apply(*skill.select(sites).read(raw))
+
+        return of(slice(0, S)), of(slice(S, None))
 
 
 def kinds_of(model: SceneModel, label: Tensor) -> Tensor:

@@ -76,19 +76,23 @@ class Learnt(Messenger):
 
     Args:
         guide: the guide.
+        prior_probability: with which a value is a draw of the prior instead, each for itself: values that nothing else
+            in the scene tells of, for a network to be trained on. The guide's other draws do not go by them.
 
     Attributes:
         class_nodes, graph: of what the program has derived; of all scenarios where it is of several.
         scene, values: u of the scene's and of the class nodes' learnt sites so far, ``(N, G)`` and ``(N, M', S)``; NaN
-            where there are none.
+            where there are none. Of the guide's own draws, where the prior's take their place.
+        scene_from_prior, from_prior: bool of the same shapes, which values are the prior's.
     """
 
-    def __init__(self, guide: ParameterGuide):
+    def __init__(self, guide: ParameterGuide, prior_probability: float = 0.0):
         super().__init__()
-        self.guide = guide
+        self.guide, self.prior_probability = guide, prior_probability
         self.class_nodes: ClassNodes | None = None
         self.graph = SceneGraph.from_nodes(*torch.full((2, 0, 1), -1))
         self.scene, self.values = torch.zeros(0), torch.zeros(0)
+        self.scene_from_prior, self.from_prior = torch.zeros(0), torch.zeros(0)
 
     def _pyro_post_derive(self, msg: Any) -> None:
         model = self.guide.model
@@ -99,6 +103,8 @@ class Learnt(Messenger):
         N, M = self.class_nodes.kind.shape
         self.scene = torch.full((N, len(self.guide.scene_sites)), torch.nan)
         self.values = torch.full((N, M, len(self.guide.node_sites)), torch.nan)
+        self.scene_from_prior = torch.zeros_like(self.scene, dtype=torch.bool)
+        self.from_prior = torch.zeros_like(self.values, dtype=torch.bool)
 
     def _pyro_sample(self, msg: Any) -> None:
         if self._own(msg) in self.guide.prior_sites:
@@ -110,7 +116,7 @@ class Learnt(Messenger):
     def _pyro_post_sample(self, msg: Any) -> None:
         learnt = msg["fn"] if isinstance(msg["fn"], _OfSites) else self._learnt(msg)
         if learnt is not None:
-            learnt.keep(msg["value"])
+            learnt.keep(learnt.own_u(msg["value"]))
 
     def _learnt(self, msg: Any) -> "_OfSites | None":
         """The distribution that the guide has for a site; None where it is not of the guide."""
@@ -145,6 +151,7 @@ class _OfSites(TorchDistribution):
         self.base, self.learnt, self.index, self.has = base, learnt, index, has
         self.net, self.graph, self.class_nodes = learnt.guide.net, learnt.graph, cast(ClassNodes, learnt.class_nodes)
         self.scene, self.values = learnt.scene, learnt.values
+        self.drawn_u: Tensor | None = None  # of the guide, where the prior's draws may take its place
         super().__init__(base.batch_shape, validate_args=False)
 
     @property
@@ -157,8 +164,14 @@ class _OfSites(TorchDistribution):
         if sample_shape:
             raise NotImplementedError("expected samples one batch at a time; put the number of scenes in the plate.")
         drawn = self.base.sample()
-        v = self.base.cdf(drawn).clamp(U_EPS, 1 - U_EPS)
-        return torch.where(self.has, self.base.icdf(self.quantile(v)), drawn)
+        u = self.quantile(self._u(drawn))
+        value = torch.where(self.has, self.base.icdf(u), drawn)
+        if not self.learnt.prior_probability:
+            return value
+        self.drawn_u = u
+        from_prior = torch.rand(value.shape) < self.learnt.prior_probability
+        self.note_prior(from_prior & self.has)
+        return torch.where(from_prior, self.base.sample(), value)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Of each node, given the nodes and sites before; 0 where a node has none."""
@@ -173,9 +186,17 @@ class _OfSites(TorchDistribution):
         """``log q(u | before)``."""
         raise NotImplementedError
 
-    def keep(self, value: Tensor) -> None:
-        """Note what was sampled, for what comes after it."""
+    def keep(self, u: Tensor) -> None:
+        """Note u, for what comes after it."""
         raise NotImplementedError
+
+    def note_prior(self, from_prior: Tensor) -> None:
+        """Note which values are the prior's."""
+        raise NotImplementedError
+
+    def own_u(self, value: Tensor) -> Tensor:
+        """u of the guide's own draw, or of a value."""
+        return self._u(value) if self.drawn_u is None else self.drawn_u
 
     def _u(self, value: Tensor) -> Tensor:
         return self.base.cdf(value).clamp(U_EPS, 1 - U_EPS)
@@ -193,8 +214,11 @@ class OfNodes(_OfSites):
         found = self.net.node_mixture(self.graph, self.scene, values, self.index).log_prob(self.class_nodes.gather(u))
         return self.class_nodes.scatter(found, torch.zeros_like(u))
 
-    def keep(self, value: Tensor) -> None:
-        self.learnt.values = self._with(self.learnt.values, self._u(value))
+    def keep(self, u: Tensor) -> None:
+        self.learnt.values = self._with(self.learnt.values, u)
+
+    def note_prior(self, from_prior: Tensor) -> None:
+        self.learnt.from_prior = self._with(self.learnt.from_prior, from_prior)
 
     def _with(self, values: Tensor, u: Tensor) -> Tensor:
         """The values, with u at the nodes that have it: a scenario's program leaves other scenes as they are."""
@@ -210,9 +234,14 @@ class OfScenes(_OfSites):
     def density(self, u: Tensor) -> Tensor:
         return self.net.scene_mixture(self.graph, self.scene, self.index).log_prob(self._one(u)).expand_as(u)
 
-    def keep(self, value: Tensor) -> None:
-        u, has = self._one(self._u(value)), self.has.any(1, keepdim=True)
-        self.learnt.scene = _put(self.learnt.scene.unsqueeze(1), self.index, u, has).squeeze(1)
+    def keep(self, u: Tensor) -> None:
+        self.learnt.scene = self._with(self.learnt.scene, self._one(u))
+
+    def note_prior(self, from_prior: Tensor) -> None:
+        self.learnt.scene_from_prior = self._with(self.learnt.scene_from_prior, from_prior.any(1, keepdim=True))
+
+    def _with(self, scene: Tensor, u: Tensor) -> Tensor:
+        return _put(scene.unsqueeze(1), self.index, u, self.has.any(1, keepdim=True)).squeeze(1)
 
     def _one(self, values: Tensor) -> Tensor:
         """``(N, 1)``."""

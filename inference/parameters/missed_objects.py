@@ -94,7 +94,7 @@ class MissedObjects(NamedTuple):
                 torch.cat([found.centre, self.centre[which]]),
                 torch.cat([found.parent, self.parent[which]]),
                 torch.cat([found.raw, found.raw.new_zeros(len(which), *found.raw.shape[1:])]),
-                found.overall,
+                found.scene_raw,
             ),
             self.u[which],
             torch.cat([torch.ones(len(found.label)), weight[self.label[which]]]),

@@ -107,46 +107,10 @@ class ParameterNet(nn.Module):
             has: ``(N, M)`` bool, which nodes have the site; others keep ``v``.
         """
         some = NodeSubset.from_mask(has)
-        given = self.given(graph, scene, values, s, some)
-        u = v.new_full((*some.index.shape, 1), torch.nan)  # parents and siblings before come earlier
-        at, memory = v.gather(1, some.index), v.new_zeros(len(v), self.cell.hidden_size)
-        w: Any = self.cell  # torch names its weights as it makes them
+        nodes, at = NodeSequence(self, self.given(graph, scene, values, s, some), s), v.gather(1, some.index)
         for r in range(some.index.shape[1]):
-            here = slice(r, r + 1)
-            place = given.place[:, here] + self.mates(given.links.place[:, here], given.links.last[:, here], u[..., 0])
-            for number, index in enumerate((given.parent, given.before)):
-                place = place + self._of_one(self.of_values, number + 1, gather_nodes(u, index[:, here]), s)
-            found = LogisticMixture.from_raw(self._raw(place[:, 0], memory, s)).icdf(at[:, r])
-            found = found.where(some.there[:, r], torch.nan)[:, None, None]
-            u = torch.cat([u[:, :r], found, u[:, r + 1 :]], 1)
-            x = F.silu(given.gru_input[:, r] + self._of_one(self.read, 0, found, s)[:, 0])
-            memory = torch.gru_cell(x, memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
-        return some.scatter(u)[..., 0].where(has, v)
-
-    def reparameterise(
-        self, graph: SceneGraph, scene: Tensor, values: Tensor, trained: Sequence[bool]
-    ) -> tuple[Tensor, Tensor]:
-        """``scene (N, G)`` and ``values (N, M, S)`` of a sample; those of some sites each with the gradient that it has
-        as a quantile of the mixture that it was drawn from, what comes before it held [1].
-
-        Args:
-            trained: ``S + G``, which of the sites of nodes and then of scenes; the others have no gradient.
-
-        References:
-            [1] Figurnov, Mohamed, Mnih, *Implicit reparameterization gradients*, NeurIPS 2018.
-        """
-        scenes = [
-            self.scene_mixture(graph, scene, g).reparameterise(u[:, None].nan_to_num(0.5))[:, 0] if moves else u
-            for g, (u, moves) in enumerate(zip(scene.unbind(1), trained[self.node_sites :], strict=True))
-        ]
-        nodes = [
-            self.node_mixture(graph, scene, values, s).reparameterise(u.nan_to_num(0.5)) if moves else u
-            for s, (u, moves) in enumerate(zip(values.unbind(2), trained[: self.node_sites], strict=True))
-        ]
-        return (
-            torch.stack(scenes, 1).where(~scene.isnan(), torch.nan) if scenes else scene,
-            torch.stack(nodes, 2).where(~values.isnan(), torch.nan) if nodes else values,
-        )
+            nodes.append(nodes.mixture().icdf(at[:, r]))
+        return some.scatter(nodes.u)[..., 0].where(has, v)
 
     def given(
         self,
@@ -270,6 +234,56 @@ class Conditioning(NamedTuple):
     parent: Tensor
     before: Tensor
     links: SiblingLinks
+
+    def select(self, rows: Tensor) -> "Conditioning":
+        """Of some of the scenes."""
+        return Conditioning(
+            NodeSubset(*(part[rows] for part in self.subset)),
+            self.place[rows],
+            self.gru_input[rows],
+            self.parent[rows],
+            self.before[rows],
+            SiblingLinks(*(part[rows] for part in self.links)),
+        )
+
+
+class NodeSequence:
+    """The nodes of scenes that have a site, one after the other: each one's mixture, given the u of those before.
+
+    Args:
+        net: the network.
+        given: what the mixtures depend on beside that.
+        s: number of the site.
+
+    Attributes:
+        u: ``(N, R, 1)`` of the nodes so far; NaN for the others.
+    """
+
+    def __init__(self, net: ParameterNet, given: Conditioning, s: int):
+        self.net, self.given, self.s, self.done = net, given, s, 0
+        self.u = given.place.new_full((*given.subset.index.shape, 1), torch.nan)  # what nodes depend on comes earlier
+        self.memory = given.place.new_zeros(len(self.u), net.cell.hidden_size)
+
+    def mixture(self) -> LogisticMixture:
+        """Of the next node of each scene, ``(N,)``."""
+        net, given, here = self.net, self.given, slice(self.done, self.done + 1)
+        place = given.place[:, here] + net.mates(given.links.place[:, here], given.links.last[:, here], self.u[..., 0])
+        for number, index in enumerate((given.parent, given.before)):
+            place = place + net._of_one(net.of_values, number + 1, gather_nodes(self.u, index[:, here]), self.s)
+        return LogisticMixture.from_raw(net._raw(place[:, 0], self.memory, self.s))
+
+    def append(self, u: Tensor) -> None:
+        """Go on, with the next node's u ``(N,)``."""
+        net, r, w = self.net, self.done, cast(Any, self.net.cell)  # torch names its weights as it makes them
+        found = u.where(self.given.subset.there[:, r], torch.nan)[:, None, None]
+        self.u = torch.cat([self.u[:, :r], found, self.u[:, r + 1 :]], 1)
+        x = F.silu(self.given.gru_input[:, r] + net._of_one(net.read, 0, found, self.s)[:, 0])
+        self.memory = torch.gru_cell(x, self.memory, w.weight_ih_l0, w.weight_hh_l0, w.bias_ih_l0, w.bias_hh_l0)
+        self.done += 1
+
+    def select(self, rows: Tensor) -> None:
+        """Go on with some of the scenes, ``(N',)``; one may come several times."""
+        self.given, self.u, self.memory = self.given.select(rows), self.u[rows], self.memory[rows]
 
 
 @torch.no_grad()

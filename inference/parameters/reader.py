@@ -21,7 +21,6 @@ from .backbone import WIDTH, Backbone
 from .global_head import GlobalHead, global_features
 
 HIDDEN = 96
-REFIT_DROPOUT = 0.5  # of the head that is refitted
 SCORE_THRESHOLDS = 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6  # of which calibration chooses one
 MAX_OBJECTS = 200  # objects in an image
 LOG_SD_RANGE = -6.0, 0.5  # of u, least and largest
@@ -37,7 +36,7 @@ class Detections(NamedTuple):
         label: ``(K,)`` int64 class.
         centre, parent: ``(K, 2)`` x and y of its middle, and of its parent's, pixels.
         raw: ``(K, S, 2 + HARMONICS)`` the network's output for u.
-        overall: ``(N, G, 2 + HARMONICS)`` of the scenes' sites.
+        scene_raw: ``(N, G, 2 + HARMONICS)`` of the scenes' sites.
     """
 
     image: Tensor
@@ -46,68 +45,62 @@ class Detections(NamedTuple):
     centre: Tensor
     parent: Tensor
     raw: Tensor
-    overall: Tensor
+    scene_raw: Tensor
 
     def select(self, which: Tensor) -> "Detections":
         """Some of the objects, ``(K,)`` bool."""
-        return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "overall"})
+        return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "scene_raw"})
 
 
 class Reader(nn.Module):
     """Heads on a backbone.
 
     Args:
-        eye: the backbone.
+        backbone: the backbone.
         classes, sites, scene_sites: C, S and G.
 
     Attributes:
-        overall: the head for the scenes' sites.
-        again: the head that is refitted for some of them.
-        anew: ``(G,)`` bool, for which.
+        scene_head: for the scenes' sites.
         thresholds: of scores, from which ``CalibratedReader`` chooses.
-        least: the threshold that is chosen; detections have higher scores.
+        score_threshold: the one that is chosen; detections have higher scores.
     """
 
-    least: Tensor
-    anew: Tensor
+    score_threshold: Tensor
 
-    def __init__(self, eye: Backbone, classes: int, sites: int, scene_sites: int):
+    def __init__(self, backbone: Backbone, classes: int, sites: int, scene_sites: int):
         super().__init__()
-        self.eye, self.classes, self.sites, self.scene_sites = eye, classes, sites, scene_sites
-        self.what = nn.Conv2d(WIDTH, 1 + classes, 1)
+        self.backbone, self.classes, self.sites, self.scene_sites = backbone, classes, sites, scene_sites
+        self.class_head = nn.Conv2d(WIDTH, 1 + classes, 1)
         self.hidden = nn.Linear(WIDTH + 2, HIDDEN)
-        self.values = nn.Linear(HIDDEN, 2 + sites * (2 + HARMONICS))
-        self.overall = GlobalHead(max(1, scene_sites), 2 + HARMONICS)
-        with torch.random.fork_rng(devices=[]):
-            self.again = GlobalHead(max(1, scene_sites), 2 + HARMONICS, REFIT_DROPOUT)
-        self.register_buffer("anew", torch.zeros(max(1, scene_sites), dtype=torch.bool))
+        self.value_head = nn.Linear(HIDDEN, 2 + sites * (2 + HARMONICS))
+        self.scene_head = GlobalHead(max(1, scene_sites), 2 + HARMONICS)
         self.thresholds = SCORE_THRESHOLDS
-        self.register_buffer("least", torch.tensor(SCORE_THRESHOLDS[0]))
+        self.register_buffer("score_threshold", torch.tensor(SCORE_THRESHOLDS[0]))
         with torch.no_grad():  # nearly every cell holds nothing
-            self.what.weight.mul_(0.3)
-            bias = cast(Tensor, self.what.bias)
+            self.class_head.weight.mul_(0.3)
+            bias = cast(Tensor, self.class_head.bias)
             bias.zero_()
             bias[0] = 3.0
 
     def forward(self, entered: Tensor) -> tuple[Tensor, Tensor]:
-        """Of what has entered the eye: what it sees ``(N, WIDTH, h, w)``, and logits ``(N, 1 + C, h, w)``."""
-        seen = self.eye(entered)
-        return seen, self.what(seen)
+        """Of what has entered the backbone: what it sees ``(N, WIDTH, h, w)``, and logits ``(N, 1 + C, h, w)``."""
+        seen = self.backbone(entered)
+        return seen, self.class_head(seen)
 
-    def at(self, seen: Tensor, image: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+    def values_at(self, seen: Tensor, image: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
         """Of cells ``(...)``, as few hold an object: how many cells away its parent is ``(..., 2)``; the output for u
         ``(..., S, 2 + HARMONICS)``."""
         h, w = seen.shape[-2:]
         place = torch.stack([2 * column / max(1, w - 1) - 1, 2 * row / max(1, h - 1) - 1], -1)
         hidden = F.relu(self.hidden(torch.cat([seen[image, :, row, column], place], -1)))
-        parent, values = self.values(hidden).tensor_split([2], -1)
+        parent, values = self.value_head(hidden).tensor_split([2], -1)
         return parent, values.unflatten(-1, (self.sites, 2 + HARMONICS))
 
     @torch.no_grad()
     def detect(self, images: Tensor) -> Detections:
         """Objects in ``(N, 1 or 3, H, W)`` uint8 images."""
         found = self.detect_all(images)
-        return found.select(found.score > self.least)
+        return found.select(found.score > self.score_threshold)
 
     @torch.no_grad()
     def detect_all(self, images: Tensor) -> Detections:
@@ -120,24 +113,24 @@ class Reader(nn.Module):
         """How many objects of each class it detects, ``(N, C)``, in ``(N, 1 or 3, H, W)`` uint8 images."""
         counts = torch.zeros(len(images), self.classes)
         for i, some in enumerate(images.split(64)):
-            mass = self(self.eye.enter(some))[1].softmax(1)[:, 1:]
-            n, y, x, inside = find_objects(mass.sum(1), float(self.least))
+            mass = self(self.backbone.enter(some))[1].softmax(1)[:, 1:]
+            n, y, x, inside = find_objects(mass.sum(1), float(self.score_threshold))
             label = held(mass, n, y, x)[0]
             counts.index_put_((n + 64 * i, label), torch.ones(len(n)), accumulate=True)
         return counts
 
     def _detect(self, images: Tensor, first: int) -> Detections:
-        entered = self.eye.enter(images)
+        entered = self.backbone.enter(images)
         seen, logits = self(entered)
         mass = logits.softmax(1)[:, 1:]
         n, y, x, inside = find_objects(mass.sum(1), self.thresholds[0])
         label, image, rows, columns = held(mass, n, y, x)
         share = mass[image, label[:, None], rows, columns]
         share = (share / share.sum(1, keepdim=True).clamp(min=1e-6)).unsqueeze(-1)  # of what each of the cells says
-        parent, values = self.at(seen, image, rows, columns)
+        parent, values = self.values_at(seen, image, rows, columns)
         here = torch.stack([columns, rows], -1) + 0.5
-        scale = self.eye.cell
-        overall = self._overall(entered) if self.scene_sites else seen.new_zeros(len(seen), 0, 2 + HARMONICS)
+        scale = self.backbone.cell
+        scene_raw = self._read_scene(entered) if self.scene_sites else seen.new_zeros(len(seen), 0, 2 + HARMONICS)
         return Detections(
             n + first,
             inside,
@@ -145,13 +138,11 @@ class Reader(nn.Module):
             scale * (share * here).sum(1),
             scale * (share * (here + parent)).sum(1),
             (share.unsqueeze(-1) * values).sum(1),
-            overall,
+            scene_raw,
         )
 
-    def _overall(self, entered: Tensor) -> Tensor:
-        x = global_features(entered)
-        output = self.overall.from_features(x)
-        return self.again.from_features(x).where(self.anew[:, None], output) if self.anew.any() else output
+    def _read_scene(self, entered: Tensor) -> Tensor:
+        return self.scene_head.from_features(global_features(entered))
 
 
 def find_objects(mass: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -200,14 +191,19 @@ def value_loss(output: Tensor, u: Tensor) -> Tensor:
     times its standard deviation without gradient [1], and the squared errors of the circles. Without the factor the
     gradient of a site that is read sharply, a place, would be all that shared weights follow."""
     mean, sd = normal(output)
-    z, whole = (u - mean) / sd, _phi((1 - mean) / sd) - _phi(-mean / sd)
-    nats = 0.5 * z.square().clamp(max=50.0) + sd.log() + whole.clamp(min=1e-6).log()
+    z, whole = (u - mean) / sd, cut_off_mass(mean, sd)
+    nats = 0.5 * z.square().clamp(max=50.0) + sd.log() + whole.log()
     return 2 * sd.detach() * nats + (output[..., 2:] - harmonics(u)).square().sum(-1)
 
 
 def normal(output: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation ``(...)`` of the normal distribution, before it is cut off."""
     return output[..., 0].clamp(-1.0, 2.0), output[..., 1].clamp(*LOG_SD_RANGE).exp()
+
+
+def cut_off_mass(mean: Tensor, sd: Tensor) -> Tensor:
+    """The probability of 0..1 under a normal distribution."""
+    return (_phi((1 - mean) / sd) - _phi(-mean / sd)).clamp(min=1e-6)
 
 
 def truncated_mean(mean: Tensor, sd: Tensor) -> Tensor:

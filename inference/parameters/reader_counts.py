@@ -11,7 +11,7 @@ from ..features.counting.net import CountNet
 from .backbone import RenderBackbone
 from .reader import Reader
 
-COUNTING_PREFIXES = ("eye.", "what.", "least")  # parts of a reader that find objects
+COUNTING_PREFIXES = ("backbone.", "class_head.", "score_threshold")  # parts of a reader that find objects
 
 
 class ReaderCounts:

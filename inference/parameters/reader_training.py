@@ -37,7 +37,7 @@ class SupervisedBatch(NamedTuple):
         parent: ``(N, M)`` int64 node index of the nearest parent that has a class, -1 for none.
         group: ``(N, M)`` int64 node index in the derivation of the parent, whether that has a class or not.
         u: ``(N, M, S)``, NaN where a node has none.
-        overall: ``(N, G)`` of the scenes' sites.
+        scene_u: ``(N, G)`` of the scenes' sites.
     """
 
     drawn: Examples
@@ -45,7 +45,7 @@ class SupervisedBatch(NamedTuple):
     parent: Tensor
     group: Tensor
     u: Tensor
-    overall: Tensor
+    scene_u: Tensor
 
     def select(self, rows: slice) -> "SupervisedBatch":
         """Some of the scenes."""
@@ -76,7 +76,7 @@ class ReaderTraining(AdamTraining):
         learning_rate: float = 4e-3,
         seed: int = 0,
     ):
-        pretrained_parts = [parameter for part in reader.eye.pretrained_parts for parameter in part.parameters()]
+        pretrained_parts = [parameter for part in reader.backbone.pretrained_parts for parameter in part.parameters()]
         rest = [
             parameter for parameter in reader.parameters() if not any(parameter is other for other in pretrained_parts)
         ]
@@ -86,7 +86,7 @@ class ReaderTraining(AdamTraining):
         ]
         adam = torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
         super().__init__(reader, adam, steps, seed, warmup_steps=30)
-        self.reader, self.draw, self.images = reader, draw, reader.eye.images_per_step(images)
+        self.reader, self.draw, self.images = reader, draw, reader.backbone.images_per_step(images)
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
@@ -97,7 +97,7 @@ class GlobalHeadTraining(AdamTraining):
     """Resumable training of an ``GlobalHead``. In its first half renders are drawn, from all of which it learns.
 
     Args:
-        overall: trained in place.
+        head: trained in place.
         draw: so many images as they enter, and the u of their scenes' sites ``(N, G)``, NaN where there is none.
         renders: in all.
         learning_rate: the largest.
@@ -108,16 +108,16 @@ class GlobalHeadTraining(AdamTraining):
 
     def __init__(
         self,
-        overall: GlobalHead,
+        head: GlobalHead,
         draw: Callable[[int], tuple[Tensor, Tensor]],
         renders: int = 4096,
         learning_rate: float = 2e-3,
         seed: int = 0,
     ):
-        adam = torch.optim.AdamW(overall.parameters(), lr=learning_rate, weight_decay=1e-2)
-        super().__init__(overall, adam, -(-renders // RENDERS_PER_STEP), seed, warmup_steps=30)
-        self.overall, self.draw, self.drawn = overall, draw, 0
-        self.features, self.u = torch.empty(renders, NUM_FEATURES), torch.empty(renders, overall.sites)
+        adam = torch.optim.AdamW(head.parameters(), lr=learning_rate, weight_decay=1e-2)
+        super().__init__(head, adam, -(-renders // RENDERS_PER_STEP), seed, warmup_steps=30)
+        self.head, self.draw, self.drawn = head, draw, 0
+        self.features, self.u = torch.empty(renders, NUM_FEATURES), torch.empty(renders, head.sites)
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
@@ -128,7 +128,7 @@ class GlobalHeadTraining(AdamTraining):
         torch.set_rng_state(state)
         rows = torch.randint(self.drawn, (SCENE_IMAGES,))
         u = self.u[rows]
-        loss = value_loss(self.overall.from_features(self.features[rows]), u.nan_to_num(0.5))
+        loss = value_loss(self.head.from_features(self.features[rows]), u.nan_to_num(0.5))
         return loss.where(~u.isnan(), 0.0).sum(1).mean()
 
     @torch.no_grad()
@@ -138,21 +138,21 @@ class GlobalHeadTraining(AdamTraining):
         images, self.u[rows] = self.draw(rows.stop - rows.start)
         self.features[rows] = global_features(images)
         if not self.drawn:
-            self.overall.fit_normalisation(self.features[rows])
+            self.head.fit_normalisation(self.features[rows])
         self.drawn = rows.stop
 
 
 def reader_loss(reader: Reader, valued: SupervisedBatch) -> Tensor:
     """Cross-entropy of the cells, the error of where parents are, and of u, summed over an image's objects."""
-    drawn, scale = valued.drawn, reader.eye.cell
-    seen, logits = reader(reader.eye.enter(drawn.image))
+    drawn, scale = valued.drawn, reader.backbone.cell
+    seen, logits = reader(reader.backbone.enter(drawn.image))
     h, w = logits.shape[-2:]
     label = drawn.label.masked_fill(drawn.visible < MIN_VISIBLE, -1)
     target = cells(drawn.centre / scale * CELL, label, reader.classes, h, w)
     entropy = -(target * F.log_softmax(logits, 1)).sum((1, 2, 3)).mean()
     parts = zip(*shares(drawn.centre / scale * CELL, label, h, w), strict=True)
     n, m, i, j, share = (torch.cat(part) for part in parts)
-    parent, output = reader.at(seen, n, i, j)
+    parent, output = reader.values_at(seen, n, i, j)
     u = valued.u[n, m]
     of_values = value_loss(output, u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
     has = (valued.parent[n, m] >= 0).float()

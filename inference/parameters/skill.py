@@ -14,7 +14,7 @@ from .reader import normal, truncated_mean
 
 LINE, CIRCLE, TWICE = range(3)
 MIN_SKILL = 0.2  # of a site that is learnt
-GEOMETRY_MARGINS = 0.05, 0.15  # by which a circle, and one that u goes round twice, must explain more
+CIRCLE_REMAINDER = 0.8  # of the variance that a line leaves, and a circle of what it goes round once, at most
 MIN_OBJECTS = 20  # or readings of a site in the target, to conclude anything from
 MIN_SD = 2e-3
 NUM_GUESSES = 41  # constants, of which the best is the guess without a reading
@@ -25,33 +25,37 @@ class Skill(NamedTuple):
     """Of each site.
 
     Attributes:
-        way: ``(S,)`` int64, ``LINE``, ``CIRCLE`` or ``TWICE``.
-        share: ``(S,)`` of the variance that is explained, at least; NaN where the site was seen in fewer than two
-            objects.
+        geometry: ``(S,)`` int64, ``LINE``, ``CIRCLE`` or ``TWICE``.
+        explained: ``(S,)`` share of the variance that a reading explains, at least; NaN where the site was seen in
+            fewer than two objects.
     """
 
-    way: Tensor
-    share: Tensor
+    geometry: Tensor
+    explained: Tensor
+
+    def select(self, sites: slice) -> "Skill":
+        """Of some sites."""
+        return Skill(self.geometry[sites], self.explained[sites])
 
     @property
     def turns(self) -> Tensor:
         """``(S,)`` bool, which are read on a circle."""
-        return self.way != LINE
+        return self.geometry != LINE
 
     @property
     def readable(self) -> Tensor:
         """``(S,)`` bool."""
-        return self.share > MIN_SKILL
+        return self.explained > MIN_SKILL
 
     @staticmethod
     def from_readings(raw: Tensor, u: Tensor) -> "Skill":
         """Of the reader's output for objects ``(K, S, ...)`` whose u ``(K, S)`` is known; NaN where there is none."""
-        ways, shares = [], []
+        geometries, shares = [], []
         for s in range(u.shape[1]):
             there = ~u[:, s].isnan()
             true, output = u[there, s], raw[there, s]
             if len(true) < 2:
-                ways.append(LINE)
+                geometries.append(LINE)
                 shares.append(torch.nan)
                 continue
             found = [
@@ -60,36 +64,17 @@ class Skill(NamedTuple):
                 _explained(_turned(output, 2), true, 2),
             ]
             each = [share for share, _ in found]
-            way = CIRCLE if each[1] > each[0] + GEOMETRY_MARGINS[0] else LINE
-            way = TWICE if each[2] > each[way] + GEOMETRY_MARGINS[1] else way
-            ways.append(way)
+            way = CIRCLE if 1 - each[1] < CIRCLE_REMAINDER * (1 - each[0]) else LINE
+            way = TWICE if 1 - each[2] < CIRCLE_REMAINDER * (1 - each[way]) else way
+            geometries.append(way)
             shares.append(each[way] - STANDARD_ERRORS * found[way][1])
-        return Skill(torch.tensor(ways), torch.tensor(shares))
-
-    def explained_variance(self, raw: Tensor, u: Tensor) -> Tensor:
-        """``(S,)`` the share of u's variance that readings of other objects ``(K, S, ...)`` explain by linear
-        regression, as a reader that has since learnt to expect some values guesses toward them. NaN for a site that
-        fewer than ``MIN_OBJECTS`` of the objects have."""
-        shares = []
-        for s, way in enumerate(self.way.tolist()):
-            there = ~u[:, s].isnan()
-            true, output = u[there, s], raw[there, s]
-            if len(true) < MIN_OBJECTS:
-                shares.append(torch.nan)
-                continue
-            turned = slice(2 * way, 2 * way + 2)
-            y = _direction(way * true) if way else true.unsqueeze(1)
-            x = output[:, turned] if way else truncated_mean(*normal(output)).unsqueeze(1)
-            x, y = x - x.mean(0), y - y.mean(0)
-            left = y - x @ torch.linalg.lstsq(x, y, driver="gelsd").solution
-            shares.append(1 - float(left.square().sum() / y.square().sum()))
-        return torch.tensor(shares)
+        return Skill(torch.tensor(geometries), torch.tensor(shares))
 
     def read(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of u, ``(K, S)`` each, from a reader's output ``(K, S, ...)``. Where two values
         look alike, one of them is drawn by the reader's probability."""
         mean, sd = normal(raw)
-        for s, way in enumerate(self.way.tolist()):
+        for s, way in enumerate(self.geometry.tolist()):
             if way == CIRCLE:
                 mean[:, s] = _turned(raw[:, s], 1).remainder(1.0)
                 sd[:, s] = _spread(raw[:, s, 2:4], 1)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from probscene.errors import ModelError
 from probscene.model import SceneModel
@@ -12,6 +13,7 @@ from probscene.sampling import Scenes, sample
 
 from ..features.base import Examples
 from .graph import ClassNodes
+from .guide import Learnt, ParameterGuide
 from .layout_augmentation import LayoutAugmentation
 from .reader_training import SupervisedBatch
 from .sites import Site, of_scenes, quantiles_of, with_handlers
@@ -33,29 +35,52 @@ class SupervisedRenders:
         self.model, self.label, self.node_sites, self.scene_sites = model, label, node_sites, scene_sites
 
     @torch.no_grad()
-    def draw(
-        self, num: int, policy: Policy, drawn_by: SceneModel | None = None, augmented: float = 0.0
-    ) -> SupervisedBatch:
+    def draw(self, num: int, policy: Policy, drawn_by: SceneModel | None = None) -> SupervisedBatch:
         """``num`` scenes of a policy.
 
         Args:
             drawn_by: the same model with other parameters.
-            augmented: share of the scenes whose sites of nodes are augmented, see ``LayoutAugmentation``.
         """
-        model = self.model if drawn_by is None else drawn_by
-        if augmented:
-            names = frozenset(site.name for site in self.node_sites)
-            model = with_handlers(model, LayoutAugmentation(model.grammar, names, augmented))
-        return self.label_scenes(sample(model, policy, num, density=False))
+        return self.label_scenes(sample(self.model if drawn_by is None else drawn_by, policy, num, density=False))
 
-    def label_scenes(self, scenes: Scenes) -> SupervisedBatch:
+    @torch.no_grad()
+    def draw_augmented(self, num: int, policy: Policy, share: float) -> SupervisedBatch:
+        """``num`` scenes of a policy, in a share of which sites of nodes are arranged, see ``LayoutAugmentation``; only
+        draws of the prior have a u."""
+        augmentation = LayoutAugmentation(self.model.grammar, frozenset(site.name for site in self.node_sites), share)
+        scenes = sample(with_handlers(self.model, augmentation), policy, num, density=False)
+        return self.label_scenes(scenes, augmentation.from_prior)
+
+    @torch.no_grad()
+    def draw_mixed(self, num: int, guide: ParameterGuide, prior_probability: float) -> SupervisedBatch:
+        """``num`` scenes of a guide, in which each value of its sites is a draw of the prior with some probability.
+        Only these have a u. So what a reader learns of u by them is proportional to the likelihood, whatever the guide
+        expects, in scenes like the guide's."""
+        learnt = Learnt(guide, prior_probability)
+        batch = self.label_scenes(sample(with_handlers(self.model, learnt), guide.structure, num, density=False))
+        u, scene = batch.u.clone(), batch.scene_u.clone()
+        for s, site in enumerate(guide.node_sites):
+            column = self.node_sites.index(site)
+            u[..., column] = u[..., column].where(learnt.from_prior[:, : u.shape[1], s], torch.nan)
+        for g, site in enumerate(guide.scene_sites):
+            column = self.scene_sites.index(site)
+            scene[:, column] = scene[:, column].where(learnt.scene_from_prior[:, g], torch.nan)
+        return batch._replace(u=u, scene_u=scene)
+
+    def label_scenes(self, scenes: Scenes, known: dict[str, Tensor] | None = None) -> SupervisedBatch:
         """Of scenes of the model, whatever drew their parameters.
+
+        Args:
+            known: ``(N, M)`` bool by site, the values that have a u; all where a site is not named.
 
         Raises:
             ModelError: the program did not sample one of the sites.
         """
         drawn, found = self.label(scenes), quantiles_of(self.model, scenes)
         self._check(found)
+        for name, of in (known or {}).items():
+            M = found[name].shape[1]
+            found[name] = found[name].where(pad(of[:, :M], (0, max(0, M - of.shape[1]))), torch.nan)
         derivation = scenes.derivation.trimmed()
         class_nodes = ClassNodes.from_derivation(self.model.grammar, self.model.classes, derivation)
         N, M = derivation.kind.shape
@@ -102,8 +127,8 @@ def concatenate(parts: list[SupervisedBatch]) -> SupervisedBatch:
         image=torch.cat([part.drawn.image for part in parts]),
         **{name: all_of(name) for name in ("label", "centre", "size", "visible")},
     )
-    overall = torch.cat([part.overall for part in parts])
-    return SupervisedBatch(drawn, all_of("kind"), all_of("parent"), all_of("group"), all_of("u", torch.nan), overall)
+    scene_u = torch.cat([part.scene_u for part in parts])
+    return SupervisedBatch(drawn, all_of("kind"), all_of("parent"), all_of("group"), all_of("u", torch.nan), scene_u)
 
 
 def _padded(part: Tensor, nodes: int, empty: float) -> Tensor:

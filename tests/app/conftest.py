@@ -38,8 +38,6 @@ PARAMETERS = {
     "parameters.rounds": 1,
     "parameters.round_reader_steps": 2,
     "parameters.round_steps": 2,
-    "parameters.energy_steps": 2,
-    "parameters.energy_scenes": 6,
 }
 # With the features named, a fit does not ask whether its target looks like renders: 320 images through EfficientNet.
 WORDS = ["--preset", "quick", "--features", "count", "--threads", "1", "--no-cache", "--no-verdict"]

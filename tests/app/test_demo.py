@@ -31,8 +31,6 @@ SHORT = QUICK.set(
         "parameters.steps": 2,
         "parameters.round_reader_steps": 2,
         "parameters.round_steps": 2,
-        "parameters.energy_steps": 2,
-        "parameters.energy_scenes": 6,
     }
 )
 ONE_THREAD = Execution(threads=1)

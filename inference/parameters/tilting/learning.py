@@ -43,15 +43,16 @@ from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
 from ...statistics.energy import Features
-from ...training import Callback, TrainingLoop, batch_seed, of_prefix
+from ...training import AdamTraining, Callback, TrainingLoop, batch_seed, of_prefix
 from ..guide import ParameterGuide
-from ..likelihood import MaximumLikelihood, Values, log_density
 from ..net import ParameterNet
 from ..sites import U_EPS, Site, find_sites
 from ..supervised_renders import Label, SupervisedRenders, concatenate
+from ..values import Values, images_per_step, log_density
 from .schedule import TiltingSchedule
 
 RENDERS_PER_CALL = 100  # scenes that are drawn and rendered together
+MAX_SCENES = 200  # of a step of the guide
 FALSE_DISCOVERY_RATE = 0.05  # of the sites that are moved, at most, say nothing of images in the mean [5]
 MAX_ETA = 1e3  # eta, in standard deviations of w
 MIN_UNIT = 0.1  # share of w's standard deviation
@@ -162,23 +163,28 @@ class TiltingLearning(TrainingLoop):
             features.append([look(some.drawn.image) for look in self.looks])
             parts.append(some._replace(drawn=some.drawn._replace(image=some.drawn.image[..., :0])))  # to save memory
         of, turns = concatenate(parts), torch.zeros(len(self.chosen), dtype=torch.bool)
-        scene, none = of.overall.clamp(U_EPS, 1 - U_EPS), of.u
+        scene, none = of.scene_u.clamp(U_EPS, 1 - U_EPS), of.u
         values = Values(of.kind, of.parent, none, none, scene, torch.full_like(scene, EXACT_SD), turns)
         return [torch.cat(part).double().numpy() for part in zip(*features, strict=True)], values
 
 
-class _Weighted(MaximumLikelihood):
-    """On values that are known, of scenes in proportion to their weight ``(N,)``; of the chosen sites."""
+class _Weighted(AdamTraining):
+    """Maximum likelihood of values that are known, of scenes in proportion to their weight ``(N,)``; of the chosen
+    sites."""
+
+    subject = "the parameters"
 
     def __init__(
         self, net: ParameterNet, values: Values, weight: Features, chosen: Tensor, schedule: TiltingSchedule, seed: int
     ):
-        super().__init__(net, values, schedule.steps, learning_rate=schedule.rate, seed=seed)
-        self.weight, self.chosen = torch.from_numpy(weight), chosen
+        adam = torch.optim.Adam(net.parameters(), lr=schedule.rate)
+        super().__init__(net, adam, schedule.steps, seed, max_grad_norm=10.0)
+        self.net, self.values, self.weight, self.chosen = net, values, torch.from_numpy(weight), chosen
+        self.images = images_per_step(net, values, MAX_SCENES)
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
-        rows = torch.multinomial(self.weight, self._number(), replacement=True)
+        rows = torch.multinomial(self.weight, self.images, replacement=True)
         return -log_density(self.net, self.values.select(rows))[:, self.chosen].sum(1).mean()
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from torch import Tensor
 
 from probscene.inference.features.base import objects_counted
-from probscene.inference.parameters.calibration import LOW_SKILL
 from probscene.inference.parameters.sites import OPTED_OUT, find_sites
 from probscene.inference.statistics.residual import Grade, ResidualRatio, Sample, residual_ratio, worst_grade
 from probscene.inference.statistics.verdict import StructureVerdict, Verdict
@@ -27,6 +26,7 @@ from .source_features import ALL, LEARNT, NUM_IMAGES, PRIOR, STRUCTURE, TARGET, 
 MAX_ROWS = 1000  # of each source
 KINDS = ("structure", "layout", "looks")
 ABSENT, UNSURE, UNREAD = "not judged", "cannot be told", "cannot be read"
+MIN_SKILL = 0.5  # from which on what is read tells whether a site agrees
 FIXED = (OPTED_OUT, "the program says so")  # the latter in records of before 0.2
 AGREEING_FLOORS = 2.0  # distance of a site's readings in the prior's renders and in the target, up to which they agree
 
@@ -156,7 +156,7 @@ def doubtful_sites(run: RunFolder) -> tuple[str, ...]:
 def _agrees(site: dict[str, Any]) -> bool:
     """Whether a site of a run's record has its prior in the target, too."""
     distance = site.get("read", {}).get("distance")
-    if not distance or (site["skill"] or 0) < LOW_SKILL or None in (distance["prior"], distance["floor"]):
+    if not distance or (site["skill"] or 0) < MIN_SKILL or None in (distance["prior"], distance["floor"]):
         return False
     return distance["prior"] <= AGREEING_FLOORS * distance["floor"]
 

@@ -161,7 +161,7 @@ KIND = "kind"  # names a choice's class in records
 
 # Ranges of settings by name: the least whole number where it is not 1, and numbers that must be above 0.
 _LEAST_WHOLE = {
-    "num_scenes": 2, "scenes": 2, "batches": 0, "rounds": 0, "energy_steps": 0, "weighted_scenes": 0, "directions": 0,
+    "num_scenes": 2, "scenes": 2, "batches": 0, "rounds": 0, "directions": 0,
     "render_cache": 0,
 }  # fmt: skip
 _ABOVE_ZERO = ("learning_rate", "variance", "marginal_variance", "scale", "difference")
@@ -672,11 +672,17 @@ def _record(value: Any) -> Any:
     return {KIND: type(value).__name__, **record} if type(value).__name__ in _KINDS else record
 
 
+_FORMER_SETTINGS = {
+    (ParameterSchedule, name)
+    for name in ("energy_steps", "energy_scenes", "weighted_scenes", "energy_rate", "sure")
+}  # of runs of format 4 from before there was one estimator
+
+
 def _from_record(made: type, record: dict[str, Any]) -> Any:
     hints = get_type_hints(made)
     values = {}
     for name, value in record.items():
-        if name == KIND:
+        if name == KIND or (made, name) in _FORMER_SETTINGS:
             continue
         if isinstance(value, dict):
             of = _KINDS[value[KIND]] if KIND in value else _optional(hints[name])
@@ -732,9 +738,11 @@ def from_flat_preset(record: dict[str, Any], guide: dict[str, Any]) -> FitConfig
     settings = {name: value for name, value in guide.items() if name != "kind"}
     schedules = {LIKELIHOOD: "parameters", TILTING: "tilting", META_SIM: "meta_sim"}
     method = old.get("parameter_method", LIKELIHOOD)
-    parameters = (
-        METHODS[method](**_renamed(old.get(schedules[method], {}))) if old.get("learn", STRUCTURE) == BOTH else None
-    )
+    parameters = None
+    if old.get("learn", STRUCTURE) == BOTH:
+        settings_then = _renamed(old.get(schedules[method], {}))
+        known = {one.name for one in fields(METHODS[method])}
+        parameters = METHODS[method](**{name: value for name, value in settings_then.items() if name in known})
     return FitConfig(
         features=_former_features(old, some),
         divergence=divergence,

@@ -31,12 +31,12 @@ from .learnt_parameters import NAME, prefixed, with_parameters
 from .plugins import inner
 from .rendered_features import RenderedFeatures
 from .run import RunFolder
-from .site_selection import held_out, prior_site_selector, select_sites
+from .site_selection import select_sites
 from .store import Checkpointer
 
 READER = "reader"  # of the file with what finds objects, until structure was learnt again
 HELD = 5  # one image of the target in so many is not learnt from, and judges
-JUDGED, DOUBTFUL = 200, 500  # images of each side, at most, and where these are too few to tell which sites are learnt
+MAX_HELD_OUT = 500  # of those images, at most
 
 
 def learn_parameters(
@@ -60,10 +60,10 @@ def learn_parameters(
         ProbsceneError: a loss is no longer finite.
     """
     seed_everything(batch_seed(run.record["seed"], 5))
-    eye, schedule = Backbone.from_feature_net(inner(net)), run.config.parameters
+    backbone, schedule = Backbone.from_feature_net(inner(net)), run.config.parameters
     by_reading = isinstance(schedule, ParameterSchedule)
     joint = isinstance(schedule, MetaSimSchedule) and isinstance(run.model.grammar, JointGrammar)
-    if joint or (by_reading and eye is None):
+    if joint or (by_reading and backbone is None):
         who = "models of several scenarios are" if joint else f"{run.features.name} features are"
         say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
         return
@@ -71,19 +71,15 @@ def learn_parameters(
     if kept is None:
         target = images()
         held = torch.arange(len(target)) % HELD == HELD - 1
-        if isinstance(schedule, ParameterSchedule) and eye is not None:
+        if isinstance(schedule, ParameterSchedule) and backbone is not None:
             learning = ParameterLearning(
                 run.model,
                 guide,
-                eye,
+                backbone,
                 observer.labelled,
                 cache(lambda: _some(target, ~held, schedule.images)),
                 schedule,
                 batch_seed(run.record["seed"], 5),
-                held_out(run, guide, _some(target, held, JUDGED)),
-                prior_site_selector(
-                    run, guide, lambda many: _some(target, held, DOUBTFUL if many else JUDGED), schedule.sure
-                ),
             )
         elif isinstance(schedule, MetaSimSchedule):
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
@@ -98,11 +94,10 @@ def learn_parameters(
 
         learning.run(each)
         keep.finish()
-        if isinstance(learning, ParameterLearning) and isinstance(eye, RenderBackbone):
+        if isinstance(learning, ParameterLearning) and isinstance(backbone, RenderBackbone):
             run.write_tensors(READER, counting_state(learning.calibrated.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
-        judges = _some(target, held, JUDGED), lambda: _some(target, held, DOUBTFUL)
-        run.write_parameters(_record(run, guide, learning, *judges))
+        run.write_parameters(_record(run, guide, learning, _some(target, held, MAX_HELD_OUT)))
         run.write_tensors(NAME, kept)
         (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
     say(_said(run.parameters))
@@ -121,24 +116,20 @@ def _record(
     guide: Guide,
     learning: ParameterLearning | ImageLevelTraining,
     held: Tensor,
-    more: Callable[[], Tensor],
 ) -> dict[str, Any]:
     """For JSON, see ``select_sites``."""
     method = {"method": run.config.parameter_method}
     if not isinstance(learning, ParameterLearning):
-        return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held, more).distances}
+        return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held).distances}
     assert learning.calibrated.skill is not None
-    shares = learning.calibrated.skill.share.tolist()
+    shares = learning.calibrated.skill.explained.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))
-    found = select_sites(run, guide, learning, held, more)
-    passed = frozenset() if learning.guide is None else learning.guide.prior_sites
+    found = select_sites(run, guide, learning, held)
     sites = []  # in the program's order, which is that of the network's columns
     for site in learning.sites:
         share, fitted = skill.get(site, torch.nan), site in learning.learnt
-        because = site.keeps or learning.calibrated.why_not(site)
-        if site.name in passed:
-            because = found.because.get(site.name, "scenes come no nearer to held-out images by it")
-        about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in passed}
+        because = site.keeps or learning.calibrated.why_not(site) or found.because.get(site.name, "")
+        about = {"name": site.name, "kinds": site.kinds, "learnt": fitted and site.name not in found.because}
         about |= {"fitted": fitted, "skill": share if share == share else None, "because": because}
         sites.append(about | ({"read": found.sites[site.name]} if site.name in found.sites else {}))
     return method | {"sites": sites, **found.distances}

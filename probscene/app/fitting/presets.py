@@ -43,7 +43,7 @@ STREET = FitConfig(
     ),
     divergence=JensenShannon(anscombe=True),
     structure=ScoreFunctionTraining(prior_kl_weight=0.03, draws_per_structure=1),
-    parameters=ParameterSchedule(scene_renders=12288, round_scene_renders=4096, sure=True),
+    parameters=ParameterSchedule(scene_renders=12288, round_scene_renders=4096),
 )
 # The paper's Multi-MNIST (section 4.1, supplement): 20 epochs of 5,000 target images in batches of 500 are 200 updates.
 PAPER = FitConfig(

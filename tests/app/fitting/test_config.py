@@ -64,7 +64,7 @@ def test_what_is_set_beside_a_choice_wins_whatever_comes_first():
         (["features.directions=2"], "CountFeatures"),
         (["parameters=none", "parameters.rounds=1"], "no setting of parameters = none"),
         (["parameters=none", "refine.batches=5"], "no setting of refine = none"),
-        (["parameters=meta-sim", "parameters.energy_steps=1"], "MetaSimSchedule"),
+        (["parameters=meta-sim", "parameters.scene_renders=1"], "MetaSimSchedule"),
         (["parameters.hidden=8"], "ParameterSchedule"),
         (["divergence=witness", "divergence.leave_one_out=true"], "MMD"),
         (["divergence=mmd", "structure.baseline=leave_one_out"], "moving_average or none with a shared MMD"),

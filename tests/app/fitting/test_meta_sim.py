@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.fitting import site_selection as select_sites
+from probscene.app.fitting import site_selection
 from probscene.app.fitting import store as storage
 from probscene.app.fitting.run import RunFolder
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
@@ -21,7 +21,7 @@ LEARN = ("--learn", "structure,parameters", "--parameters", "meta-sim", "--set",
 
 
 def it_is_kept(patch):
-    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(site_selection, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from pyro.util import get_rng_state, set_rng_state
 from probscene.app.api.fit import fit
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.fitting import parameter_stage as parameters
-from probscene.app.fitting import site_selection as select_sites
+from probscene.app.fitting import site_selection
 from probscene.app.fitting import store as storage
 from probscene.app.fitting import structure_stage as structure
 from probscene.app.fitting.learnt_parameters import split_tensors
@@ -39,9 +39,8 @@ def anything_is_read(patch):
     """Also what a reader of six steps says; and it is kept."""
     patch.setattr(skill, "MIN_SKILL", -1e9)
     patch.setattr(reader, "SCORE_THRESHOLDS", (1e-3,))
-    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
-    patch.setattr(select_sites, "sites_to_reset", lambda *_: frozenset())
-    patch.setattr(select_sites, "reset_low_skill_sites", lambda *_: (frozenset(), {}))
+    patch.setattr(site_selection, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(site_selection, "sites_without_evidence", lambda *_: {})
     for renders in ("CALIBRATION_RENDERS", "BUILDER_RENDERS", "MISSED_RENDERS"):
         patch.setattr(learning, renders, 40)
 
@@ -229,7 +228,7 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     }
     settings |= {"pretrain.derivations": 300, "parameters.reader_steps": 250, "parameters.steps": 250}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 60, "parameters.round_steps": 100}
-    settings |= {"parameters.energy_steps": 5, "parameters.energy_scenes": 40, "refine.batches": 2}
+    settings |= {"refine.batches": 2}
     config = preset("quick").set("features=count", settings)
     execution = Execution(1, cache=False, progress=False)
     run = fit(dots(False), tmp_path / "target" / "images", config, out=tmp_path / "run", execution=execution)
@@ -252,59 +251,33 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     assert after[0] < 0.4 * prior[0] and after[1] < 0.2 * prior[1]
 
 
-@pytest.mark.parametrize(("sure", "in_the_end"), [(True, 7), (False, 5)])
-def test_who_has_to_be_sure_looks_at_more_images_in_the_end(
-    sure, in_the_end, call, discs, target, tmp_path, monkeypatch
+@pytest.mark.parametrize("without", [("x",), ("x", "y")], ids=["one", "all"])
+def test_sites_without_evidence_keep_the_prior_in_all_that_is_drawn(
+    without, call, discs, target, tmp_path, monkeypatch
 ):
     anything_is_read(monkeypatch)
-    monkeypatch.setattr(parameters, "JUDGED", 5)
-    monkeypatch.setattr(parameters, "DOUBTFUL", 7)
-    looked_at, site_rows = [], parameters.ParameterLearning.site_rows
-
-    def noted(learning, images):
-        looked_at.append({name: len(some) for name, some in images.items()})
-        return site_rows(learning, images)
-
-    monkeypatch.setattr(parameters.ParameterLearning, "site_rows", noted)
-    monkeypatch.setattr(select_sites, "sites_to_reset", lambda *_: frozenset())
-    settings = (*discs.without(), *LEARN, "--set", f"parameters.sure={str(sure).lower()}")
-    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *settings)
-    assert done.code == 0, done.err
-    *trainings, last = looked_at
-    assert trainings and all(each == dict.fromkeys(("target", "prior", "learnt"), 5) for each in trainings)
-    assert last == dict.fromkeys(("target", "prior", "learnt"), in_the_end)
-
-
-@pytest.mark.parametrize("passed", [("x",), ("x", "y")], ids=["one", "all"])
-def test_such_sites_keep_the_prior_in_all_that_is_drawn(passed, call, discs, target, tmp_path, monkeypatch):
-    anything_is_read(monkeypatch)
-    monkeypatch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(1.0, 1.0, 0.0))
-    monkeypatch.setattr(select_sites, "sites_to_reset", lambda *_: frozenset(passed))
+    monkeypatch.setattr(site_selection, "sites_without_evidence", lambda *_: dict.fromkeys(without, "it is dark there"))
     out = tmp_path / "run"
     done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.without(), *LEARN)
     assert done.code == 0, done.err
     run = RunFolder.at(out)
     record = {site["name"]: site for site in run.parameters["sites"]}
-    if len(passed) == 2:
+    if len(without) == 2:
         assert run.parameters["kept"] == "prior" and run.guide.with_parameters is None
-        assert "All keep the prior, as learnt scenes come no nearer" in done.err + done.out
         return
-    assert (record["x"]["learnt"], record["y"]["learnt"], run.parameters["kept"]) == (False, True, "learnt")
-    assert record["x"]["because"] == "scenes come no nearer to held-out images by it"
-    x_keeps_the_prior(run)
-
-
-def test_a_site_that_cannot_be_read_where_the_target_is_keeps_the_prior(call, discs, target, tmp_path, monkeypatch):
-    anything_is_read(monkeypatch)
-    monkeypatch.setattr(select_sites, "reset_low_skill_sites", lambda *_: (frozenset("x"), {"x": "it is dark there"}))
-    out = tmp_path / "run"
-    done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.without(), *LEARN)
-    assert done.code == 0, done.err
-    run = RunFolder.at(out)
-    record = {site["name"]: site for site in run.parameters["sites"]}
     assert (record["x"]["learnt"], record["x"]["fitted"], record["y"]["learnt"]) == (False, True, True)
-    assert record["x"]["because"] == "it is dark there"
+    assert record["x"]["because"] == "it is dark there" and run.parameters["kept"] == "learnt"
     x_keeps_the_prior(run)
+
+
+def test_scenes_that_are_farther_as_wholes_keep_the_prior(call, discs, target, tmp_path, monkeypatch):
+    anything_is_read(monkeypatch)
+    monkeypatch.setattr(site_selection, "bootstrap_test", lambda *_: BootstrapTest(2.0, 1.0, 1.0))
+    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", *discs.without(), *LEARN)
+    assert done.code == 0, done.err
+    run = RunFolder.at(tmp_path / "run")
+    assert run.parameters["kept"] == "prior" and run.guide.with_parameters is None
+    assert "All keep the prior, as learnt scenes come no nearer" in done.err + done.out
 
 
 def x_keeps_the_prior(run):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from probscene.app.fitting import site_selection as select_sites
+from probscene.app.fitting import site_selection
 from probscene.app.fitting import store as storage
 from probscene.app.fitting.presets import preset
 from probscene.app.fitting.run import RunFolder
@@ -35,7 +35,7 @@ def lit(tmp_path_factory, discs) -> Path:
 
 
 def it_is_kept(patch):
-    patch.setattr(select_sites, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(site_selection, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(learning, "FALSE_DISCOVERY_RATE", 1.1)  # of so few scenes, whatever they say
 
 

@@ -14,45 +14,45 @@ from probscene.inference.parameters.reader_training import ReaderTraining
 CLASSES = ("red", "blue")
 
 
-def eye_of(kind, canvas):
+def backbone_of(kind, canvas):
     net = CountNet(CLASSES, 3, canvas, width=(4, 8, 8)) if kind == "renders" else PretrainedCountNet(CLASSES, canvas)
-    eye = Backbone.from_feature_net(net)
-    assert eye is not None
-    return eye.eval()
+    backbone = Backbone.from_feature_net(net)
+    assert backbone is not None
+    return backbone.eval()
 
 
 @pytest.mark.parametrize("kind", ["renders", "photographs"])
 @pytest.mark.parametrize("canvas", [(64, 64), (96, 128)])
 def test_cells_cover_the_image(kind, canvas):
-    eye = eye_of(kind, canvas)
-    seen = eye(eye.enter(torch.randint(0, 256, (2, 3, *canvas), dtype=torch.uint8)))
-    across, down = (seen.shape[3] * eye.cell[0], seen.shape[2] * eye.cell[1])
+    backbone = backbone_of(kind, canvas)
+    seen = backbone(backbone.enter(torch.randint(0, 256, (2, 3, *canvas), dtype=torch.uint8)))
+    across, down = (seen.shape[3] * backbone.cell[0], seen.shape[2] * backbone.cell[1])
     assert seen.shape[:2] == (2, WIDTH)
-    assert 0 <= float(across) - canvas[1] < 2 * eye.cell[0] and 0 <= float(down) - canvas[0] < 2 * eye.cell[1]
+    assert 0 <= float(across) - canvas[1] < 2 * backbone.cell[0] and 0 <= float(down) - canvas[0] < 2 * backbone.cell[1]
 
 
 @pytest.mark.parametrize("kind", ["renders", "photographs"])
 def test_what_is_found_does_not_depend_on_the_other_images(kind):
     torch.manual_seed(0)
-    eye = eye_of(kind, (64, 64))
-    reader = Reader(eye, 2, 1, 1).eval()
-    torch.nn.init.normal_(reader.what.weight, std=30.0)
+    backbone = backbone_of(kind, (64, 64))
+    reader = Reader(backbone, 2, 1, 1).eval()
+    torch.nn.init.normal_(reader.class_head.weight, std=30.0)
     images = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
     alone, together = reader.detect(images[3:4]), reader.detect(images)
     rows = together.image == 3
     assert len(alone.image) and torch.allclose(alone.centre, together.centre[rows], atol=1e-3)
-    assert torch.allclose(alone.overall[0], together.overall[3], atol=1e-4)
+    assert torch.allclose(alone.scene_raw[0], together.scene_raw[3], atol=1e-4)
 
 
 @pytest.mark.parametrize("training", [False, True])
 def test_grey_images_are_seen_by_the_layers_themselves(training):
     torch.manual_seed(0)
     net = CountNet(CLASSES, 1, (96, 128), width=(4, 8, 8))
-    eye = RenderBackbone(net).train(training)
-    x = eye.enter(torch.randint(0, 256, (3, 1, 96, 128), dtype=torch.uint8))
-    fine = eye.fine(x)
-    coarse = torch.nn.functional.interpolate(eye.down(eye.coarse(fine)), scale_factor=2)
-    assert torch.allclose(eye(x), eye.both(eye.side(fine) + coarse), atol=1e-4)
+    backbone = RenderBackbone(net).train(training)
+    x = backbone.enter(torch.randint(0, 256, (3, 1, 96, 128), dtype=torch.uint8))
+    fine = backbone.fine(x)
+    coarse = torch.nn.functional.interpolate(backbone.down(backbone.coarse(fine)), scale_factor=2)
+    assert torch.allclose(backbone(x), backbone.both(backbone.side(fine) + coarse), atol=1e-4)
 
 
 @pytest.mark.parametrize("channels", [1, 3])

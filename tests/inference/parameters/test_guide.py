@@ -12,9 +12,9 @@ from pyro.optim import Adam
 from probscene.inference.parameters import sibling_encoder as module
 from probscene.inference.parameters.graph import ClassNodes, SceneGraph
 from probscene.inference.parameters.guide import ParameterGuide
-from probscene.inference.parameters.likelihood import Values, log_density
 from probscene.inference.parameters.sibling_encoder import SiblingEncoder
 from probscene.inference.parameters.sites import Site, find_sites, of_scenes, quantiles_of, site_name
+from probscene.inference.parameters.values import Values, log_density
 from probscene.sampling import run_program, sample, seed_everything
 
 NAMES = ("scene.bright", "tray.x", "tray.y", "ball.away", "ball.size", "ball.shade", "floor.turn")

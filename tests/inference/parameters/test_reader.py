@@ -88,7 +88,7 @@ def test_the_way_is_found_and_read(way):
     u = torch.rand(600, generator=torch.Generator().manual_seed(1))
     raw = said(u, way=way)
     skill = Skill.from_readings(raw, u[:, None])
-    assert skill.way.tolist() == [way] and float(skill.share) > 0.9 and bool(skill.readable)
+    assert skill.geometry.tolist() == [way] and float(skill.explained) > 0.9 and bool(skill.readable)
     mean, sd = skill.read(raw)
     apart = (mean[:, 0] - u).abs()
     apart = torch.minimum(apart, 1 - apart) if way != LINE else apart
@@ -103,35 +103,11 @@ def test_what_says_nothing_is_not_readable():
     assert not Skill.from_readings(raw, torch.full((600, 1), torch.nan)).readable.any()
 
 
-@given(seeds, st.sampled_from([LINE, CIRCLE, TWICE]), st.floats(0.3, 1.0), st.floats(0.02, 0.4))
-def test_what_is_told_of_others_is_that_of_a_regression_however_far_guesses_are_drawn_in(seed, way, much, error):
-    """As numpy's least squares say; half of the objects have no such site."""
-    rng = np.random.default_rng(seed)
-    u = rng.uniform(0, 1, 200)
-    u[::2] = np.nan
-    read = torch.from_numpy(u + error * rng.standard_normal(200)).float().nan_to_num(0.5)
-    raw = torch.zeros(200, 1, 6)
-    raw[:, 0, 0], raw[:, 0, 1] = 0.5 + much * 0.2 * (read - 0.5), -6.0
-    raw[:, 0, 2:] = much * harmonics(read) + torch.tensor([0.1, 0.2, 0.3, 0.4])
-    told = Skill(torch.tensor([way]), torch.ones(1)).explained_variance(raw, torch.from_numpy(u).float()[:, None])
-    there = ~np.isnan(u)
-    true, said = u[there], read.numpy()[there]
-    if way:
-        y = np.stack([np.cos(2 * np.pi * way * true), np.sin(2 * np.pi * way * true)], 1)
-        x = np.stack([np.cos(2 * np.pi * way * said), np.sin(2 * np.pi * way * said), np.ones(100)], 1)
-    else:
-        y, x = true[:, None], np.stack([said, np.ones(100)], 1)
-    left = np.linalg.lstsq(x, y, rcond=None)[1].sum()
-    assert float(told) == pytest.approx(1 - left / (y.var(0).sum() * 100), abs=2e-3)
-    few = torch.from_numpy(u).float()[:38, None]
-    assert Skill(torch.tensor([way]), torch.ones(1)).explained_variance(raw[:38], few).isnan().all()
-
-
 @given(seeds, st.integers(0, 40))
 def test_what_is_the_same_for_all_says_nothing_however_few_they_are(seed, number):
     rng = torch.Generator().manual_seed(seed)
     u, raw = torch.rand(number, 1, generator=rng), torch.randn(1, 1, 6, generator=rng).expand(number, 1, 6)
-    share = Skill.from_readings(raw, u).share
+    share = Skill.from_readings(raw, u).explained
     assert share.isnan().all() if number < 2 else float(share) < 0.05
 
 
@@ -144,7 +120,7 @@ def test_a_site_that_few_objects_have_is_hardly_ever_read_by_chance():
 def test_skill_is_the_share_of_the_variance_that_is_explained():
     u = torch.rand(20_000, generator=torch.Generator().manual_seed(1))
     for error in (0.02, 0.06):
-        share = float(Skill.from_readings(said(u, error), u[:, None]).share)
+        share = float(Skill.from_readings(said(u, error), u[:, None]).explained)
         assert share == pytest.approx(1 - 12 * error**2, abs=0.01)
 
 
@@ -222,7 +198,7 @@ def test_batches_are_joined_as_they_are(model):
     for part, rows in zip(parts, (slice(0, 3), slice(3, 8)), strict=True):
         M = part.parent.shape[1]
         assert torch.equal(whole.drawn.image[rows], part.drawn.image)
-        assert torch.equal(whole.overall[rows], part.overall)
+        assert torch.equal(whole.scene_u[rows], part.scene_u)
         for one, other in (
             (whole.parent, part.parent),
             (whole.group, part.group),

@@ -14,8 +14,8 @@ def reader_of(net):
     """One that finds something in noise, however little of it."""
     torch.manual_seed(1)
     reader = Reader(RenderBackbone(net), len(CLASSES), 4, 2).eval()
-    torch.nn.init.normal_(reader.what.weight, std=30.0)
-    reader.least.fill_(0.3)
+    torch.nn.init.normal_(reader.class_head.weight, std=30.0)
+    reader.score_threshold.fill_(0.3)
     return reader
 
 
