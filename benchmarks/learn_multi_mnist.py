@@ -60,13 +60,18 @@ def distributions(target: int) -> tuple[np.ndarray, np.ndarray]:
     return rng.dirichlet(np.ones(11)), rng.dirichlet(np.ones(10))
 
 
+def glyphs_of(mnist: Path) -> list[np.ndarray]:
+    """The digits of t10k, ``(n, 28, 28)`` uint8 of each class."""
+    pixels = np.frombuffer(gzip.decompress((mnist / "t10k-images-idx3-ubyte.gz").read_bytes()), np.uint8, offset=16)
+    labels = np.frombuffer(gzip.decompress((mnist / "t10k-labels-idx1-ubyte.gz").read_bytes()), np.uint8, offset=8)
+    return [pixels.reshape(-1, 28, 28)[labels == c] for c in range(10)]
+
+
 def draw_target(mnist: Path, target: int, folder: Path, images: int) -> None:
     """Upright digits in an evenly spaced row, pasted by numpy."""
     if folder.is_dir():
         return
-    pixels = np.frombuffer(gzip.decompress((mnist / "t10k-images-idx3-ubyte.gz").read_bytes()), np.uint8, offset=16)
-    labels = np.frombuffer(gzip.decompress((mnist / "t10k-labels-idx1-ubyte.gz").read_bytes()), np.uint8, offset=8)
-    glyphs = [pixels.reshape(-1, 28, 28)[labels == c] for c in range(10)]
+    glyphs = glyphs_of(mnist)
     number, share = distributions(target)
     rng = np.random.default_rng([8, target])
     aside = folder.with_suffix(".part")

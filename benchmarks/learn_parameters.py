@@ -74,7 +74,7 @@ def drawn(run: RunFolder, policy: Policy, seed: int) -> tuple[list[Scenes], Tens
     return scenes, torch.cat([render(some.drawing).image for some in scenes])[:IMAGES]
 
 
-def said(figure: ImageDistance) -> dict[str, float]:
+def with_interval(figure: ImageDistance) -> dict[str, float]:
     """For JSON."""
     return {"value": figure.value, "low": figure.low, "high": figure.high}
 
@@ -112,7 +112,7 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
         "total_variation": distances(run.guide, target),
         "total_variation_before": distances(first, target),
     }
-    row["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
+    row["floor"] = with_interval(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
     panels, tensors = [], run.read_tensors(NAME)
     learnt = None
     if tensors:
@@ -121,7 +121,7 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
         policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
         policy.with_parameters = learnt if source in ("parameters", "both") else None
         scenes, pictures = drawn(run, policy, 1)
-        row[source] = row_errors(scenes) | {"kid": said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
+        row[source] = row_errors(scenes) | {"kid": with_interval(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
         panels += [pictures] if source in SHOWN else []
     file = f"scenes-{target}.png" if method == LIKELIHOOD else f"scenes-{method}-{target}.png"
     picture([*panels, torch.stack([real.load(i) for i in range(SIDE**2)])], args.out / file)

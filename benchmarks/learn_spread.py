@@ -16,7 +16,6 @@ learnt structures, so that all rows have the same numbers of digits.
 """
 
 import argparse
-import gzip
 import json
 import shutil
 from copy import copy
@@ -26,7 +25,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from given import mnist_option, needed_mnist, out_option
-from learn_multi_mnist import distributions
+from learn_multi_mnist import distributions, glyphs_of
 from scipy.stats import wasserstein_distance
 
 from probscene.app.api.fit import fit
@@ -76,9 +75,7 @@ def draw_images(mnist: Path, target: int, folder: Path, images: int) -> None:
     """The target's folder."""
     if folder.is_dir():
         return
-    pixels = np.frombuffer(gzip.decompress((mnist / "t10k-images-idx3-ubyte.gz").read_bytes()), np.uint8, offset=16)
-    labels = np.frombuffer(gzip.decompress((mnist / "t10k-labels-idx1-ubyte.gz").read_bytes()), np.uint8, offset=8)
-    glyphs = [pixels.reshape(-1, SIDE, SIDE)[labels == c] for c in range(10)]
+    glyphs = glyphs_of(mnist)
     number, share = distributions(target)
     rng = np.random.default_rng([11, target])
     aside = folder.with_suffix(".part")

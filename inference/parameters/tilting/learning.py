@@ -147,7 +147,7 @@ class TiltingLearning(TrainingLoop):
             of = values.scene[:, self.chosen]
             v, sure = explained_part(of, normalised_sum(of, freed))
             weight = tilted_weights(v, 1 - sure * (1 - self.schedule.ess_fraction))
-            _Weighted(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
+            _WeightedLikelihood(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
         return sum(apart for _, apart in each)
 
     def _set_prior_sites(self) -> None:
@@ -168,7 +168,7 @@ class TiltingLearning(TrainingLoop):
         return [torch.cat(part).double().numpy() for part in zip(*features, strict=True)], values
 
 
-class _Weighted(AdamTraining):
+class _WeightedLikelihood(AdamTraining):
     """Maximum likelihood of values that are known, of scenes in proportion to their weight ``(N,)``; of the chosen
     sites."""
 
