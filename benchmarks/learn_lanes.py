@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from given import out_option
 from learn_aerial import Truth, judged
-from learn_parameters import IMAGES, drawn, said
+from learn_parameters import IMAGES, drawn, with_interval
 from torch import Tensor
 
 from probscene.app.api.fit import fit
@@ -92,13 +92,14 @@ def measured(seed: int, args: argparse.Namespace) -> dict:
         "seconds": timing(run),
         "structure_of": judged(run.guide, Truth()),
     }
-    row["target"] = lane_errors([sample(truth, truth.prior, IMAGES)]) | {"kid": said(floor)}
+    row["target"] = lane_errors([sample(truth, truth.prior, IMAGES)]) | {"kid": with_interval(floor)}
     panels = []
     for source in ("prior", "structure", "both"):
         policy = copy(run.model.prior if source == "prior" else run.guide)
         policy.with_parameters = run.guide.with_parameters if source == "both" else None
         scenes, pictures = drawn(run, policy, 1)
-        row[source] = lane_errors(scenes) | {"kid": said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
+        distance = kid(of_real[:IMAGES], look.embed(pictures), "efficientnet")
+        row[source] = lane_errors(scenes) | {"kid": with_interval(distance)}
         panels.append(pictures)
     picture([*panels, torch.stack([real.load(i) for i in range(SIDE**2)])], args.out / f"scenes-{seed}.png")
     return row

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from given import command, out_option
 from learn_driving import counted
-from learn_parameters import IMAGES, drawn, said
+from learn_parameters import IMAGES, drawn, with_interval
 from pyro.poutine.messenger import Messenger
 from scipy.stats import wasserstein_distance
 from torch import Tensor
@@ -133,13 +133,13 @@ def measured(model: SceneModel, seed: int, args: argparse.Namespace) -> dict:
     row["cars"] = {name: float(total_variation(each, cars["truth"])) for name, each in cars.items() if name != "truth"}
     look, real = EfficientNetLite(), ImageFolder(folder / "images", model.canvas, model.channels)
     of_real = look.embed(torch.stack([real.load(i) for i in range(2 * IMAGES)]))
-    row["kid"]["floor"] = said(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
+    row["kid"]["floor"] = with_interval(kid(of_real[:IMAGES], of_real[IMAGES:], "efficientnet"))
     panels = []
     for source in ("prior", "start", "structure", "both"):
         policy = copy({"prior": model.prior, "start": model.pretraining_policy}.get(source, run.guide))
         policy.with_parameters = (lambda _: learnt) if source == "both" else None
         _, pictures = drawn(run, policy, 1)
-        row["kid"][source] = said(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))
+        row["kid"][source] = with_interval(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))
         panels += [pictures] if source != "start" else []
     picture([*panels, torch.stack([real.load(i) for i in range(SHOWN)])], args.out / f"scenes-{seed}.png")
     return row

@@ -121,7 +121,8 @@ def measured(target: int, method: str, args: argparse.Namespace) -> dict:
         policy = copy(run.guide if source in ("structure", "both") else run.model.prior)
         policy.with_parameters = learnt if source in ("parameters", "both") else None
         scenes, pictures = drawn(run, policy, 1)
-        row[source] = row_errors(scenes) | {"kid": with_interval(kid(of_real[:IMAGES], look.embed(pictures), "efficientnet"))}
+        distance = kid(of_real[:IMAGES], look.embed(pictures), "efficientnet")
+        row[source] = row_errors(scenes) | {"kid": with_interval(distance)}
         panels += [pictures] if source in SHOWN else []
     file = f"scenes-{target}.png" if method == LIKELIHOOD else f"scenes-{method}-{target}.png"
     picture([*panels, torch.stack([real.load(i) for i in range(SIDE**2)])], args.out / file)

@@ -147,7 +147,8 @@ class TiltingLearning(TrainingLoop):
             of = values.scene[:, self.chosen]
             v, sure = explained_part(of, normalised_sum(of, freed))
             weight = tilted_weights(v, 1 - sure * (1 - self.schedule.ess_fraction))
-            _WeightedLikelihood(guide.net, values, weight, self.chosen, self.schedule, batch_seed(self.seed, 2, self.done)).run()
+            seed = batch_seed(self.seed, 2, self.done)
+            _WeightedLikelihood(guide.net, values, weight, self.chosen, self.schedule, seed).run()
         return sum(apart for _, apart in each)
 
     def _set_prior_sites(self) -> None:
