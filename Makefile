@@ -42,12 +42,12 @@ docs: install
 tutorial: install
 	@OMP_NUM_THREADS=1 $(BIN)/python docs/run_page.py docs/tutorial.md
 
-# One thread a process, and one process more than two cores have, as tests of other processes wait for these. Without
-# xdist's own order, in which files of few tests come last, however long these take.
+# One thread a process: two processes with one thread each are faster than one with two. Without xdist's own order, in
+# which files of few tests come last, however long these take.
 test: export OMP_NUM_THREADS := 1
 test: install
 	@$(MAKE) --no-print-directory --jobs 2 lint docs
-	$(BIN)/python -m pytest --quiet --numprocesses 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # An evening's worth. MNIST's files for the benchmarks that need them: make benchmark MNIST=FOLDER
 # Two at a time, for what is learnt and not for speed: make --jobs 2 benchmark. A script that fails does not stop others.
