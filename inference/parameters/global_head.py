@@ -21,15 +21,14 @@ class GlobalHead(nn.Module):
     Args:
         sites: G.
         outputs: numbers a site.
-        dropout: share of what enters that is left out in training.
     """
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, sites: int, outputs: int, dropout: float = DROPOUT):
+    def __init__(self, sites: int, outputs: int):
         super().__init__()
-        self.sites, self.outputs, self.drop = sites, outputs, nn.Dropout(dropout)
+        self.sites, self.outputs, self.drop = sites, outputs, nn.Dropout(DROPOUT)
         self.join, self.out = nn.Linear(NUM_FEATURES, HIDDEN), nn.Linear(HIDDEN, sites * outputs)
         self.register_buffer("mean", torch.zeros(NUM_FEATURES))
         self.register_buffer("deviation", torch.zeros(NUM_FEATURES))

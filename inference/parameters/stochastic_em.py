@@ -227,6 +227,7 @@ class StochasticEM(AdamTraining):
         images: a step, at most.
         learning_rate: the largest.
         seed: of everything random.
+        from_prior: whether the net is the prior still; the first half of the steps then fits the normal approximation.
 
     Attributes:
         nodes, scene: ``(L, M, S)`` and ``(L, G)`` u, the chains' present states; NaN where a value is not there.
