@@ -27,13 +27,13 @@ pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
 
 
-def unwritable(node, code, tried, *arguments):
+def unwritable(node, tried, *arguments):
     """The work of ``generate``, where one node's disk takes no files; others leave it chunks until it has tried."""
     import ray
 
     def fails(*_):
         tried.touch()
-        raise OSError(code, os.strerror(code))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def waits(chunk):
         while chunk and not tried.exists():
@@ -149,10 +149,11 @@ def test_an_actor_that_prepares_itself_for_long_is_waited_for(nodes, monkeypatch
 def test_generators_that_nodes_have_started_leave_no_files(nodes):
     argv = [sys.executable, str(Path(__file__).parents[1] / "generators" / "draw_boxes.py")]
     pool, folders = nodes.actor_pool(drawing, (argv,)), []
-    pool.run(range(3), folders.append)
-    assert len(folders) == 3 and any(map(os.path.exists, folders))
+    pool.run([0], folders.append)
+    (folder,) = folders
+    assert os.path.exists(folder)
     pool.close()
-    assert not any(map(os.path.exists, folders))
+    assert not os.path.exists(folder)
 
 
 def test_what_a_task_raises_is_told_with_its_node(nodes):
@@ -160,18 +161,17 @@ def test_what_a_task_raises_is_told_with_its_node(nodes):
         nodes.actor_pool(doubling, (0.0, 3)).run([3], lambda result: None)
 
 
-@pytest.mark.parametrize("code, what", [(errno.ENOSPC, "The disk is full"), (errno.EROFS, "Read-only file system")])
-def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, alone, tmp_path, monkeypatch, code, what):
+def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, alone, tmp_path, monkeypatch):
+    simulated.kill()  # two are enough
     run, node, out = RunFolder.at(fitted), simulated.nodes[1].node_id, tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(datasets, "_actor", partial(unwritable, node, code, tmp_path / "tried"))
-        with pytest.raises(MachineError, match=f"On node .*: .*{what}"):
+        patch.setattr(datasets, "_actor", partial(unwritable, node, tmp_path / "tried"))
+        with pytest.raises(MachineError, match="On node .*: .*The disk is full"):
             generate(run, 700, out, seed=3, format="coco,yolo", workers=nodes)
     shown = {name: data for name, data in contents(out).items() if not name.startswith(".")}
     assert shown.items() <= alone.items()  # whole or absent
-    if code == errno.ENOSPC:
-        generate(run, 700, out, seed=3, format="coco,yolo", workers=nodes)
-        assert contents(out) == alone
+    generate(run, 700, out, seed=3, format="coco,yolo", workers=nodes)
+    assert contents(out) == alone
 
 
 def test_other_versions_are_refused(nodes, monkeypatch):
@@ -182,6 +182,9 @@ def test_other_versions_are_refused(nodes, monkeypatch):
 
 
 def test_the_last_node_is_lost(simulated, nodes):
+    for _ in range(2):
+        simulated.kill()
+
     def done(_):
         while simulated.nodes:
             simulated.kill()
@@ -240,8 +243,8 @@ def test_auto_starts_one_where_what_ray_remembers_is_gone(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     found = []
     with Cluster("auto") as cluster:
-        cluster.actor_pool(doubling, ()).run([1, 2], found.append)
-    assert sorted(found) == [(1, 2), (2, 4)]
+        cluster.actor_pool(doubling, ()).run([1], found.append)
+    assert found == [(1, 2)]
 
 
 def test_workers_or_a_cluster(nodes):

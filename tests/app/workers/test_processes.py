@@ -23,12 +23,6 @@ def main():
     spread(prepare, (), 2, [1, 2], print)
 """
 GUARDED = SPREAD + '\nif __name__ == "__main__":\n    main()\n'
-GENERATE = """
-import sys
-import probscene as ps
-fit = ps.Run.open(sys.argv[1])
-fit.generate(130, sys.argv[2], workers=2, progress=False)
-"""
 ONCE = "import os\nos.mkdir('made')\n" + SPREAD + "\nmain()\n"
 
 
@@ -53,12 +47,7 @@ def test_with_a_guard_they_work(tmp_path):
     assert done.returncode == 0 and sorted(done.stdout.split()) == ["-1", "-2"], done.stderr
 
 
-def test_a_missing_guard_is_named(tmp_path, fitted):
-    done = run(tmp_path, GENERATE, fitted, tmp_path / "out")
-    check_ends_with(done, "ProbsceneError", NO_GUARD)
-
-
-def test_so_it_is_where_calls_are_in_a_function(tmp_path):
+def test_a_missing_guard_is_named(tmp_path):
     check_ends_with(run(tmp_path, SPREAD + "\nmain()\n"), "ProbsceneError", NO_GUARD)
 
 

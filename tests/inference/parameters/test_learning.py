@@ -168,7 +168,7 @@ def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(
         reader_steps=1, scene_renders=60, steps=2, step_images=20, rounds=1, round_reader_steps=1,
-        round_scene_renders=60, round_steps=30, reader_images=2,
+        round_scene_renders=60, round_steps=12, reader_images=2,
     )  # fmt: skip
     images = torch.randint(256, (30, 3, 64, 64), dtype=torch.uint8)
 
