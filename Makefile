@@ -1,5 +1,5 @@
 BENCHMARKS := $(shell grep -l '^def main' benchmarks/*.py)
-.PHONY: install demo docs tutorial test lint benchmark blender clean $(BENCHMARKS)
+.PHONY: install demo docs tutorial test pytest lint benchmark blender clean $(BENCHMARKS)
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -42,11 +42,15 @@ docs: install
 tutorial: install
 	@OMP_NUM_THREADS=1 $(BIN)/python docs/run_page.py docs/tutorial.md
 
-# One thread a process: two processes with one thread each are faster than one with two. Without xdist's own order, in
-# which files of few tests come last, however long these take.
-test: export OMP_NUM_THREADS := 1
 test: install
-	@$(MAKE) --no-print-directory --jobs 2 lint docs
+	@$(MAKE) --no-print-directory --jobs 3 pytest lint docs
+
+# One thread a process: two processes with one thread each are faster than one with two. Without xdist's own order, in
+# which files of few tests come last, however long these take. Python keeps what it has compiled even where the
+# environment says otherwise: a hundred processes import the library.
+pytest: export OMP_NUM_THREADS := 1
+pytest: export PYTHONDONTWRITEBYTECODE :=
+pytest: install
 	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # An evening's worth. MNIST's files for the benchmarks that need them: make benchmark MNIST=FOLDER
