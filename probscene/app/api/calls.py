@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -24,13 +25,14 @@ from ..fitting.run import RunFolder, is_run
 from ..loading import load_model, renderer_for
 from ..progress import Display
 from ..targets import Target, TargetImages, open_images
-from ..trial import trial as trying
-from ..trial.results import Results
-from ..trial.trial import TrialOptions
 from ..views import comparison as comparison_picture
 from ..views import report as reporting
 from ..workers.cluster import connected
 from ..workers.processes import end_if_starting
+
+if TYPE_CHECKING:
+    from ..trial.results import Results
+    from ..trial.trial import TrialOptions
 
 
 def render(model: SceneModel, scenes: Scenes, threads: int | None = None) -> RenderBatch:
@@ -193,11 +195,11 @@ def trial(
     test: Path | str,
     out: Path | str,
     sets: Mapping[str, str | Path] | None = None,
-    options: TrialOptions | None = None,
+    options: "TrialOptions | None" = None,
     *,
     workers: int = 1,
     progress: bool = True,
-) -> Results:
+) -> "Results":
     """What is a labelled set worth? Train one detector, from one start and with one budget, on each of several sets,
     and test it on labelled real images; the same call goes on after an interruption.
 
@@ -214,8 +216,10 @@ def trial(
         ProbsceneError: see ``trial.trial``.
     """
     end_if_starting()
+    from ..trial import trial as trying  # torchvision takes seconds to import
+
     with display(progress) as show:
-        options = options or TrialOptions()
+        options = options or trying.TrialOptions()
         return trying.trial(Path(test), Path(out), sets or {}, options, workers=workers, show=show, callback=show.say)
 
 

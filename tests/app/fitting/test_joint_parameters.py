@@ -49,15 +49,15 @@ def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
     truth, model = both(True), both(False)
     generate_scenes(truth, truth.prior, 200, tmp_path / "target", format="images")
     settings = {
-        "features.schedule.steps": 150,
+        "features.schedule.steps": 100,
         "features.schedule.images": 8,
         "features.width": "8,16,32",
         "structure.batches": 4,
         "structure.num_scenes": 60,
     }
-    settings |= {"pretrain.derivations": 300, "parameters.reader_steps": 150, "parameters.steps": 150}
-    settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 40, "parameters.round_steps": 60}
-    settings |= {"parameters.scene_renders": 2000, "parameters.round_scene_renders": 400}
+    settings |= {"pretrain.derivations": 300, "parameters.reader_steps": 150, "parameters.steps": 100}
+    settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 30, "parameters.round_steps": 40}
+    settings |= {"parameters.scene_renders": 1200, "parameters.round_scene_renders": 200}
     settings |= {"refine.batches": 2}
     config = preset("quick").set("features=count", settings)
     execution = Execution(1, cache=False, progress=False)
