@@ -54,10 +54,8 @@ class Recalibration(NamedTuple):
         found = Recalibration.identity(u.shape[1])
         for s in range(u.shape[1]):
             known = ~u[:, s].isnan()
-            if int(known.sum()) < MIN_KNOWN:
-                continue
-            of_site = tuple(part[known, s].double() for part in (mean, sd, u))
-            found.slope[s], found.scale[s], found.outliers[s] = _likeliest(*of_site, circle=bool(turns[s]))
+            of_site = tuple(part[known, s] for part in (mean, sd, u))
+            found.slope[s], found.scale[s], found.outliers[s] = likeliest(*of_site, circle=bool(turns[s]))
         return found
 
     def apply(self, mean: Tensor, sd: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,18 +63,29 @@ class Recalibration(NamedTuple):
         return torch.where(self.slope == 1, mean, 0.5 + self.slope * (mean - 0.5)), self.scale * sd
 
 
-def _likeliest(mean: Tensor, sd: Tensor, u: Tensor, circle: bool) -> tuple[float, float, float]:
-    limit = math.log(MAX_FACTOR)
+def likeliest(mean: Tensor, sd: Tensor, u: Tensor, circle: bool) -> tuple[float, float, float]:
+    """Slope, scale and outliers of one site's readings ``(K,)`` of known u ``(K,)``; of few objects those of
+    ``Recalibration.identity``."""
+    if len(u) < MIN_KNOWN:
+        return 1.0, 1.0, 0.0
+    mean, sd, u, limit = mean.double(), sd.double(), u.double(), math.log(MAX_FACTOR)
 
     def loss(at: np.ndarray) -> float:
         slope = 1.0 if circle else math.exp(at[2])
         nats = negative_log_likelihood(0.5 + slope * (mean - 0.5), math.exp(at[0]) * sd, u, circle)
-        return -float(torch.logaddexp(math.log(1 - at[1]) - nats, torch.full_like(nats, math.log(at[1]))).mean())
+        return float(with_outliers(nats, at[1]).mean())
 
     start = [0.0, OUTLIERS[1]] if circle else [0.0, OUTLIERS[1], 0.0]
     bounds = [(-limit, limit), (OUTLIERS[0], OUTLIERS[2]), (-limit, limit)][: len(start)]
     found = minimize(loss, np.array(start), method="Nelder-Mead", bounds=bounds).x
     return (1.0 if circle else math.exp(found[2])), math.exp(found[0]), float(found[1])
+
+
+def with_outliers(nats: Tensor, share: float) -> Tensor:
+    """Of ``negative_log_likelihood``, where a share of the readings says nothing."""
+    if share == 0:
+        return nats
+    return -torch.logaddexp(math.log(1 - share) - nats, torch.full_like(nats, math.log(share)))
 
 
 def negative_log_likelihood(mean: Tensor, sd: Tensor, u: Tensor, circle: bool) -> Tensor:

@@ -1,24 +1,27 @@
 """Which sites a reader can read, and how, by renders of the prior that nothing was trained on.
 
 A site is read on a line, on a circle, where u = 0 and u = 1 look alike, or on a circle that u goes round twice, where
-two values look alike. Skill is the share of the variance of u that a reading explains; of a site of which few objects
-were seen, only as much as is sure. Axis letters: K objects, S sites.
+two values look alike: in the way that is likeliest once readings are recalibrated. Skill is the share of the variance
+of u that a reading explains; of a site of which few objects were seen, only as much as is sure. Axis letters: K
+objects, S sites.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from .reader import normal, truncated_mean
+from .recalibration import likeliest, negative_log_likelihood, with_outliers
 
 LINE, CIRCLE, TWICE = range(3)
 MIN_SKILL = 0.2  # of a site that is learnt
-CIRCLE_REMAINDER = 0.8  # of the variance that a line leaves, and a circle of what it goes round once, at most
+MAX_COSINE = 0.96  # of how sure it is which of two values that look alike u is
 MIN_OBJECTS = 20  # or readings of a site in the target, to conclude anything from
 MIN_SD = 2e-3
 NUM_GUESSES = 41  # constants, of which the best is the guess without a reading
-STANDARD_ERRORS = 2.0  # that are subtracted from an estimated share
+STANDARD_ERRORS = 2.0  # subtracted from an estimated share, and by which a circle is likelier than a line
 
 
 class Skill(NamedTuple):
@@ -58,16 +61,14 @@ class Skill(NamedTuple):
                 geometries.append(LINE)
                 shares.append(torch.nan)
                 continue
-            found = [
-                _explained(truncated_mean(*normal(output)), true, 0),
-                _explained(_turned(output, 1), true, 1),
-                _explained(_turned(output, 2), true, 2),
-            ]
-            each = [share for share, _ in found]
-            way = CIRCLE if 1 - each[1] < CIRCLE_REMAINDER * (1 - each[0]) else LINE
-            way = TWICE if 1 - each[2] < CIRCLE_REMAINDER * (1 - each[way]) else way
+            found = [_on_a_line(output, true), _on_a_circle(output, true), _on_a_circle_twice(output, true)]
+            way = LINE
+            for other in (CIRCLE, TWICE):
+                better = found[way].nats - found[other].nats
+                if float(better.mean()) > STANDARD_ERRORS * float(better.std()) / len(true) ** 0.5:
+                    way = other
             geometries.append(way)
-            shares.append(each[way] - STANDARD_ERRORS * found[way][1])
+            shares.append(found[way].share - STANDARD_ERRORS * found[way].error)
         return Skill(torch.tensor(geometries), torch.tensor(shares))
 
     def read(self, raw: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,9 +93,51 @@ def _turned(output: Tensor, times: int) -> Tensor:
     return torch.atan2(sine, cosine) / (2 * torch.pi * times)
 
 
+class _Reading(NamedTuple):
+    """How well a site is read in one way, recalibrated.
+
+    Attributes:
+        nats: ``(K,)`` negative log likelihood of u.
+        share: of the variance of u that is explained, against the best guess without a reading.
+        error: its standard error, by the delta method.
+    """
+
+    nats: Tensor
+    share: float
+    error: float
+
+
+def _on_a_line(output: Tensor, true: Tensor) -> _Reading:
+    mean, sd = normal(output)
+    slope, scale, outliers = likeliest(mean, sd, true, circle=False)
+    mean, sd = 0.5 + slope * (mean - 0.5), scale * sd
+    nats = with_outliers(negative_log_likelihood(mean, sd, true, circle=False), outliers)
+    return _Reading(nats, *_explained(truncated_mean(mean, sd), true, 0))
+
+
+def _on_a_circle(output: Tensor, true: Tensor) -> _Reading:
+    read = _turned(output, 1)
+    return _Reading(_circular_nats(read, _spread(output[:, 2:4], 1), true), *_explained(read, true, 1))
+
+
+def _on_a_circle_twice(output: Tensor, true: Tensor) -> _Reading:
+    """The likelihood of u's place on the circle, and of the one of its two places there."""
+    read = _turned(output, 2)
+    nats = _circular_nats(2 * read, 2 * _spread(output[:, 4:6], 2), (2 * true).remainder(1.0)) - math.log(2)
+    toward = (output[:, 2:4] * _direction(read)).sum(-1).clamp(-MAX_COSINE, MAX_COSINE)
+    is_it = _circular_difference(true, read, 1.0).abs() < 0.25
+    return _Reading(nats - ((1 + toward.where(is_it, -toward)) / 2).log(), *_explained(read, true, 2))
+
+
+def _circular_nats(read: Tensor, sd: Tensor, true: Tensor) -> Tensor:
+    sd = sd.clamp(min=MIN_SD)
+    _, scale, outliers = likeliest(read, sd, true, circle=True)
+    return with_outliers(negative_log_likelihood(read, scale * sd, true, circle=True), outliers)
+
+
 def _explained(read: Tensor, true: Tensor, times: int) -> tuple[float, float]:
-    """The share of u's variance that a reading explains, against the best guess without one, and its standard error, by
-    the delta method; on a line, or on a circle that u goes round so many times."""
+    """The share of u's variance that is explained and its standard error; on a line, or on a circle that u goes round
+    so many times."""
     whole = 1 / max(times, 1)
     guess = torch.linspace(0, whole, NUM_GUESSES).unsqueeze(1)
 

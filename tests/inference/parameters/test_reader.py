@@ -96,6 +96,18 @@ def test_the_way_is_found_and_read(way):
     assert float(apart.mean()) < 0.03 and float(sd.mean()) < 0.1
 
 
+def test_an_interval_of_which_some_readings_say_nothing_is_no_circle():
+    """Wrong by more than a half is wrong by less than a half on a circle; the standard deviation is said too wide."""
+    rng = torch.Generator().manual_seed(2)
+    u, other = torch.rand(2, 2000, generator=rng)
+    read = torch.where(torch.rand(2000, generator=rng) < 0.2, other, u)
+    raw = said(read, 0.1)
+    raw[:, 0, 1] = np.log(0.3)
+    raw[:, 0, 2:] = harmonics(raw[:, 0, 0]) * 0.8
+    skill = Skill.from_readings(raw, u[:, None])
+    assert skill.geometry.tolist() == [LINE] and float(skill.explained) > 0.4
+
+
 def test_what_says_nothing_is_not_readable():
     u = torch.rand(600, generator=torch.Generator().manual_seed(1))
     raw = said(u, way=LINE)[torch.randperm(600, generator=torch.Generator().manual_seed(2))]
