@@ -24,6 +24,7 @@ __version__ = "0.2.0"
 _APP_MODULES = {
     "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
     "api.fit": ("fit",),
+    "cut_paste.begin": ("BeginOptions", "begin"),
     "datasets.generate": ("DatasetOptions",),
     "evaluation.labels": ("TargetLabels",),
     "fitting.begin": ("ModelFile",),
@@ -43,7 +44,7 @@ _MODULES = {
     "probscene.dataset": ("ImageFolder",),
     "probscene.derivation": ("Derivation",),
     "probscene.derive": ("derive",),
-    "probscene.drawing": ("Drawing", "Sprites"),
+    "probscene.drawing": ("Atlas", "Drawing", "Sprites"),
     "probscene.enumeration": ("enumerate_derivations",),
     "probscene.errors": (
         "DataError", "GeneratorError", "GrammarError", "MachineError", "ModelError", "ProbsceneError", "RunError",
@@ -65,6 +66,7 @@ _MODULES = {
     "probscene.mesh": ("Mesh",),
     "probscene.model": ("Groups", "SceneModel", "scene_model"),
     "probscene.camera_effects": ("CameraEffects",),
+    "probscene.placement": ("separate",),
     "probscene.policy": ("Policy",),
     "probscene.request": ("Objects", "Request"),
     "probscene.sampling": ("Scenes", "sample", "seed_everything"),
@@ -80,6 +82,7 @@ if TYPE_CHECKING:
     from probscene.app.api.fit import fit
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
+    from probscene.app.cut_paste.begin import BeginOptions, begin
     from probscene.app.datasets.generate import DatasetOptions
     from probscene.app.datasets.scene_dataset import SceneDataset
     from probscene.app.evaluation.labels import TargetLabels
@@ -106,7 +109,7 @@ if TYPE_CHECKING:
     from .dataset import ImageFolder
     from .derivation import Derivation
     from .derive import derive
-    from .drawing import Drawing, Sprites
+    from .drawing import Atlas, Drawing, Sprites
     from .enumeration import enumerate_derivations
     from .errors import (
         DataError,
@@ -123,6 +126,7 @@ if TYPE_CHECKING:
     from .image_array import ImageArray
     from .mesh import Mesh
     from .model import Groups, SceneModel, scene_model
+    from .placement import separate
     from .policy import Policy
     from .request import Objects, Request
     from .sampling import Scenes, sample, seed_everything
@@ -131,15 +135,16 @@ if TYPE_CHECKING:
     from .world import Camera, Ground, Light, Meshes, World
 
 __all__ = [
-    "Camera", "CameraEffects", "Command", "DataError", "DatasetOptions", "Derivation", "Divergence", "Drawing",
-    "Execution", "FeatureNet", "Features", "FitConfig", "GeneratedSets", "GeneratorError", "Grammar", "GrammarError",
-    "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon", "KDELogRatio", "LSTMGuide",
-    "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "ModelFile", "Objects", "PCFG", "ParameterGuide",
-    "Policy", "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError", "SamplingError",
-    "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "ScoreFunctionConfig", "Sprites",
-    "StructurePrior", "TargetImages", "TargetLabels", "TrainingBudget", "TrialOptions", "World", "compare", "counts",
-    "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label", "load_model", "preset",
-    "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything", "trial", "weights",
+    "Atlas", "BeginOptions", "Camera", "CameraEffects", "Command", "DataError", "DatasetOptions", "Derivation",
+    "Divergence", "Drawing", "Execution", "FeatureNet", "Features", "FitConfig", "GeneratedSets", "GeneratorError",
+    "Grammar", "GrammarError", "GrammarVAE", "Ground", "Groups", "Guide", "ImageArray", "ImageFolder", "JensenShannon",
+    "KDELogRatio", "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "ModelFile", "Objects",
+    "PCFG", "ParameterGuide", "Policy", "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError",
+    "SamplingError", "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "ScoreFunctionConfig",
+    "Sprites", "StructurePrior", "TargetImages", "TargetLabels", "TrainingBudget", "TrialOptions", "World", "begin",
+    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
+    "load_model", "preset", "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything",
+    "separate", "trial", "weights",
 ]  # fmt: skip
 
 

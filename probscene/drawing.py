@@ -4,16 +4,21 @@ Coordinates are pixels with the origin in the upper left corner of the canvas, x
 pixel in row i and column j is (j + 0.5, i + 0.5). Axis letters: N scenes, M nodes.
 """
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from .camera_effects import CameraEffects
-from .errors import ModelError
+from .decoding import eight_bit, quiet, read, stored
+from .errors import DataError, ModelError
+from .image_bytes import Fault
 
 _COLOUR_LIMITS = -1.0, 2.0  # within which a channel is clipped to 0..1; beyond them it has another scale
 
@@ -58,6 +63,60 @@ class Atlas:
 
     def __len__(self) -> int:
         return len(self.sprites)
+
+    @staticmethod
+    def from_folder(path: Path | str) -> "Atlas":
+        """The PNG files of a folder, sorted by name, each a sprite; hidden files are not read.
+
+        Raises:
+            DataError: no PNG there, or one that does not decode.
+        """
+        files = sorted(f for f in Path(path).glob("*") if f.suffix.lower() == ".png" and not f.name.startswith("."))
+        if not files:
+            raise DataError(f"expected PNG files in {path}, got none; put back what was taken out, or edit the model.")
+        return Atlas(tuple(map(_picture, files)))
+
+    @property
+    def fingerprint(self) -> str:
+        """Of its pixels: what a model says in ``assets``, so that its runs are bound to them."""
+        digest = hashlib.sha256()
+        for sprite in self.sprites:
+            digest.update(repr(sprite.shape).encode() + sprite.tobytes())
+        return digest.hexdigest()[:12]
+
+    def pick(self, u: Tensor) -> Tensor:
+        """The sprite that a value in [0, 1] chooses, each with the same share: int64 of the same shape."""
+        return (u * len(self)).long().clamp(0, len(self) - 1)
+
+    def feathered(self, widths: Sequence[float]) -> "Atlas":
+        """Every sprite with its edge blurred by each of some widths: sprite i at ``len(widths) * i`` and after.
+
+        A detector that sees one way of pasting alone learns to see the seam (Dwibedi, Misra, Hebert, *Cut, Paste and
+        Learn*, ICCV 2017). Alpha is blurred and colour is not, so that a sprite should have colour beyond its edge.
+
+        Args:
+            widths: standard deviations, pixels of the sprite; 0 for as it is.
+        """
+        return Atlas(tuple(_feathered(sprite, width) for sprite in self.sprites for width in widths))
+
+
+def _picture(file: Path) -> np.ndarray:
+    """RGBA."""
+    try:
+        with quiet():
+            found = eight_bit(stored(read(file), opacity=True)[0])
+    except Fault as fault:
+        raise DataError(f"expected a picture in {file}, got a file that {fault}; replace or delete it.") from fault
+    if found.ndim == 2:
+        found = np.repeat(found[..., None], 3, 2)
+    return found if found.shape[2] == 4 else np.dstack([found, np.full(found.shape[:2], 255, np.uint8)])
+
+
+def _feathered(sprite: np.ndarray, width: float) -> np.ndarray:
+    if not width:
+        return sprite
+    alpha = cv2.GaussianBlur(sprite[..., 3], (0, 0), width, borderType=cv2.BORDER_CONSTANT)
+    return np.dstack([sprite[..., :3], alpha])
 
 
 def _described(value: Any) -> str:

@@ -57,3 +57,15 @@ def range_given(text: str | None) -> tuple[float, float] | None:
     except ValueError:
         raise ProbsceneError(f"expected --range LOW,HIGH such as 0,4095, got {text!r}.") from None
     return low, high
+
+
+def size_given(text: str) -> tuple[int, int]:
+    """Height and width of ``WIDTHxHEIGHT``.
+
+    Raises:
+        ProbsceneError: it is something else.
+    """
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ProbsceneError(f"expected a size WIDTHxHEIGHT such as 256x192, got {text!r}.")
+    return int(height), int(width)

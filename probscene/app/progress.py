@@ -44,6 +44,7 @@ STAGES = {
     "labels": ("Labelled images", "images"),
     "training": ("Detectors", "images"),
     "scoring": ("Scoring", "sets"),
+    "cutting": ("Cutting out", "photographs"),
 }
 """By stage: what it does, and in what it counts."""
 EVERY = 30.0  # seconds without a line, at most, where there is no terminal

@@ -23,7 +23,8 @@ class Call:
 
 
 ORDER = (
-    "check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "trial", "demo", "version",
+    "begin", "check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "trial", "demo",
+    "version",
 )  # fmt: skip
 
 

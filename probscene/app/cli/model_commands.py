@@ -13,6 +13,48 @@ from .options import Assets, Model, Seed, ValueRange
 
 
 @app.command()
+def begin(
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="A folder of photographs.")],
+    labels: Annotated[
+        Path, typer.Option(metavar="PATH", help="Boxes or masks of some of them: COCO, KITTI or YOLO.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write: a model and its pictures.")],
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Of the model; the folder's if not given.")] = None,
+    canvas: Annotated[
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of its scenes; most photographs' if not given.")
+    ] = None,
+    turn: Annotated[
+        bool | None,
+        typer.Option("--turn/--upright", help="Objects lie in any direction; as they do if neither is given."),
+    ] = None,
+    ignore: Annotated[
+        str, typer.Option(metavar="NAME,...", help="Classes of what is no object, drawn without a label.")
+    ] = "ignore",
+    seed: Seed = 0,
+    value_range: ValueRange = None,
+) -> None:
+    """Make a first model of a few labelled photographs: their objects, cut out, on what is left of them."""
+    from ..arguments import range_given, size_given
+    from ..cut_paste.begin import BeginOptions
+    from ..cut_paste.begin import begin as made
+
+    options = BeginOptions(
+        name=name,
+        canvas=None if canvas is None else size_given(canvas),
+        turn=turn,
+        ignore=tuple(word.strip() for word in ignore.split(",") if word.strip()),
+        value_range=range_given(value_range),
+        seed=seed,
+    )
+    found = made(photos, labels, out, options)
+    for note in found.notes:
+        print(f"Note: {note}")
+    counted = ", ".join(f"{found.cutouts[name]} of {number} {name}" for name, number in found.objects.items())
+    print(f"Cut out: {counted}; {found.grounds} grounds. Look at {out / 'cutouts.png'}, and delete what is cut badly.")
+    print(f"The model is {found.path}; try: probscene preview {found.path} --out preview.png")
+
+
+@app.command()
 def check(
     model: Model,
     assets: Assets = None,

@@ -74,7 +74,7 @@ def trial(
     from rich.console import Console
 
     from ..api import calls
-    from ..arguments import range_given
+    from ..arguments import range_given, size_given
     from ..trial.tables import show
     from ..trial.trial import GeneratedSets, TrainingBudget, TrialOptions
 
@@ -97,7 +97,7 @@ def trial(
         classes=None if classes is None else _words(classes),
         detector=detector,
         budget=TrainingBudget(iterations, batch, rate, finetune_fraction, warm_start),
-        size=None if size is None else _size(size),
+        size=None if size is None else size_given(size),
         seeds=seeds,
         seed=seed,
         baselines=baseline or (),
@@ -118,11 +118,3 @@ def _numbers(text: str) -> list[int | None]:
     if not all(word == "all" or (word.isdecimal() and int(word) > 0) for word in words):
         raise ProbsceneError(f"expected numbers of photographs such as 10,20,50,all, or none, got {text!r}.")
     return [None if word == "all" else int(word) for word in words]
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Height and width."""
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise ProbsceneError(f"expected a size WIDTHxHEIGHT such as 256x192, got {text!r}.")
-    return int(height), int(width)

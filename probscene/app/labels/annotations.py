@@ -4,6 +4,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .naming import Entry
 
 Size = tuple[int, int]
@@ -20,6 +23,7 @@ class Annotation(NamedTuple):
         occluded: KITTI's level of what is hidden, 0 to 3.
         crowd: it stands for an unknown number of objects.
         where: it is in its file, for messages.
+        mask: ``mask()``, its pixels ``(H, W)`` bool; None where only its box is known.
     """
 
     name: str
@@ -31,6 +35,7 @@ class Annotation(NamedTuple):
     occluded: float = 0.0
     crowd: bool = False
     where: str = ""
+    mask: Callable[[], NDArray[np.bool_]] | None = None
 
 
 class Annotated(NamedTuple):

@@ -9,10 +9,12 @@ Numbers may be written as text, ids as 1.0 for 1; a width or height of 0 is an u
 import json
 import math
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probscene.errors import DataError
 
@@ -121,7 +123,29 @@ def _annotation(name: str, where: str, entry: dict[str, Any], size: Size) -> Ann
         )
     x, y, width, height = box
     crowd = number_of(entry.get("iscrowd")) > 0 or entry.get("iscrowd") is True
-    return Annotation(name, x, y, x + width, y + height, crowd=crowd, where=where)
+    mask = partial(_mask, shape, size, where) if (shape := entry.get("segmentation")) else None
+    return Annotation(name, x, y, x + width, y + height, crowd=crowd, where=where, mask=mask)
+
+
+def _mask(segmentation: Any, size: Size, where: str) -> NDArray[np.bool_]:
+    """``(H, W)`` of polygons or run lengths."""
+    from faster_coco_eval.core import mask as coder
+
+    around(segmentation, where)
+    if isinstance(segmentation, dict):
+        if tuple(map(number_of, segmentation["size"])) != size:
+            raise DataError(
+                f"expected a mask of {size[1]}x{size[0]} {where}, as its image is, got one of "
+                f"{segmentation['size'][1]}x{segmentation['size'][0]}; fix or delete it."
+            )
+    elif not isinstance(segmentation[0], list):
+        segmentation = [segmentation]
+    coded = coder.frPyObjects(segmentation, *size) if not _is_packed(segmentation) else segmentation
+    return coder.decode(coder.merge(coded) if isinstance(coded, list) else coded).astype(bool)
+
+
+def _is_packed(segmentation: Any) -> bool:
+    return isinstance(segmentation, dict) and isinstance(segmentation["counts"], str)
 
 
 def around(segmentation: Any, where: str) -> list[float]:

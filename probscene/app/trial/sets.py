@@ -246,6 +246,11 @@ def _example(path: Path, pixels: NDArray, objects: list[_Object], classes: tuple
         )
     of_class = np.array([-1 if name is None else classes.index(name) for _, name, *_ in objects], np.int64)
     levels = np.array([each.level for each in objects], np.int64)
+    return Example(path, cut, of_class, levels, real, (height, width), digest_of_pixels(pixels))
+
+
+def digest_of_pixels(pixels: NDArray) -> str:
+    """Of what ``decoding.stored`` gives, in RGB."""
     pixels = np.dstack([pixels] * 3) if pixels.ndim == 2 else pixels
-    digest = hashlib.sha256(f"{height}x{width}".encode() + pixels.tobytes()).hexdigest()
-    return Example(path, cut, of_class, levels, real, (height, width), digest)
+    height, width = pixels.shape[:2]
+    return hashlib.sha256(f"{height}x{width}".encode() + pixels.tobytes()).hexdigest()

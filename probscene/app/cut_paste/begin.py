@@ -1,0 +1,421 @@
+"""``probscene begin``: a model file made of a few labelled photographs, with the pictures that it draws beside it.
+
+    model.py             the model, to read and edit
+    cutouts/CLASS/*.png  objects, RGBA; those that are deleted are no longer drawn
+    cutouts.png          all of them at a glance
+    grounds/*.png        the photographs without their objects
+    labels.json          the labels (COCO), with the model's names of classes
+    begun.json           which photographs these pictures are of; they must not stand in a test
+"""
+
+import os
+import re
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+
+from probscene.dataset import ImageFolder, is_image
+from probscene.decoding import quiet, read, stored, window
+from probscene.errors import DataError
+from probscene.image_bytes import Fault
+
+from ..arguments import checked_seed
+from ..files import machine_error, make_folder, write_json, write_text
+from ..labels.annotations import Annotated, Annotation
+from ..labels.kitti import DONT_CARE
+from ..labels.naming import composed, matched
+from ..labels.reading import read_annotations
+from ..progress import Display, Progress
+from ..trial.sets import digest_of_pixels
+from .cutouts import Cutout, Object, covered, cut_out, overlaps, turned
+from .grounds import ground_of, light_of
+from .model_file import ClassPart, ModelPart, model_text
+
+AREA = 342 * 342  # pixels of the canvas at most: what counting heads see of an image
+MAX_CUTOUTS = 80  # of a class
+MAX_GROUNDS = 60
+MIN_CUTOUTS = 5  # of a class; with fewer a note says how little that is
+MIN_CONTRAST = 1.3  # of a cut-out; less is noise, or a label of nothing
+OUTLIER = 3.5  # robust standard deviations of the logarithm of a mask's area
+MIN_TO_CHOOSE = 8  # cut-outs of a class, to leave out unusual ones
+OVERLAPPING = 0.1  # of a box that another covers, from which on objects overlap
+WHOLE_IMAGE = 0.9  # of an image, that a box may cover
+IGNORE = "ignore"  # the class of what is no object
+LIGHTS = 0.9  # of the photographs, whose light a model's exposure covers
+MARGIN = 0.05  # of the canvas, by which places go on beyond those seen
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeginOptions:
+    """How a model is made.
+
+    Args:
+        name: of the model; its folder's where None.
+        canvas: height and width of its scenes, pixels; that of most photographs, reduced to ``AREA``, where None.
+        turn: whether objects lie in any direction; by class as their cut-outs do where None.
+        ignore: classes of what looks like an object and is none, drawn without a label.
+        value_range: of photographs of 16 bits, see ``ImageFolder``.
+        seed: of the noise in grounds, and of the choice among many cut-outs.
+    """
+
+    name: str | None = None
+    canvas: tuple[int, int] | None = None
+    turn: bool | None = None
+    ignore: tuple[str, ...] = (IGNORE,)
+    value_range: Sequence[float] | None = None
+    seed: int = 0
+
+
+class BegunModel(NamedTuple):
+    """What ``begin`` wrote.
+
+    Attributes:
+        path: the model's file.
+        cutouts: of each class, how many there are.
+        objects: of each class, how many are labelled.
+        grounds: how many.
+        notes: what a person should know, one sentence each.
+    """
+
+    path: Path
+    cutouts: Mapping[str, int]
+    objects: Mapping[str, int]
+    grounds: int
+    notes: tuple[str, ...]
+
+
+class _Photographs(NamedTuple):
+    """The labelled photographs as the canvas has them."""
+
+    images: list[NDArray[np.uint8]]  # (H, W, 3)
+    objects: list[list[Object]]
+    crowds: list[list[Object]]
+    folder: ImageFolder
+    notes: tuple[str, ...]
+
+
+def begin(
+    photos: Path | str,
+    labels: Path | str,
+    out: Path | str,
+    options: BeginOptions = BeginOptions(),
+    *,
+    progress: bool = True,
+) -> BegunModel:
+    """Make a model of labelled photographs: their objects are cut out, their grounds filled in, and a program pastes
+    the ones on the others [1]. Its prior has flat counts up to half again of what the labels have.
+
+    Args:
+        photos: the folder of the photographs; those without labels are not looked at.
+        labels: of some of them, with boxes or masks: COCO, KITTI or YOLO.
+        out: the folder to write, new or empty.
+
+    Raises:
+        DataError: see ``read_annotations``, ``ImageFolder`` and ``matched``; no labelled photograph, or no object that
+            can be cut out; the folder holds files.
+
+    References:
+        [1] Dwibedi, Misra, Hebert, *Cut, Paste and Learn*, ICCV 2017.
+    """
+    out, photos = Path(out), Path(photos)
+    checked_seed(options.seed)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DataError(f"expected a new or empty folder for the model, got {out}, which holds files; name another.")
+    with Display() if progress else Display(Console(quiet=True)) as show:
+        return _begin(photos, Path(labels), out, options, show)
+
+
+def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: Progress) -> BegunModel:
+    found = _photographs(photos, labels, options)
+    kinds = _kinds(found.objects)
+    rng, notes = np.random.default_rng(options.seed), list(found.notes)
+    light = float(np.median([light_of(*pair) for pair in zip(found.images, _there(found), strict=True)]))
+    cut: dict[str, list[Cutout]] = {name: [] for name in kinds}
+    grounds, covers = [], []
+    for i, (image, objects, there) in enumerate(zip(found.images, found.objects, _there(found), strict=True)):
+        for one, cutout in zip(objects, cut_out(image, objects, light), strict=True):
+            if cutout is not None:
+                cut[one.name].append(cutout)
+        gain = light / max(light_of(image, there), 1.0)
+        grounds.append(np.clip(ground_of(image, there, rng) * gain, 0, 255).round().astype(np.uint8))
+        covers.append(float(there.mean()))
+        show("cutting", i + 1, len(found.images))
+    if renamed := [f"{name} {kind}" for name, kind in kinds.items() if name != kind]:
+        notes.append(f"In the model and in labels.json, classes are called otherwise: {', '.join(renamed)}.")
+    ignored = {name for name in kinds if composed(name) in map(composed, options.ignore)}
+    chosen = {name: _chosen(name, some, rng, notes) for name, some in cut.items()}
+    empty = [name for name, some in chosen.items() if not some]
+    if len(empty) == len(chosen) or not set(chosen) - ignored - set(empty):
+        raise DataError(
+            f"expected objects in {labels} that can be cut out, got none of {', '.join(kinds) or 'any class'}; label "
+            "some that are at least a few pixels wide."
+        )
+    for name in empty:
+        notes.append(f"{name}: no object could be cut out, so that the model has no such class; label larger ones.")
+    if len(grounds) == 1:
+        notes.append("One photograph is all there is: scenes have one ground. Label a few more.")
+    best = np.argsort(covers, kind="stable")[:MAX_GROUNDS]
+    model = _model(found, chosen, kinds, ignored, options, out)
+    _write(out, model, {kinds[n]: c for n, c in chosen.items() if c}, [grounds[i] for i in sorted(best)], found, kinds)
+    number = Counter(one.name for each in found.objects for one in each)
+    return BegunModel(
+        out / "model.py",
+        {name: len(some) for name, some in chosen.items()},
+        {name: number[name] for name in kinds},
+        len(best),
+        tuple(notes),
+    )
+
+
+def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photographs:
+    if not photos.is_dir():
+        raise DataError(f"expected a folder of photographs, got {photos}; name the folder that they are in.")
+    labels = read_annotations(path)
+    files = [file for file in sorted(photos.iterdir()) if is_image(file)]
+    pairs = matched(labels.images, files, photos, stems=labels.stems)
+    if not pairs.entries:
+        raise DataError(
+            f"expected labels of photographs in {photos}, got none of them in {path}; label at least one, by the name "
+            "of its file."
+        )
+    named = [files[i] for i in pairs.entries]
+    sizes = ImageFolder(named, (64, 64), 3, value_range=options.value_range).sizes
+    folder = ImageFolder(named, options.canvas or _canvas(sizes), 3, value_range=options.value_range)
+    images = [folder.load(i).permute(1, 2, 0).contiguous().numpy() for i in range(len(folder))]
+    objects, crowds, dropped = [], [], Counter[str]()
+    for i, entry in enumerate(pairs.entries.values()):
+        each = [one for one in labels.read(entry, folder.sizes[i]) if one.name != DONT_CARE]
+        mine = [_object(one, folder, i, labels) for one in each]
+        crowds.append([o for one, o in zip(each, mine, strict=True) if one.crowd and o is not None])
+        kept = []
+        for one, o in zip(each, mine, strict=True):
+            if o is None:
+                dropped["lie where photographs are cut to the canvas"] += 1
+            elif not one.crowd and o.size**2 > WHOLE_IMAGE * folder.canvas[0] * folder.canvas[1]:
+                dropped["cover the whole photograph"] += 1
+            elif not one.crowd:
+                kept.append(o)
+        objects.append(kept)
+    notes = [*pairs.notes, *folder.notes]
+    notes += [f"Left out: {number} objects that {why}." for why, number in dropped.items()]
+    if not any(objects):
+        raise DataError(f"expected objects in {path}, got none in {len(named)} photographs; label some.")
+    return _Photographs(images, objects, crowds, folder, tuple(dict.fromkeys(notes)))
+
+
+def _canvas(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """The size to which the most photographs are brought without a cut, reduced to ``AREA``."""
+    common = Counter(sizes)
+    height, width = max(
+        sorted(common), key=lambda size: (sum(window(other, size) is None for other in sizes), common[size])
+    )
+    scale = min(1.0, (AREA / (height * width)) ** 0.5)
+    return max(8, round(height * scale)), max(8, round(width * scale))
+
+
+def _object(one: Annotation, folder: ImageFolder, i: int, labels: Annotated) -> Object | None:
+    """As the canvas has it; None where its middle is not on it."""
+    size, (H, W) = folder.sizes[i], folder.canvas
+    end = 1.0 if labels.kitti else 0.0
+    right, bottom = one.right + end, one.bottom + end
+    if not (one.left < size[1] and right > 0 and one.top < size[0] and bottom > 0):
+        raise DataError(
+            f"expected boxes on the image of {size[1]}x{size[0]} {one.where}, got {one.name} from {one.left:g}, "
+            f"{one.top:g} to {right:g}, {bottom:g}; give the labels of these images, not of images of another size."
+        )
+    top, left, height, width = folder.windows[i] or (0, 0, *size)
+    x = np.clip([one.left, right], 0, size[1]) - left
+    y = np.clip([one.top, bottom], 0, size[0]) - top
+    if not (0 <= x.mean() < width and 0 <= y.mean() < height):
+        return None
+    x, y = np.clip(x, 0, width) * W / width, np.clip(y, 0, height) * H / height
+    mask = None
+    if one.mask is not None:
+        part = one.mask()[top : top + height, left : left + width].astype(np.uint8)
+        mask = cv2.resize(part, (W, H), interpolation=cv2.INTER_NEAREST).astype(bool)
+        mask = mask if mask.any() else None
+    return Object(composed(one.name), (float(x[0]), float(y[0]), float(x[1]), float(y[1])), mask)
+
+
+def _there(found: _Photographs) -> list[NDArray[np.bool_]]:
+    pairs = zip(found.objects, found.crowds, strict=True)
+    return [covered([*objects, *crowds], found.folder.canvas) for objects, crowds in pairs]
+
+
+def _kinds(objects: Iterable[Iterable[Object]]) -> dict[str, str]:
+    """By the names of classes what they are called in the grammar, large ones first."""
+    size: dict[str, list[float]] = {}
+    for each in objects:
+        for one in each:
+            size.setdefault(one.name, []).append(one.size)
+    kinds: dict[str, str] = {}
+    for name in sorted(size, key=lambda name: (-float(np.median(size[name])), name)):
+        kind = re.sub(r"[^\w\-]+", "_", name).strip("_-") or "object"
+        kind = kind[0].lower() + kind[1:]  # of a nonterminal the first letter is upper-case
+        while kind in kinds.values() or kind == "ε":
+            kind += "_"
+        kinds[name] = kind
+    return kinds
+
+
+def _chosen(name: str, some: list[Cutout], rng: np.random.Generator, notes: list[str]) -> list[Cutout]:
+    """The cut-outs of a class that are drawn."""
+    whole = [one for one in some if one.whole]
+    if some and not whole:
+        notes.append(f"{name}: every object is cut by the border or covered by another, and is drawn as it is.")
+        whole = some
+    clear = [one for one in whole if one.contrast >= MIN_CONTRAST]
+    if clear and len(clear) < len(whole):
+        notes.append(f"{name}: {len(whole) - len(clear)} objects that look like their ground are not drawn.")
+        whole = clear
+    if len(whole) >= MIN_TO_CHOOSE:
+        area = np.log([max((one.rgba[..., 3] > 127).sum(), 1) for one in whole])
+        off = np.abs(area - np.median(area))
+        usual = off <= OUTLIER * max(1.4826 * float(np.median(off)), 0.1)
+        whole = [one for one, keep in zip(whole, usual, strict=True) if keep]
+    if whole and len(whole) < MIN_CUTOUTS:
+        objects = "object is" if len(whole) == 1 else "objects are"
+        notes.append(f"{name}: {len(whole)} {objects} all that scenes show of it. Label more, for other looks.")
+    if len(whole) > MAX_CUTOUTS:
+        whole = [whole[i] for i in sorted(rng.choice(len(whole), MAX_CUTOUTS, replace=False))]
+    return whole
+
+
+def _model(
+    found: _Photographs,
+    chosen: Mapping[str, list[Cutout]],
+    kinds: Mapping[str, str],
+    ignored: Iterable[str],
+    options: BeginOptions,
+    out: Path,
+) -> ModelPart:
+    """What the file says."""
+    height, width = found.folder.canvas
+    parts = []
+    for name, cutouts in chosen.items():
+        if not cutouts:
+            continue
+        number = [sum(one.name == name for one in each) for each in found.objects]
+        boxes = np.array([one.box for each in found.objects for one in each if one.name == name])
+        middles = (boxes[:, :2] + boxes[:, 2:]) / 2
+        low = np.maximum(middles.min(0) - (MARGIN * width, MARGIN * height), 0)
+        high = np.minimum(middles.max(0) + (MARGIN * width, MARGIN * height), (width, height))
+        turn = turned([one.direction for one in cutouts]) if options.turn is None else options.turn
+        parts.append(
+            ClassPart(
+                kinds[name], name in ignored, max(number), (min(number), max(number)), len(boxes), len(cutouts),
+                (float(low[0]), float(high[0])), (float(low[1]), float(high[1])), turn,
+            )
+        )  # fmt: skip
+    objects = [[one for one in each if one.name not in ignored] for each in found.objects]
+    most = max((float(overlaps(each).max(initial=0.0)) for each in objects if each), default=0.0)
+    radius = float(np.median([one.size for each in objects for one in each] or [1.0])) / 2
+    lights = [light_of(*pair) for pair in zip(found.images, _there(found), strict=True)]
+    off = np.abs(np.log(np.maximum(lights, 1.0) / np.median(np.maximum(lights, 1.0))))
+    grey = all((image == image[..., :1]).all() for image in found.images)
+    return ModelPart(
+        re.sub(r"\W", "_", options.name or out.resolve().name) or "begun",
+        (height, width),
+        1 if grey else 3,
+        tuple(parts),
+        len(found.images),
+        most > OVERLAPPING,
+        radius,
+        float(np.quantile(off, LIGHTS)),
+    )
+
+
+def _write(
+    out: Path,
+    model: ModelPart,
+    cutouts: Mapping[str, list[Cutout]],
+    grounds: list[NDArray[np.uint8]],
+    found: _Photographs,
+    kinds: Mapping[str, str],
+) -> None:
+    """The folder, whole or not at all."""
+    make_folder(out.resolve().parent)
+    try:
+        aside = Path(tempfile.mkdtemp(dir=out.resolve().parent, prefix=f".{out.name}."))
+    except OSError as error:
+        raise machine_error(error, out) from error
+    try:
+        for kind, some in cutouts.items():
+            _save([one.rgba for one in some], aside / "cutouts" / kind)
+        _save(grounds, aside / "grounds")
+        Image.fromarray(_sheet(cutouts)).save(aside / "cutouts.png")
+        write_text(aside / "model.py", model_text(model))
+        write_json(aside / "labels.json", _labels(found, kinds))
+        write_json(aside / "begun.json", {"format": 1, "photographs": [_known(file) for file in found.folder.paths]})
+        aside.chmod(0o755)
+        if out.is_dir():
+            out.rmdir()
+        os.replace(aside, out)
+    except OSError as error:
+        raise machine_error(error, out) from error
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _save(pictures: Sequence[NDArray[np.uint8]], folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for i, picture in enumerate(pictures):
+        Image.fromarray(picture).save(folder / f"{i:03d}.png")
+
+
+def _known(file: Path) -> dict[str, str]:
+    """A photograph by its name and its pixels, see ``trial.sets.Example.digest``."""
+    try:
+        with quiet():
+            return {"name": file.name, "digest": digest_of_pixels(stored(read(file))[0])}
+    except Fault as fault:
+        raise DataError(f"expected a photograph in {file}, got a file that {fault}.") from fault
+
+
+def _labels(found: _Photographs, kinds: Mapping[str, str]) -> dict[str, Any]:
+    """COCO of the boxes, in pixels of the files."""
+    images, annotations = [], []
+    H, W = found.folder.canvas
+    for i, (file, objects) in enumerate(zip(found.folder.paths, found.objects, strict=True)):
+        size = found.folder.sizes[i]
+        top, left, height, width = found.folder.windows[i] or (0, 0, *size)
+        images.append({"id": i + 1, "file_name": file.name, "height": size[0], "width": size[1]})
+        for one in objects:
+            x0, y0, x1, y1 = np.array(one.box) * ((width / W, height / H) * 2) + ((left, top) * 2)
+            annotations.append(
+                {
+                    "id": len(annotations) + 1, "image_id": i + 1, "category_id": list(kinds).index(one.name) + 1,
+                    "bbox": [round(float(v), 3) for v in (x0, y0, x1 - x0, y1 - y0)], "iscrowd": 0,
+                    "area": round(float((x1 - x0) * (y1 - y0)), 3),
+                }
+            )  # fmt: skip
+    categories = [{"id": i + 1, "name": kind} for i, kind in enumerate(kinds.values())]
+    return {"images": images, "annotations": annotations, "categories": categories}
+
+
+def _sheet(cutouts: Mapping[str, list[Cutout]], side: int = 72, columns: int = 16) -> NDArray[np.uint8]:
+    """All cut-outs on grey, with the names of their files."""
+    font, rows = ImageFont.load_default(11), sum(1 + -(-len(some) // columns) for some in cutouts.values())
+    sheet = Image.new("RGB", (columns * side, rows * (side + 14)), (128, 128, 128))
+    draw, row = ImageDraw.Draw(sheet), 0
+    for kind, some in cutouts.items():
+        draw.text((4, row * (side + 14) + side - 6), f"cutouts/{kind}", (255, 255, 255), ImageFont.load_default(18))
+        for i, one in enumerate(some):
+            at, line = i % columns * side, (row + 1 + i // columns) * (side + 14)
+            picture = Image.fromarray(one.rgba)
+            scale = (side - 4) / max(picture.size)
+            picture = picture.resize([max(1, round(scale * v)) for v in picture.size])
+            sheet.paste(picture, (at + 2, line), picture)
+            draw.text((at + 2, line + side - 3), f"{i:03d}", (230, 230, 230), font)
+        row += 1 + -(-len(some) // columns)
+    return np.asarray(sheet)
