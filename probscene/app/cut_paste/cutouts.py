@@ -114,7 +114,7 @@ def _cut_out(image: NDArray[np.uint8], objects: Sequence[Object], i: int, light:
     alpha = cv2.GaussianBlur(alpha, (0, 0), SMOOTH)
     whole = min(x0, y0) >= 1 and x1 <= width - 1 and y1 <= height - 1
     whole = whole and overlaps(objects)[i].max(initial=0.0) <= MAX_COVERED
-    ground = (alpha < 0.02) & ~covered(objects[:i] + objects[i + 1 :], (height, width))[top:bottom, left:right]
+    ground = (alpha < 0.02) & ~covered([*objects[:i], *objects[i + 1 :]], (height, width))[top:bottom, left:right]
     gain, contrast = 1.0, np.inf
     if ground.sum() >= RING:
         middle = float(np.median(patch[ground]))
@@ -139,11 +139,13 @@ def _separated(patch: NDArray[np.uint8], box: tuple[float, float, float, float])
     found = ellipse
     if x1 - x0 >= 4 and y1 - y0 >= 4 and np.ptp(large) > 0:
         cv2.setRNGSeed(0)
-        cv2.grabCut(large, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        back, front = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(large, labels, (0, 0, 0, 0), back, front, ITERATIONS, cv2.GC_INIT_WITH_MASK)
         found = _largest(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8))
         if found.sum() < MIN_FILLED * (x1 - x0) * (y1 - y0):
             found = ellipse
-    return cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return small.astype(np.float32)
 
 
 def _largest(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -153,13 +155,13 @@ def _largest(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     framed = cv2.copyMakeBorder(mask, rim, rim, rim, rim, cv2.BORDER_CONSTANT)
     shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     closed = cv2.morphologyEx(framed, cv2.MORPH_CLOSE, shape)
-    mask = np.ascontiguousarray(closed[rim:-rim, rim:-rim])
+    mask = closed[rim:-rim, rim:-rim].astype(np.uint8)
     number, label, stats, _ = cv2.connectedComponentsWithStats(mask)
     if number < 2:
         return mask
     largest = (label == 1 + stats[1:, cv2.CC_STAT_AREA].argmax()).astype(np.uint8)
     outlines, _ = cv2.findContours(largest, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(largest, outlines, -1, 1, cv2.FILLED)
+    return cv2.drawContours(largest, outlines, -1, 1, cv2.FILLED).astype(np.uint8)
 
 
 def _ellipse(box: Sequence[float], shape: tuple[int, int], times: float) -> NDArray[np.uint8]:

@@ -40,4 +40,4 @@ def _surface(image: NDArray[np.uint8], there: NDArray[np.bool_]) -> NDArray[np.f
     if (~there).mean() < MIN_LEFT:
         return np.broadcast_to(np.median(image.reshape(-1, 3), 0), image.shape).astype(np.float64)
     weights, _, _, _ = np.linalg.lstsq(terms[~there], image[~there].astype(np.float64), rcond=None)
-    return np.clip(terms @ weights, image[~there].min(0), image[~there].max(0))
+    return np.clip(terms @ weights, image[~there].min(0), image[~there].max(0)).astype(np.float64)
