@@ -1,5 +1,7 @@
 """``probscene begin``: a model file made of a few labelled photographs, with the pictures that it draws beside it.
 
+The folder that it writes:
+
     model.py             the model, to read and edit
     cutouts/CLASS/*.png  objects, RGBA; those that are deleted are no longer drawn
     cutouts.png          all of them at a glance
@@ -37,7 +39,7 @@ from ..labels.naming import composed, matched
 from ..labels.reading import read_annotations
 from ..progress import Display, Progress
 from ..trial.sets import digest_of_pixels
-from .cutouts import Cutout, Object, covered, cut_out, overlaps, turned
+from .cutouts import Cutout, Object, covered, cut_out, inside, overlaps, parents, turned
 from .grounds import ground_of, light_of
 from .model_file import ClassPart, ModelPart, model_text
 
@@ -104,6 +106,13 @@ class _Photographs(NamedTuple):
     notes: tuple[str, ...]
 
 
+class _Roles(NamedTuple):
+    """The classes that are drawn without a label; and those that lie on another, by name, see ``cutouts.inside``."""
+
+    ignored: set[str]
+    on: dict[str, str]
+
+
 def begin(
     photos: Path | str,
     labels: Path | str,
@@ -140,10 +149,11 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
     kinds = _kinds(found.objects)
     rng, notes = np.random.default_rng(options.seed), list(found.notes)
     light = float(np.median([light_of(*pair) for pair in zip(found.images, _there(found), strict=True)]))
+    relation = inside(found.objects)
     cut: dict[str, list[Cutout]] = {name: [] for name in kinds}
     grounds, covers = [], []
     for i, (image, objects, there) in enumerate(zip(found.images, found.objects, _there(found), strict=True)):
-        for one, cutout in zip(objects, cut_out(image, objects, light), strict=True):
+        for one, cutout in zip(objects, cut_out(image, objects, light, relation), strict=True):
             if cutout is not None:
                 cut[one.name].append(cutout)
         gain = light / max(light_of(image, there), 1.0)
@@ -165,7 +175,8 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
     if len(grounds) == 1:
         notes.append("One photograph is all there is: scenes have one ground. Label a few more.")
     best = np.argsort(covers, kind="stable")[:MAX_GROUNDS]
-    model = _model(found, chosen, kinds, ignored, options, out)
+    usable = {n: on for n, on in relation.items() if chosen[n] and chosen[on] and not {n, on} & ignored}
+    model = _model(found, chosen, kinds, _Roles(ignored, usable), options, out)
     _write(out, model, {kinds[n]: c for n, c in chosen.items() if c}, [grounds[i] for i in sorted(best)], found, kinds)
     number = Counter(one.name for each in found.objects for one in each)
     return BegunModel(
@@ -295,31 +306,42 @@ def _model(
     found: _Photographs,
     chosen: Mapping[str, list[Cutout]],
     kinds: Mapping[str, str],
-    ignored: Iterable[str],
+    roles: _Roles,
     options: BeginOptions,
     out: Path,
 ) -> ModelPart:
     """What the file says."""
     height, width = found.folder.canvas
-    parts = []
+    parts, lists = [], [parents(each, roles.on) for each in found.objects]
     for name, cutouts in chosen.items():
         if not cutouts:
             continue
-        number = [sum(one.name == name for one in each) for each in found.objects]
-        boxes = np.array([one.box for each in found.objects for one in each if one.name == name])
-        middles = (boxes[:, :2] + boxes[:, 2:]) / 2
-        low = np.maximum(middles.min(0) - (MARGIN * width, MARGIN * height), 0)
-        high = np.minimum(middles.max(0) + (MARGIN * width, MARGIN * height), (width, height))
+        number, middles, objects = [], [], 0
+        for each, under in zip(found.objects, lists, strict=True):
+            mine = [(one, each[on] if on is not None else None) for one, on in zip(each, under, strict=True)]
+            mine = [(one, on) for one, on in mine if one.name == name]
+            objects += len(mine)
+            if name in roles.on:
+                number += [sum(on is of for _, on in mine) for of in each if of.name == roles.on[name]]
+                middles += [np.subtract(one.middle, on.middle) for one, on in mine if on is not None]
+            else:
+                number.append(len(mine))
+                middles += [np.array(one.middle) for one, _ in mine]
+        low, high = np.min(middles, 0), np.max(middles, 0)
+        if name not in roles.on:
+            low = np.maximum(low - (MARGIN * width, MARGIN * height), 0)
+            high = np.minimum(high + (MARGIN * width, MARGIN * height), (width, height))
         turn = turned([one.direction for one in cutouts]) if options.turn is None else options.turn
         parts.append(
             ClassPart(
-                kinds[name], name in ignored, max(number), (min(number), max(number)), len(boxes), len(cutouts),
-                (float(low[0]), float(high[0])), (float(low[1]), float(high[1])), turn,
+                kinds[name], name in roles.ignored, max(number), (min(number), max(number)), objects, len(cutouts),
+                (float(low[0]), float(high[0]) + 0.1), (float(low[1]), float(high[1]) + 0.1), turn,
+                kinds[roles.on[name]] if name in roles.on else "",
             )
         )  # fmt: skip
-    objects = [[one for one in each if one.name not in ignored] for each in found.objects]
-    most = max((float(overlaps(each).max(initial=0.0)) for each in objects if each), default=0.0)
-    radius = float(np.median([one.size for each in objects for one in each] or [1.0])) / 2
+    labelled = [[one for one in each if one.name not in roles.ignored] for each in found.objects]
+    most = max((float(overlaps(each).max(initial=0.0)) for each in labelled if each), default=0.0)
+    radius = float(np.median([one.size for each in labelled for one in each] or [1.0])) / 2
     lights = [light_of(*pair) for pair in zip(found.images, _there(found), strict=True)]
     off = np.abs(np.log(np.maximum(lights, 1.0) / np.median(np.maximum(lights, 1.0))))
     grey = all((image == image[..., :1]).all() for image in found.images)

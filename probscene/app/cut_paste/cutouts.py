@@ -8,7 +8,7 @@ References:
     [1] Rother, Kolmogorov, Blake, *GrabCut*, SIGGRAPH 2004.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -25,6 +25,8 @@ SMOOTH = 0.7  # pixels of the blur of a mask's edge
 RING = 4  # pixels around an object, whose light is the ground's
 MIN_SIDE = 3.0  # pixels of a box
 MAX_GAIN = 2.0  # and one over that
+LARGER = 1.5  # times the side of a box, that what it lies on has
+CONTAINED, MOSTLY, MIN_INSIDE = 0.9, 0.8, 5  # of a box, in what it lies on; the share of boxes; objects at least
 AXIS_RATIO = 1.25  # of a mask's axes, from which on it has a direction
 ALIGNED = 0.6  # mean resultant length of directions, from which on they are one
 
@@ -41,6 +43,12 @@ class Object(NamedTuple):
     name: str
     box: tuple[float, float, float, float]
     mask: NDArray[np.bool_] | None = None
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """x and y, pixels."""
+        x0, y0, x1, y1 = self.box
+        return (x0 + x1) / 2, (y0 + y1) / 2
 
     @property
     def size(self) -> float:
@@ -65,14 +73,22 @@ class Cutout(NamedTuple):
     contrast: float
 
 
-def cut_out(image: NDArray[np.uint8], objects: Sequence[Object], light: float) -> list[Cutout | None]:
+def cut_out(
+    image: NDArray[np.uint8], objects: Sequence[Object], light: float, inside: Mapping[str, str]
+) -> list[Cutout | None]:
     """Each of an image's objects, None where it is too small.
 
     Args:
         image: ``(H, W, 3)``.
         light: the ground's, to which that around the object is brought.
+        inside: see ``inside``; what an object lies on does not cover it.
     """
-    return [_cut_out(image, objects, i, light) for i in range(len(objects))]
+    covers = overlaps(objects)
+    for i, one in enumerate(objects):
+        for j, other in enumerate(objects):
+            if inside.get(one.name) == other.name:
+                covers[i, j] = 0
+    return [_cut_out(image, objects, i, light, float(covers[i].max(initial=0.0))) for i in range(len(objects))]
 
 
 def covered(objects: Sequence[Object], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -93,6 +109,38 @@ def overlaps(objects: Sequence[Object]) -> NDArray[np.float64]:
     return shares
 
 
+def inside(photographs: Sequence[Sequence[Object]]) -> dict[str, str]:
+    """By the names of classes, the class on whose objects theirs lie: nearly all of them with nearly all of their
+    boxes, and on much larger ones. What something lies on lies on nothing itself."""
+    names = sorted({one.name for objects in photographs for one in objects})
+    size = {n: np.median([one.size for objects in photographs for one in objects if one.name == n]) for n in names}
+    found: dict[str, str] = {}
+    for name in sorted(names, key=lambda name: size[name]):
+        for other in sorted(names, key=lambda name: size[name]):
+            if size[other] < LARGER * size[name] or name in found.values() or other in found:
+                continue
+            each = [
+                max((float(shares[j]) for j, under in enumerate(objects) if under.name == other), default=0.0)
+                for objects in photographs
+                for one, shares in zip(objects, overlaps(objects), strict=True)
+                if one.name == name
+            ]
+            if len(each) >= MIN_INSIDE and np.mean(np.array(each) >= CONTAINED) >= MOSTLY:
+                found[name] = other
+                break
+    return found
+
+
+def parents(objects: Sequence[Object], relation: Mapping[str, str]) -> list[int | None]:
+    """Of each object the one that it lies on, see ``inside``; None where it lies on none."""
+    found: list[int | None] = []
+    for one, shares in zip(objects, overlaps(objects), strict=True):
+        of_class = [j for j, other in enumerate(objects) if other.name == relation.get(one.name)]
+        best = max(of_class, key=lambda j: float(shares[j]), default=None)
+        found.append(best if best is not None and shares[best] > 0 else None)
+    return found
+
+
 def turned(directions: Sequence[float | None]) -> bool:
     """Whether objects of a class lie in any direction: most have none, as they are round, or theirs differ."""
     known = np.array([each for each in directions if each is not None])
@@ -101,7 +149,7 @@ def turned(directions: Sequence[float | None]) -> bool:
     return len(known) > 2 and bool(abs(np.exp(2j * known).mean()) < ALIGNED)
 
 
-def _cut_out(image: NDArray[np.uint8], objects: Sequence[Object], i: int, light: float) -> Cutout | None:
+def _cut_out(image: NDArray[np.uint8], objects: Sequence[Object], i: int, light: float, cover: float) -> Cutout | None:
     one, (height, width) = objects[i], image.shape[:2]
     x0, y0, x1, y1 = one.box
     if min(x1 - x0, y1 - y0) < MIN_SIDE:
@@ -113,7 +161,7 @@ def _cut_out(image: NDArray[np.uint8], objects: Sequence[Object], i: int, light:
     alpha = _separated(patch, box) if one.mask is None else one.mask[top:bottom, left:right].astype(np.float32)
     alpha = cv2.GaussianBlur(alpha, (0, 0), SMOOTH)
     whole = min(x0, y0) >= 1 and x1 <= width - 1 and y1 <= height - 1
-    whole = whole and overlaps(objects)[i].max(initial=0.0) <= MAX_COVERED
+    whole = whole and cover <= MAX_COVERED
     ground = (alpha < 0.02) & ~covered([*objects[:i], *objects[i + 1 :]], (height, width))[top:bottom, left:right]
     gain, contrast = 1.0, np.inf
     if ground.sum() >= RING:

@@ -20,8 +20,9 @@ class ClassPart(NamedTuple):
         most: objects in an image.
         seen: the least and most objects in an image.
         objects, cutouts: how many are labelled, and drawn.
-        x, y: ranges of their middles, pixels.
+        x, y: ranges of their middles, pixels; from the middle of what they lie on.
         turn: whether they lie in any direction.
+        on: the kind of what they lie on; empty for none.
     """
 
     kind: str
@@ -33,6 +34,7 @@ class ClassPart(NamedTuple):
     x: tuple[float, float]
     y: tuple[float, float]
     turn: bool
+    on: str = ""
 
     @property
     def list(self) -> str:
@@ -78,8 +80,9 @@ def model_text(model: ModelPart) -> str:
         "PHOTOGRAPHS": "one photograph" if model.photographs == 1 else f"{model.photographs} photographs",
         "HEIGHT": f"{model.canvas[0]}",
         "WIDTH": f"{model.canvas[1]}",
-        "LISTS": " ".join(f"{part.list}" for part in labelled),
-        "RULES": "\n    ".join(f"{part.list} -> {part.kind} {part.list} | ε" for part in labelled),
+        "LISTS": " ".join(part.list for part in labelled if not part.on),
+        "RULES": "\n    ".join(_rules(part, labelled) for part in labelled),
+        "ON": ", ".join(f'"{part.kind}": "{part.on}"' for part in labelled if part.on),
         "COUNTS": "\n    ".join(
             f'"{part.list}": ps.counts(*[1] * {part.longest + 1}),  # {part.seen[0]} to {part.seen[1]} in a photograph'
             for part in labelled
@@ -96,7 +99,7 @@ def model_text(model: ModelPart) -> str:
         "SIZES": f"{SIZES}",
         "TURNED": _tuple([part.kind for part in model.classes if part.turn]),
         "CLASSES": _tuple([part.kind for part in labelled]),
-        "STEPS": f"{math.ceil(1.25 * sum(part.longest for part in labelled)) + 2 * len(labelled) + 2}",
+        "STEPS": f"{_steps(labelled)}",
         "CHANNELS": f"channels={model.channels}",
         "MODEL": model.name,
         "DARK": f"{1 / exposure:.2f}",
@@ -105,9 +108,23 @@ def model_text(model: ModelPart) -> str:
         "IGNORED": "\n    ".join(f'"{part.kind}": {part.longest},' for part in model.classes if part.ignored),
     }
     parts = ["ALWAYS", *(["APART"] if not model.overlapping else []), *(["DIRT"] if values["IGNORED"] else [])]
+    parts += ["ON"] if values["ON"] else []
     lines = [line for line in TEMPLATE.splitlines() if not (found := re.match(r"(\w+)\|", line)) or found[1] in parts]
     text = "\n".join(re.sub(r"^\w+\|", "", line) for line in lines) + "\n"
     return re.sub(r"«(\w+)»", lambda name: values[name[1]], text)
+
+
+def _rules(part: ClassPart, parts: list[ClassPart]) -> str:
+    below = " ".join(other.list for other in parts if other.on == part.kind)
+    return f"{part.list} -> {part.kind}{f'({below})' if below else ''} {part.list} | ε"
+
+
+def _steps(parts: list[ClassPart]) -> int:
+    """Rules of the longest derivation, and a quarter more."""
+    longest = {part.kind: part.longest for part in parts}
+    objects = sum(part.longest * longest.get(part.on, 1) for part in parts)
+    lists = sum(longest.get(part.on, 1) for part in parts)
+    return math.ceil(1.25 * (objects + lists)) + 2
 
 
 def _tuple(names: list[str]) -> str:
@@ -118,7 +135,8 @@ def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-# Lines that begin with APART or DIRT stand where objects never overlap, and where there is what is no object.
+# Lines that begin with APART stand where objects never overlap, with ON where some lie on others, with DIRT where there
+# is what is no object.
 TEMPLATE = '''\
 """Scenes of «NAMES», cut out of «PHOTOGRAPHS» by ``probscene begin``.
 
@@ -155,6 +173,7 @@ SIZES = «SIZES»  # factors of a cut-out's own size
 TURNED = «TURNED»  # lie in any direction: are round, or differ in direction
 CLASSES = «CLASSES»
 APART|RADIUS = «RADIUS»  # pixels that objects keep around their middles: in the photographs none covers another
+ON|ON = {«ON»}  # what lies on what; PLACES are from its middle then
 DIRT|DIRT = {  # what is no object, and how much of it there may be
 DIRT|    «IGNORED»
 DIRT|}
@@ -201,6 +220,9 @@ DIRT|            layers.append(pasted((), name, *sites(name), present=there))
     for name in CLASSES:
         with scene.nodes(name):
             places[name], looks[name] = sites(name)
+ON|        if name in ON:
+ON|            (x, y), (under_x, under_y) = places[name], places[ON[name]]
+ON|            places[name] = scene.of_parent(under_x) + x, scene.of_parent(under_y) + y
 APART|    masks = {name: scene.mask(name) for name in CLASSES}
 APART|    x, y = (sum(places[name][axis] * masks[name] for name in CLASSES) for axis in (0, 1))
 APART|    x, y = ps.separate(x, y, RADIUS, scene.mask(*CLASSES), (HEIGHT, WIDTH))

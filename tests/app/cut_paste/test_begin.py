@@ -206,6 +206,36 @@ def test_what_is_no_object_is_drawn_without_a_label(tmp_path):
     assert empty.any() and float(batch.image[empty].float().amax((1, 2, 3)).max()) > 190
 
 
+def test_what_lies_on_something_is_drawn_on_it(tmp_path):
+    """Small discs lie on large ones, which are drawn from those that have none."""
+    file = photographs(tmp_path, number=8, each=2, names=("Big Disc",))
+    whole, rng = json.loads(file.read_text()), np.random.default_rng(5)
+    for one in [one for one in whole["annotations"] if one["id"] % 2]:
+        x, y, side, _ = one["bbox"]
+        path = tmp_path / "photos" / f"{one['image_id'] - 1}.png"
+        image = np.asarray(Image.open(path)).astype(float)
+        at = x + side / 2 + rng.uniform(-4, 4), y + side / 2 + rng.uniform(-4, 4)
+        rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        image[np.hypot(columns - at[0], rows - at[1]) < 6] = (60, 40, 90)
+        Image.fromarray(image.astype(np.uint8)).save(path)
+        box = [at[0] - 6, at[1] - 6, 12, 12]
+        whole["annotations"].append({**one, "id": one["id"] + 100, "category_id": 1, "bbox": box})
+    file.write_text(json.dumps(whole))
+    found = made(tmp_path)
+    assert "big_Disc(List_disc)" in found.path.read_text() and found.cutouts == {"Big Disc": 8, "disc": 8}
+    model = load_model(str(found.path))
+    assert not check_model(model).faults
+    seed_everything(0)
+    scenes = sample(model, model.prior, 64)
+    small = scenes.derivation.kind == model.grammar.kind("disc")
+    batch = renderer_for(model, 1)(scenes.drawing)
+    middle = (batch.amodal_box[..., :2] + batch.amodal_box[..., 2:]) / 2
+    parent = scenes.derivation.parent.clamp(min=0).unsqueeze(-1).expand(-1, -1, 2)
+    away = (middle - middle.gather(1, parent)).abs().amax(-1)
+    assert small.any() and float(away[small & (batch.visible > 0)].max()) < 8
+    assert (scenes.derivation.kind.gather(1, parent[..., 0])[small] == model.grammar.kind("big_Disc")).all()
+
+
 def bars(folder: Path, angle) -> None:
     photographs(folder, number=6, each=0)
     rng, annotations = np.random.default_rng(3), []
