@@ -39,7 +39,7 @@ from ..labels.naming import composed, matched
 from ..labels.reading import read_annotations
 from ..progress import Display, Progress
 from ..trial.sets import digest_of_pixels
-from .cutouts import Cutout, Object, covered, cut_out, inside, overlaps, parents, turned
+from .cutouts import Cutout, Object, are_whole, covered, cut_out, inside, overlaps, parents, turned
 from .grounds import ground_of, light_of
 from .model_file import ClassPart, ModelPart, model_text
 
@@ -101,7 +101,7 @@ class _Photographs(NamedTuple):
 
     images: list[NDArray[np.uint8]]  # (H, W, 3)
     objects: list[list[Object]]
-    crowds: list[list[Object]]
+    there: list[NDArray[np.bool_]]  # (H, W), where objects or crowds are
     folder: ImageFolder
     notes: tuple[str, ...]
 
@@ -148,12 +148,21 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
     found = _photographs(photos, labels, options)
     kinds = _kinds(found.objects)
     rng, notes = np.random.default_rng(options.seed), list(found.notes)
-    light = float(np.median([light_of(*pair) for pair in zip(found.images, _there(found), strict=True)]))
+    light = float(np.median([light_of(*pair) for pair in zip(found.images, found.there, strict=True)]))
     relation = inside(found.objects)
+    whole = [are_whole(objects, relation, found.folder.canvas) for objects in found.objects]
+    pairs = [pair for each in zip(found.objects, whole, strict=True) for pair in zip(*each, strict=True)]
+    always = set(kinds) - {one.name for one, is_whole in pairs if is_whole}
+    notes += [
+        f"{n}: every object is cut by the border or covered by another, and is drawn as it is." for n in sorted(always)
+    ]
     cut: dict[str, list[Cutout]] = {name: [] for name in kinds}
     grounds, covers = [], []
-    for i, (image, objects, there) in enumerate(zip(found.images, found.objects, _there(found), strict=True)):
-        for one, cutout in zip(objects, cut_out(image, objects, light, relation), strict=True):
+    for i, (image, objects, there) in enumerate(zip(found.images, found.objects, found.there, strict=True)):
+        which = np.array(
+            [is_whole or one.name in always for one, is_whole in zip(objects, whole[i], strict=True)], bool
+        )
+        for one, cutout in zip(objects, cut_out(image, objects, which, light), strict=True):
             if cutout is not None:
                 cut[one.name].append(cutout)
         gain = light / max(light_of(image, there), 1.0)
@@ -203,11 +212,11 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
     sizes = ImageFolder(named, (64, 64), 3, value_range=options.value_range).sizes
     folder = ImageFolder(named, options.canvas or _canvas(sizes), 3, value_range=options.value_range)
     images = [folder.load(i).permute(1, 2, 0).contiguous().numpy() for i in range(len(folder))]
-    objects, crowds, dropped = [], [], Counter[str]()
+    objects, there, dropped = [], [], Counter[str]()
     for i, entry in enumerate(pairs.entries.values()):
         each = [one for one in labels.read(entry, folder.sizes[i]) if one.name != DONT_CARE]
         mine = [_object(one, folder, i, labels) for one in each]
-        crowds.append([o for one, o in zip(each, mine, strict=True) if one.crowd and o is not None])
+        crowds = [o for one, o in zip(each, mine, strict=True) if one.crowd and o is not None]
         kept = []
         for one, o in zip(each, mine, strict=True):
             if o is None:
@@ -217,11 +226,12 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
             elif not one.crowd:
                 kept.append(o)
         objects.append(kept)
+        there.append(covered([*kept, *crowds], folder.canvas))
     notes = [*pairs.notes, *folder.notes]
     notes += [f"Left out: {number} objects that {why}." for why, number in dropped.items()]
     if not any(objects):
         raise DataError(f"expected objects in {path}, got none in {len(named)} photographs; label some.")
-    return _Photographs(images, objects, crowds, folder, tuple(dict.fromkeys(notes)))
+    return _Photographs(images, objects, there, folder, tuple(dict.fromkeys(notes)))
 
 
 def _canvas(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
@@ -258,11 +268,6 @@ def _object(one: Annotation, folder: ImageFolder, i: int, labels: Annotated) -> 
     return Object(composed(one.name), (float(x[0]), float(y[0]), float(x[1]), float(y[1])), mask)
 
 
-def _there(found: _Photographs) -> list[NDArray[np.bool_]]:
-    pairs = zip(found.objects, found.crowds, strict=True)
-    return [covered([*objects, *crowds], found.folder.canvas) for objects, crowds in pairs]
-
-
 def _kinds(objects: Iterable[Iterable[Object]]) -> dict[str, str]:
     """By the names of classes what they are called in the grammar, large ones first."""
     size: dict[str, list[float]] = {}
@@ -281,25 +286,21 @@ def _kinds(objects: Iterable[Iterable[Object]]) -> dict[str, str]:
 
 def _chosen(name: str, some: list[Cutout], rng: np.random.Generator, notes: list[str]) -> list[Cutout]:
     """The cut-outs of a class that are drawn."""
-    whole = [one for one in some if one.whole]
-    if some and not whole:
-        notes.append(f"{name}: every object is cut by the border or covered by another, and is drawn as it is.")
-        whole = some
-    clear = [one for one in whole if one.contrast >= MIN_CONTRAST]
-    if clear and len(clear) < len(whole):
-        notes.append(f"{name}: {len(whole) - len(clear)} objects that look like their ground are not drawn.")
-        whole = clear
-    if len(whole) >= MIN_TO_CHOOSE:
-        area = np.log([max((one.rgba[..., 3] > 127).sum(), 1) for one in whole])
+    clear = [one for one in some if one.contrast >= MIN_CONTRAST]
+    if clear and len(clear) < len(some):
+        notes.append(f"{name}: {len(some) - len(clear)} objects that look like their ground are not drawn.")
+        some = clear
+    if len(some) >= MIN_TO_CHOOSE:
+        area = np.log([max((one.rgba[..., 3] > 127).sum(), 1) for one in some])
         off = np.abs(area - np.median(area))
         usual = off <= OUTLIER * max(1.4826 * float(np.median(off)), 0.1)
-        whole = [one for one, keep in zip(whole, usual, strict=True) if keep]
-    if whole and len(whole) < MIN_CUTOUTS:
-        objects = "object is" if len(whole) == 1 else "objects are"
-        notes.append(f"{name}: {len(whole)} {objects} all that scenes show of it. Label more, for other looks.")
-    if len(whole) > MAX_CUTOUTS:
-        whole = [whole[i] for i in sorted(rng.choice(len(whole), MAX_CUTOUTS, replace=False))]
-    return whole
+        some = [one for one, keep in zip(some, usual, strict=True) if keep]
+    if some and len(some) < MIN_CUTOUTS:
+        objects = "object is" if len(some) == 1 else "objects are"
+        notes.append(f"{name}: {len(some)} {objects} all that scenes show of it. Label more, for other looks.")
+    if len(some) > MAX_CUTOUTS:
+        some = [some[i] for i in sorted(rng.choice(len(some), MAX_CUTOUTS, replace=False))]
+    return some
 
 
 def _model(
@@ -342,7 +343,7 @@ def _model(
     labelled = [[one for one in each if one.name not in roles.ignored] for each in found.objects]
     most = max((float(overlaps(each).max(initial=0.0)) for each in labelled if each), default=0.0)
     radius = float(np.median([one.size for each in labelled for one in each] or [1.0])) / 2
-    lights = [light_of(*pair) for pair in zip(found.images, _there(found), strict=True)]
+    lights = [light_of(*pair) for pair in zip(found.images, found.there, strict=True)]
     off = np.abs(np.log(np.maximum(lights, 1.0) / np.median(np.maximum(lights, 1.0))))
     grey = all((image == image[..., :1]).all() for image in found.images)
     return ModelPart(

@@ -23,6 +23,7 @@ MAX_COVERED = 0.1  # of a box, by another one
 GAP = 0.12  # of an object's width, that is closed in its outline
 SMOOTH = 0.7  # pixels of the blur of a mask's edge
 RING = 4  # pixels around an object, whose light is the ground's
+AROUND = 1.15  # times a box's sides, of the ellipse that an object may fill
 MIN_SIDE = 3.0  # pixels of a box
 MAX_GAIN = 2.0  # and one over that
 LARGER = 1.5  # times the side of a box, that what it lies on has
@@ -62,42 +63,56 @@ class Cutout(NamedTuple):
 
     Attributes:
         rgba: ``(h, w, 4)`` uint8, straight alpha; colour goes on beyond the object.
-        whole: whether it lies inside its photograph, and no other object's box covers it.
         direction: of its longer axis, radians; None where no axis is longer.
         contrast: how far its pixels are from the ground's light on average, in units of how far those around it are.
     """
 
     rgba: NDArray[np.uint8]
-    whole: bool
     direction: float | None
     contrast: float
 
 
-def cut_out(
-    image: NDArray[np.uint8], objects: Sequence[Object], light: float, inside: Mapping[str, str]
-) -> list[Cutout | None]:
-    """Each of an image's objects, None where it is too small.
+def are_whole(objects: Sequence[Object], inside: Mapping[str, str], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """``(n,)`` which objects lie inside their photograph and are not covered by another one.
 
     Args:
-        image: ``(H, W, 3)``.
-        light: the ground's, to which that around the object is brought.
         inside: see ``inside``; what an object lies on does not cover it.
+        shape: height and width of the photograph.
     """
     covers = overlaps(objects)
     for i, one in enumerate(objects):
         for j, other in enumerate(objects):
             if inside.get(one.name) == other.name:
                 covers[i, j] = 0
-    return [_cut_out(image, objects, i, light, float(covers[i].max(initial=0.0))) for i in range(len(objects))]
+    boxes = np.array([one.box for one in objects]).reshape(-1, 4)
+    framed = (boxes[:, :2] >= 1).all(1) & (boxes[:, 2:] <= np.array(shape[::-1]) - 1).all(1)
+    return framed & (covers.max(1, initial=0.0) <= MAX_COVERED)
+
+
+def cut_out(
+    image: NDArray[np.uint8], objects: Sequence[Object], which: NDArray[np.bool_], light: float
+) -> list[Cutout | None]:
+    """Some of an image's objects, None for the others and for those that are too small.
+
+    Args:
+        image: ``(H, W, 3)``.
+        which: ``(n,)`` those to cut out.
+        light: the ground's, to which that around the object is brought.
+    """
+    each = [_around(one, image.shape[:2]) for one in objects]
+    total = np.sum(each, 0, dtype=np.int16)
+    return [
+        _cut_out(image, one, total > own, light) if wanted else None
+        for one, own, wanted in zip(objects, each, which, strict=True)
+    ]
 
 
 def covered(objects: Sequence[Object], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """``(H, W)`` where objects may be: their masks, or the ellipses around their boxes' middles that hold the boxes'
-    corners almost, a little wider."""
-    there = np.zeros(shape, np.uint8)
+    """``(H, W)`` where objects may be: a little around their masks, or around ellipses in their boxes."""
+    there = np.zeros(shape, bool)
     for one in objects:
-        there |= one.mask.astype(np.uint8) if one.mask is not None else _ellipse(one.box, shape, 1.15)
-    return cv2.dilate(there, np.ones((5, 5), np.uint8)) > 0
+        there |= _around(one, shape) > 0
+    return there
 
 
 def overlaps(objects: Sequence[Object]) -> NDArray[np.float64]:
@@ -149,8 +164,9 @@ def turned(directions: Sequence[float | None]) -> bool:
     return len(known) > 2 and bool(abs(np.exp(2j * known).mean()) < ALIGNED)
 
 
-def _cut_out(image: NDArray[np.uint8], objects: Sequence[Object], i: int, light: float, cover: float) -> Cutout | None:
-    one, (height, width) = objects[i], image.shape[:2]
+def _cut_out(image: NDArray[np.uint8], one: Object, others: NDArray[np.bool_], light: float) -> Cutout | None:
+    """An object; ``others (H, W)`` is where others may be."""
+    height, width = image.shape[:2]
     x0, y0, x1, y1 = one.box
     if min(x1 - x0, y1 - y0) < MIN_SIDE:
         return None
@@ -160,9 +176,7 @@ def _cut_out(image: NDArray[np.uint8], objects: Sequence[Object], i: int, light:
     box = (x0 - left, y0 - top, x1 - left, y1 - top)
     alpha = _separated(patch, box) if one.mask is None else one.mask[top:bottom, left:right].astype(np.float32)
     alpha = cv2.GaussianBlur(alpha, (0, 0), SMOOTH)
-    whole = min(x0, y0) >= 1 and x1 <= width - 1 and y1 <= height - 1
-    whole = whole and cover <= MAX_COVERED
-    ground = (alpha < 0.02) & ~covered([*objects[:i], *objects[i + 1 :]], (height, width))[top:bottom, left:right]
+    ground = (alpha < 0.02) & ~others[top:bottom, left:right]
     gain, contrast = 1.0, np.inf
     if ground.sum() >= RING:
         middle = float(np.median(patch[ground]))
@@ -171,7 +185,7 @@ def _cut_out(image: NDArray[np.uint8], objects: Sequence[Object], i: int, light:
         contrast = float(off[alpha > 0.5].mean() / max(off[ground].mean(), 1.0)) if (alpha > 0.5).any() else 0.0
     colour = np.clip(patch * gain, 0, 255)
     rgba = np.rint(np.dstack([colour, 255 * alpha])).astype(np.uint8)
-    return Cutout(rgba, bool(whole), _direction(alpha > 0.5), contrast)
+    return Cutout(rgba, _direction(alpha > 0.5), contrast)
 
 
 def _separated(patch: NDArray[np.uint8], box: tuple[float, float, float, float]) -> NDArray[np.float32]:
@@ -210,6 +224,12 @@ def _largest(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     largest = (label == 1 + stats[1:, cv2.CC_STAT_AREA].argmax()).astype(np.uint8)
     outlines, _ = cv2.findContours(largest, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return cv2.drawContours(largest, outlines, -1, 1, cv2.FILLED).astype(np.uint8)
+
+
+def _around(one: Object, shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """``(H, W)`` 1 on an object and close to it."""
+    there = one.mask.astype(np.uint8) if one.mask is not None else _ellipse(one.box, shape, AROUND)
+    return cv2.dilate(there, np.ones((5, 5), np.uint8)).astype(np.uint8)
 
 
 def _ellipse(box: Sequence[float], shape: tuple[int, int], times: float) -> NDArray[np.uint8]:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 RADIUS = 4  # pixels from which a pixel is filled in
 MAX_INPAINTED = 0.35  # of a photograph; where objects cover more, a smooth surface is fitted to what they leave
+REFITS = 5
 MIN_LEFT = 0.02  # of a photograph, to fit one to
 BLUR = 1.5  # pixels: what varies faster is noise
 MAD = 1.4826  # standard deviations of a normal distribution for its median absolute deviation
@@ -33,11 +34,19 @@ def ground_of(image: NDArray[np.uint8], there: NDArray[np.bool_], rng: np.random
 
 
 def _surface(image: NDArray[np.uint8], there: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """A quadratic surface, by least squares of what is left; the median colour where that is nearly nothing."""
+    """A quadratic surface, by least squares of what is left and is like most of it: again and again without what lies
+    far from the last one. The median colour where nearly nothing is left."""
     height, width = there.shape
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
     if (~there).mean() < MIN_LEFT:
         return np.broadcast_to(np.median(image.reshape(-1, 3), 0), image.shape).astype(np.float64)
-    weights, _, _, _ = np.linalg.lstsq(terms[~there], image[~there].astype(np.float64), rcond=None)
-    return np.clip(terms @ weights, image[~there].min(0), image[~there].max(0)).astype(np.float64)
+    basis, pixels = terms[~there], image[~there].astype(np.float64)
+    off = np.abs(pixels - np.median(pixels, 0)).sum(1)
+    fitted = terms[..., :1] * 0.0
+    for _ in range(REFITS):
+        near = off <= max(2 * float(np.median(off)), 1.0)
+        weights, _, _, _ = np.linalg.lstsq(basis[near], pixels[near], rcond=None)
+        off = np.abs(pixels - basis @ weights).sum(1)
+        fitted = terms @ weights
+    return np.clip(fitted, pixels.min(0), pixels.max(0)).astype(np.float64)
