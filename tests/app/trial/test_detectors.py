@@ -12,7 +12,7 @@ from torchvision.models import resnet50
 import probscene as ps
 from probscene.app.trial.detector import RECIPES, build
 from probscene.app.trial.sets import read_set
-from probscene.app.trial.training import Pictures, Stage, augmented, detect, fitted, order, train
+from probscene.app.trial.training import Pictures, Stage, augmented, detect, draw_augmentation, fitted, order, train
 from probscene.app.trial.trial import TrainingBudget, TrialOptions, trial
 from probscene.decoding import read_rgb
 from probscene.errors import DataError
@@ -62,7 +62,7 @@ def test_boxes_go_with_the_image(drawn):
     pictures, random, right = Pictures((96, 128)), np.random.default_rng(0), []
     for example in read_set(drawn / "train").examples:
         for _ in range(5):
-            image, boxes, classes = augmented(example, pictures, random)
+            image, boxes, classes = augmented(example, pictures, draw_augmentation(random))
             assert image.shape == (96, 128, 3) and len(boxes) == len(classes) <= len(example.boxes)
             for (x0, y0, x1, y1), c in zip(boxes, classes, strict=True):
                 green = image[int((y0 + y1) / 2), int((x0 + x1) / 2), 1]
