@@ -22,9 +22,10 @@ if (_checkout / "pyproject.toml").is_file():  # a plain checkout: probscene.mode
 __version__ = "0.2.0"
 
 _APP_MODULES = {
-    "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
+    "api.calls": ("compare", "evaluate", "generate", "predict", "render", "report", "train", "trial"),
     "api.fit": ("fit",),
     "datasets.generate": ("DatasetOptions",),
+    "detectors.train": ("TrainOptions",),
     "evaluation.labels": ("TargetLabels",),
     "fitting.begin": ("ModelFile",),
     "targets": ("TargetImages",),
@@ -76,12 +77,13 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 _OLD_MODULE_OF = {"Photo": "probscene.photo"}  # names in the model files that older runs keep
 
 if TYPE_CHECKING:
-    from probscene.app.api.calls import compare, evaluate, generate, render, report, trial
+    from probscene.app.api.calls import compare, evaluate, generate, predict, render, report, train, trial
     from probscene.app.api.fit import fit
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
     from probscene.app.datasets.generate import DatasetOptions
     from probscene.app.datasets.scene_dataset import SceneDataset
+    from probscene.app.detectors.train import TrainOptions
     from probscene.app.evaluation.labels import TargetLabels
     from probscene.app.fitting.begin import ModelFile
     from probscene.app.fitting.config import FitConfig
@@ -137,9 +139,10 @@ __all__ = [
     "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "ModelFile", "Objects", "PCFG", "ParameterGuide",
     "Policy", "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError", "SamplingError",
     "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "ScoreFunctionConfig", "Sprites",
-    "StructurePrior", "TargetImages", "TargetLabels", "TrainingBudget", "TrialOptions", "World", "compare", "counts",
-    "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label", "load_model", "preset",
-    "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything", "trial", "weights",
+    "StructurePrior", "TargetImages", "TargetLabels", "TrainOptions", "TrainingBudget", "TrialOptions", "World",
+    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
+    "load_model", "predict", "preset", "pretrain", "ranked", "render", "report", "sample", "scene_model",
+    "seed_everything", "train", "trial", "weights",
 ]  # fmt: skip
 
 

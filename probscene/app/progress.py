@@ -44,6 +44,8 @@ STAGES = {
     "labels": ("Labelled images", "images"),
     "training": ("Detectors", "images"),
     "scoring": ("Scoring", "sets"),
+    "detector": ("Training", "images"),
+    "detecting": ("Detecting", "images"),
 }
 """By stage: what it does, and in what it counts."""
 EVERY = 30.0  # seconds without a line, at most, where there is no terminal

@@ -23,7 +23,8 @@ class Call:
 
 
 ORDER = (
-    "check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "trial", "demo", "version",
+    "check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "trial", "train",
+    "predict", "demo", "version",
 )  # fmt: skip
 
 
