@@ -51,6 +51,9 @@ def test_mask_rcnn_is_trained_from_the_weights_of_a_user(drawn, tmp_path):
     recipe = RECIPES["maskrcnn"]
     train(detector, [Stage((examples[:2],), 2)], recipe, (64, 64), (0,))
     found = detect(detector, examples[0].path, (64, 64), recipe.first_label)
+    again = build("maskrcnn", 2, (64, 64))  # without the file, for the trained weights
+    again.load_state_dict(detector.state_dict())
+    assert (detect(again, examples[0].path, (64, 64), recipe.first_label).boxes == found.boxes).all()
     assert set(found.classes.tolist()) <= {0, 1} and (frozen == detector.backbone.body.layer1[0].conv1.weight).all()
     safetensors.torch.save_file({"x": torch.zeros(1)}, file)
     with pytest.raises(DataError, match="maskrcnn_resnet50_fpn or resnet50"):
