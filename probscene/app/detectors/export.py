@@ -66,7 +66,11 @@ def export(detector: FCOS, size: tuple[int, int], out: Path) -> None:
             )  # fmt: skip
     finally:
         logging.disable(before)
-    write_whole(out, lambda temporary: program.save(temporary, external_data=False))
+    whole = program.model_proto
+    for part in (whole.graph, *whole.functions):
+        for node in part.node:
+            del node.metadata_props[:]  # lines of this file, with its place on this machine
+    write_whole(out, lambda temporary: temporary.write_bytes(whole.SerializeToString()))
 
 
 class _FixedShapes(nn.Module):
