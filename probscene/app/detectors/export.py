@@ -12,6 +12,7 @@ of them before the suppression.
 
 import logging
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +36,12 @@ def check_can_export(choice: str) -> None:
     """
     if choice.partition("=")[0] != "efficientnet":
         raise ProbsceneError(f"expected the detector efficientnet for --onnx, got {choice!r}; leave one of them out.")
-    try:
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
+    missing = [name for name in ("onnx", "onnxscript") if find_spec(name) is None]
+    if missing:
         raise MachineError(
-            f"expected the packages onnx and onnxscript for --onnx, got no {error.name}; install them with "
-            "pip install 'probscene[onnx]'."
-        ) from error
+            f"expected the packages onnx and onnxscript for --onnx, got no {' and no '.join(missing)}; install them "
+            "with pip install 'probscene[onnx]'."
+        )
 
 
 def export(detector: FCOS, size: tuple[int, int], out: Path) -> None:

@@ -111,7 +111,8 @@ def predict(
     names = _names(files, format)
     if out.resolve() in {file.resolve() for file in files}:
         raise ProbsceneError(f"expected a file of its own to write, got the photograph {out}; name another.")
-    if overlays is not None and Path(overlays).resolve() in {file.resolve().parent for file in files}:
+    pictures = [None if overlays is None else _picture(overlays, name) for name in names]
+    if {path.resolve().parent for path in pictures if path} & {file.resolve().parent for file in files}:
         raise ProbsceneError(f"expected another folder for overlays than that of the photographs, got {overlays}.")
     _ = trained.network  # before anything is written
     make_folder(out.parent)
@@ -121,10 +122,10 @@ def predict(
     least, reason = _least(trained, min_score)
     known = {each["digest"] for key in ("photographs", "held_out") for each in trained.record.get(key, ())}
     if overlays is not None:
-        make_folder(Path(overlays))
+        make_folder(overlays)
     seen, bad = list[_Seen](), list[str]()
     with quiet(), threads(1):
-        for number, (file, name) in enumerate(zip(files, names, strict=True), 1):
+        for number, (file, name, picture) in enumerate(zip(files, names, pictures, strict=True), 1):
             try:
                 pixels, size = stored(read(file))
             except Fault as fault:
@@ -135,8 +136,7 @@ def predict(
             unsure = 0.0 if digest_of_pixels(pixels) in known else uncertainty(found.scores)
             kept = _from(found, least)
             seen.append(_Seen(name, size, kept, unsure))
-            if overlays is not None:
-                picture = Path(overlays) / (name if name.lower().endswith(".png") else f"{name}.png")
+            if picture is not None:
                 make_folder(picture.parent)
                 write_picture(picture, overlay(image, kept, trained.classes))
             show("detecting", number, len(files))
@@ -148,7 +148,7 @@ def predict(
     else:
         write_json(out, _coco(seen, trained.classes))
     if overlays is not None:
-        write_text(Path(overlays) / NEXT, "".join(f"{name}\n" for name in chosen))
+        write_text(overlays / NEXT, "".join(f"{name}\n" for name in chosen))
     images, found = tuple(each.name for each in seen), tuple(each.found for each in seen)
     return Predictions(out, images, found, trained.classes, least, reason, chosen)
 
@@ -197,6 +197,10 @@ def _names(files: Sequence[Path], format: str) -> list[str]:
             f"{', '.join(twice[:2])}; rename one, or write COCO."
         )
     return names
+
+
+def _picture(overlays: Path, name: str) -> Path:
+    return overlays / (name if name.lower().endswith(".png") else f"{name}.png")
 
 
 def _least(trained: TrainedDetector, given: float | None) -> tuple[float, str]:

@@ -1,26 +1,32 @@
 """A detector as ONNX gives what torch gives."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
 
-from probscene.app.detectors.export import export
-from probscene.app.detectors.folder import ONNX
+from probscene.app.detectors.folder import ONNX, WEIGHTS
 from probscene.app.detectors.train import train
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import fitted
 from probscene.decoding import read_rgb
+from probscene.errors import MachineError, ProbsceneError
 
 from .conftest import small_options
 
-pytest.importorskip("onnx", reason="the package onnx is not installed: pip install 'probscene[onnx]'")
-pytest.importorskip("onnxscript", reason="the package onnxscript is not installed: pip install 'probscene[onnx]'")
-onnxruntime = pytest.importorskip("onnxruntime", reason="the package onnxruntime, which runs ONNX, is not installed")
 
+def test_onnx_gives_the_same_boxes_and_scores(trained, discs, photographs, tmp_path):
+    """It is written when it is asked for, also of a detector that is there already."""
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(name, reason=f"the package {name} is not installed: pip install 'probscene[test]'")
+    import onnxruntime
 
-def test_onnx_gives_the_same_boxes_and_scores(trained, photographs, tmp_path):
-    export(trained.network, trained.size, tmp_path / "detector.onnx")
-    session = onnxruntime.InferenceSession(tmp_path / "detector.onnx", providers=["CPUExecutionProvider"])
+    out = tmp_path / "out"
+    shutil.copytree(trained.path, out)
+    train(discs.file, photographs / "train", None, out, small_options(test=photographs / "test", onnx=True))
+    assert (out / WEIGHTS).read_bytes() == (trained.path / WEIGHTS).read_bytes()
+    session = onnxruntime.InferenceSession(out / ONNX, providers=["CPUExecutionProvider"])
     for example in read_set(photographs / "test").examples:
         small, _ = fitted(read_rgb(example.path), trained.size)
         image = small.transpose(2, 0, 1).astype(np.float32) / 255
@@ -34,10 +40,11 @@ def test_onnx_gives_the_same_boxes_and_scores(trained, photographs, tmp_path):
         np.testing.assert_array_equal(labels[:number], found["labels"].numpy())
 
 
-def test_it_is_written_when_asked_for_also_later(discs, tmp_path):
-    options = small_options()
-    train(discs.file, None, None, tmp_path / "out", options)
-    weights = (tmp_path / "out" / "detector.safetensors").stat().st_mtime_ns
-    train(discs.file, None, None, tmp_path / "out", small_options(onnx=True))
-    assert (tmp_path / "out" / ONNX).stat().st_size > 10**6
-    assert (tmp_path / "out" / "detector.safetensors").stat().st_mtime_ns == weights
+def test_what_it_needs_is_said_before_anything_is_trained(discs, tmp_path, monkeypatch):
+    monkeypatch.setattr("probscene.app.detectors.export.find_spec", lambda name: None if name == "onnx" else name)
+    with pytest.raises(MachineError, match=r"got no onnx; install them with pip install 'probscene\[onnx\]'"):
+        train(discs.file, None, None, tmp_path / "out", small_options(onnx=True))
+    monkeypatch.setattr("probscene.app.detectors.train.recipe_of", lambda *_: None)
+    with pytest.raises(ProbsceneError, match="efficientnet for --onnx, got 'maskrcnn=x'"):
+        train(discs.file, None, None, tmp_path / "out", small_options(onnx=True, detector="maskrcnn=x"))
+    assert not (tmp_path / "out").exists()

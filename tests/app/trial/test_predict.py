@@ -154,6 +154,8 @@ def test_photographs_of_several_folders_have_them_in_their_names(trained, photog
     np.testing.assert_array_equal(found.found[0].boxes, predicted.found[0].boxes)
     predict(trained, paths, tmp_path / "all", "yolo")
     assert (tmp_path / "all" / "labels" / "train" / "images" / "000.txt").is_file()
+    with pytest.raises(ProbsceneError, match="another folder for overlays"):
+        predict(trained, paths, tmp_path / "all.json", overlays=photographs)
 
 
 def test_bad_files_are_named_or_left_out(trained, images, tmp_path):
