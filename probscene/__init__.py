@@ -22,10 +22,11 @@ if (_checkout / "pyproject.toml").is_file():  # a plain checkout: probscene.mode
 __version__ = "0.2.0"
 
 _APP_MODULES = {
-    "api.calls": ("compare", "evaluate", "generate", "render", "report", "trial"),
+    "api.calls": ("compare", "evaluate", "generate", "predict", "render", "report", "train", "trial"),
     "api.fit": ("fit",),
     "cut_paste.begin": ("BeginOptions", "begin"),
     "datasets.generate": ("DatasetOptions",),
+    "detectors.train": ("TrainOptions",),
     "evaluation.labels": ("TargetLabels",),
     "fitting.begin": ("ModelFile",),
     "targets": ("TargetImages",),
@@ -78,13 +79,14 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 _OLD_MODULE_OF = {"Photo": "probscene.photo"}  # names in the model files that older runs keep
 
 if TYPE_CHECKING:
-    from probscene.app.api.calls import compare, evaluate, generate, render, report, trial
+    from probscene.app.api.calls import compare, evaluate, generate, predict, render, report, train, trial
     from probscene.app.api.fit import fit
     from probscene.app.api.label import label
     from probscene.app.api.run import Run
     from probscene.app.cut_paste.begin import BeginOptions, begin
     from probscene.app.datasets.generate import DatasetOptions
     from probscene.app.datasets.scene_dataset import SceneDataset
+    from probscene.app.detectors.train import TrainOptions
     from probscene.app.evaluation.labels import TargetLabels
     from probscene.app.fitting.begin import ModelFile
     from probscene.app.fitting.config import FitConfig
@@ -141,10 +143,10 @@ __all__ = [
     "KDELogRatio", "LSTMGuide", "Light", "MMD", "MachineError", "Mesh", "Meshes", "ModelError", "ModelFile", "Objects",
     "PCFG", "ParameterGuide", "Policy", "ProbsceneError", "RenderBatch", "Renderer", "Request", "Run", "RunError",
     "SamplingError", "SceneDataset", "SceneGraph", "SceneModel", "Scenes", "ScoreFunction", "ScoreFunctionConfig",
-    "Sprites", "StructurePrior", "TargetImages", "TargetLabels", "TrainingBudget", "TrialOptions", "World", "begin",
-    "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit", "generate", "label",
-    "load_model", "preset", "pretrain", "ranked", "render", "report", "sample", "scene_model", "seed_everything",
-    "separate", "trial", "weights",
+    "Sprites", "StructurePrior", "TargetImages", "TargetLabels", "TrainOptions", "TrainingBudget", "TrialOptions",
+    "World", "begin", "compare", "counts", "derive", "enumerate_derivations", "evaluate", "find_sites", "fit",
+    "generate", "label", "load_model", "predict", "preset", "pretrain", "ranked", "render", "report", "sample",
+    "scene_model", "seed_everything", "separate", "train", "trial", "weights",
 ]  # fmt: skip
 
 

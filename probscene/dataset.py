@@ -156,7 +156,7 @@ class ImageFolder(Images):
         self.canvas, self.channels = (canvas[0], canvas[1]), channels
         if isinstance(path, str | os.PathLike):
             self.path = Path(path)
-            files, others, below = _listed(self.path)
+            files, others, below = listed(self.path)
         else:
             files, others, below = [Path(file) for file in path], [], {}
             self.path = _place(files)
@@ -310,9 +310,13 @@ def is_image(file: Path) -> bool:
     return file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
 
 
-def _listed(folder: Path) -> tuple[list[Path], list[str], dict[str, int]]:
+def listed(folder: Path) -> tuple[list[Path], list[str], dict[str, int]]:
     """The image files of a folder, sorted by name; the names of its other files; and by name of its subfolders how many
-    images are in them."""
+    images are in them.
+
+    Raises:
+        DataError: no such folder, or one without images.
+    """
     if not folder.exists():
         raise DataError(f"expected a folder of PNG, JPEG or TIFF images, got {folder}, which is not there.")
     if not folder.is_dir():

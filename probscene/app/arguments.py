@@ -59,13 +59,20 @@ def range_given(text: str | None) -> tuple[float, float] | None:
     return low, high
 
 
-def size_given(text: str) -> tuple[int, int]:
-    """Height and width of ``WIDTHxHEIGHT``.
+def words_given(text: str) -> list[str]:
+    """Words that were typed with commas between them."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def size_given(text: str | None) -> tuple[int, int] | None:
+    """Height and width of a size that was typed, WIDTHxHEIGHT; None where nothing was.
 
     Raises:
         ProbsceneError: it is something else.
     """
+    if text is None:
+        return None
     width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+    if not (width.isdecimal() and height.isdecimal()):
         raise ProbsceneError(f"expected a size WIDTHxHEIGHT such as 256x192, got {text!r}.")
     return int(height), int(width)

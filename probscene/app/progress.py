@@ -45,6 +45,8 @@ STAGES = {
     "training": ("Detectors", "images"),
     "scoring": ("Scoring", "sets"),
     "cutting": ("Cutting out", "photographs"),
+    "detector": ("Training", "images"),
+    "detecting": ("Detecting", "images"),
 }
 """By stage: what it does, and in what it counts."""
 EVERY = 30.0  # seconds without a line, at most, where there is no terminal

@@ -31,6 +31,9 @@ from ..workers.cluster import connected
 from ..workers.processes import end_if_starting
 
 if TYPE_CHECKING:
+    from ..detectors.folder import TrainedDetector
+    from ..detectors.predict import Predictions
+    from ..detectors.train import TrainOptions
     from ..trial.results import Results
     from ..trial.trial import TrialOptions
 
@@ -221,6 +224,75 @@ def trial(
     with display(progress) as show:
         options = options or trying.TrialOptions()
         return trying.trial(Path(test), Path(out), sets or {}, options, workers=workers, show=show, callback=show.say)
+
+
+def train(
+    source: RunFolder | SceneModel | Path | str,
+    real: Path | str | None,
+    labels: Path | str | None,
+    out: Path | str,
+    options: "TrainOptions | None" = None,
+    *,
+    workers: int = 1,
+    progress: bool = True,
+) -> "TrainedDetector":
+    """Train a detector on what a run generates, then on labelled photographs where there are some, and keep it; the
+    same call goes on after an interruption.
+
+    Args:
+        source: a run or its folder, for what it has learnt; or a model, for its prior.
+        real: a folder of photographs, some of which ``labels`` are of; without ``labels``, a labelled set, as of
+            ``trial``; None for none.
+        labels: of photographs, with boxes: COCO's JSON, or a folder of KITTI or YOLO; without ``real``, a labelled set.
+        out: the folder to write.
+        options: what it is tested on, and how it is trained.
+        workers: processes that generate a run's images; the bytes do not depend on their number. More than one are
+            spawned: a script calls this under ``if __name__ == "__main__":``.
+
+    Raises:
+        ProbsceneError: see ``detectors.train``.
+    """
+    end_if_starting()
+    from ..detectors import train as training  # torchvision takes seconds to import
+
+    real, labels = (None if path is None else Path(path) for path in (real, labels))
+    with display(progress) as show:
+        options = options or training.TrainOptions()
+        return training.train(source, real, labels, Path(out), options, workers=workers, show=show, callback=show.say)
+
+
+def predict(
+    detector: "TrainedDetector | Path | str",
+    photos: Path | str | Sequence[Path | str],
+    out: Path | str,
+    format: str = "coco",
+    *,
+    min_score: float | None = None,
+    overlays: Path | str | None = None,
+    skip_bad: bool = False,
+    progress: bool = True,
+) -> "Predictions":
+    """Write what a detector finds in photographs, as labels that other calls read.
+
+    Args:
+        detector: what ``train`` gave, or its folder.
+        photos: a folder of PNG, JPEG or TIFF images, an image, or several of these.
+        out: the file to write, of COCO; or a new folder, of YOLO.
+        format: ``"coco"``, whose annotations have a ``score``, or ``"yolo"``.
+        min_score: least score of what is written, 0 to 1; where None, that at which the detector made fewest errors on
+            held-out photographs, or 0.3 where there were none.
+        overlays: a folder for each photograph with what was found drawn on it, and for ``label_next.txt``, the
+            photographs that are worth labelling next.
+        skip_bad: leave out files that do not decode.
+
+    Raises:
+        ProbsceneError: see ``detectors.predict``.
+    """
+    from ..detectors import predict as predicting  # torchvision takes seconds to import
+
+    where = None if overlays is None else Path(overlays)
+    with display(progress) as show:
+        return predicting.predict(detector, photos, Path(out), format, min_score, where, skip_bad, show=show)
 
 
 def display(progress: bool) -> Display:

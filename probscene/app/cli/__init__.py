@@ -10,10 +10,12 @@ import sys
 from types import FrameType
 
 from ..memory import tune_malloc
-from . import fit_commands, model_commands, run_commands, trial_command
+from . import detector_commands, fit_commands, model_commands, run_commands, trial_command
 from .application import app, explained
 
-__all__ = ["app", "explained", "fit_commands", "main", "model_commands", "run_commands", "trial_command"]
+__all__ = [
+    "app", "detector_commands", "explained", "fit_commands", "main", "model_commands", "run_commands", "trial_command",
+]  # fmt: skip
 
 
 def main() -> None:

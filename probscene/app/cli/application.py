@@ -23,8 +23,8 @@ class Call:
 
 
 ORDER = (
-    "begin", "check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "trial", "demo",
-    "version",
+    "begin", "check", "preview", "view", "label", "fit", "generate", "evaluate", "report", "compare", "trial", "train",
+    "predict", "demo", "version",
 )  # fmt: skip
 
 

@@ -34,15 +34,15 @@ def begin(
     value_range: ValueRange = None,
 ) -> None:
     """Make a first model of a few labelled photographs: their objects, cut out, on what is left of them."""
-    from ..arguments import range_given, size_given
+    from ..arguments import range_given, size_given, words_given
     from ..cut_paste.begin import BeginOptions
     from ..cut_paste.begin import begin as made
 
     options = BeginOptions(
         name=name,
-        canvas=None if canvas is None else size_given(canvas),
+        canvas=size_given(canvas),
         turn=turn,
-        ignore=tuple(word.strip() for word in ignore.split(",") if word.strip()),
+        ignore=tuple(words_given(ignore)),
         value_range=range_given(value_range),
         seed=seed,
     )

@@ -7,6 +7,7 @@ import typer
 
 from probscene.errors import ProbsceneError
 
+from ..arguments import range_given, size_given, words_given
 from .application import app
 from .options import BoxMargin, Seed, ValueRange
 
@@ -74,7 +75,6 @@ def trial(
     from rich.console import Console
 
     from ..api import calls
-    from ..arguments import range_given, size_given
     from ..trial.tables import show
     from ..trial.trial import GeneratedSets, TrainingBudget, TrialOptions
 
@@ -88,16 +88,16 @@ def trial(
         named[name.strip()] = said.strip()
     generated = None
     if run is not None:
-        generated = GeneratedSets(run, tuple(_words(sources)), generate, min_visible, box_margin)
+        generated = GeneratedSets(run, tuple(words_given(sources)), generate, min_visible, box_margin)
     options = TrialOptions(
         hold_out=hold_out,
         real=real,
         numbers=None if real_numbers is None else _numbers(real_numbers),
         generated=generated,
-        classes=None if classes is None else _words(classes),
+        classes=None if classes is None else words_given(classes),
         detector=detector,
         budget=TrainingBudget(iterations, batch, rate, finetune_fraction, warm_start),
-        size=None if size is None else size_given(size),
+        size=size_given(size),
         seeds=seeds,
         seed=seed,
         baselines=baseline or (),
@@ -109,12 +109,8 @@ def trial(
     print(f"All figures are in {out / 'results.json'}, the picture is {out / 'results.png'}")
 
 
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
 def _numbers(text: str) -> list[int | None]:
-    words = [] if text == "none" else _words(text)
+    words = [] if text == "none" else words_given(text)
     if not all(word == "all" or (word.isdecimal() and int(word) > 0) for word in words):
         raise ProbsceneError(f"expected numbers of photographs such as 10,20,50,all, or none, got {text!r}.")
     return [None if word == "all" else int(word) for word in words]

@@ -38,6 +38,7 @@ from ..labels.kitti import DONT_CARE
 from ..labels.naming import composed, matched
 from ..labels.reading import read_annotations
 from ..progress import Display, Progress
+from ..trial.cut_out import FILE
 from ..trial.sets import digest_of_pixels
 from .cutouts import Cutout, Object, are_whole, covered, cut_out, inside, overlaps, parents, turned
 from .grounds import ground_of, light_of
@@ -379,7 +380,7 @@ def _write(
         Image.fromarray(_sheet(cutouts)).save(aside / "cutouts.png")
         write_text(aside / "model.py", model_text(model))
         write_json(aside / "labels.json", _labels(found, kinds))
-        write_json(aside / "begun.json", {"format": 1, "photographs": [_known(file) for file in found.folder.paths]})
+        write_json(aside / FILE, {"format": 1, "photographs": [_known(file) for file in found.folder.paths]})
         aside.chmod(0o755)
         if out.is_dir():
             out.rmdir()

@@ -89,13 +89,14 @@ def build(choice: str, classes: int, size: tuple[int, int]) -> nn.Module:
     """A detector at its start; new layers draw from torch's random numbers.
 
     Args:
+        choice: see ``checked``; of ``maskrcnn`` without a file all weights are by chance, for those of a trained one.
         size: height and width at which images come.
 
     Raises:
         DataError: see ``checked``.
     """
     name, _, file = choice.partition("=")
-    return _mask_rcnn(Path(file), classes, size) if name == "maskrcnn" else _fcos(classes, size)
+    return _mask_rcnn(Path(file) if file else None, classes, size) if name == "maskrcnn" else _fcos(classes, size)
 
 
 def pretrained_part(detector: Any) -> nn.Module:
@@ -167,8 +168,8 @@ def _fcos(classes: int, size: tuple[int, int]) -> FCOS:
     return detector
 
 
-def _mask_rcnn(file: Path, classes: int, size: tuple[int, int]) -> nn.Module:
-    tensors = read_tensors(file)
+def _mask_rcnn(file: Path | None, classes: int, size: tuple[int, int]) -> nn.Module:
+    tensors = None if file is None else read_tensors(file)
     # With batch norms that stay as they were, and the first two stages frozen, as torchvision fine-tunes it.
     detector: Any = MaskRCNN(
         resnet_fpn_backbone(backbone_name="resnet50", weights=None, trainable_layers=3),
@@ -178,6 +179,15 @@ def _mask_rcnn(file: Path, classes: int, size: tuple[int, int]) -> nn.Module:
         box_score_thresh=MIN_SCORE,
         box_detections_per_img=MAX_DETECTIONS,
     )
+    if tensors is not None:
+        _load_mask_rcnn(detector, tensors, file)
+    heads = detector.roi_heads
+    heads.box_predictor = FastRCNNPredictor(heads.box_predictor.cls_score.in_features, classes + 1)
+    heads.mask_roi_pool = heads.mask_head = heads.mask_predictor = None  # torchvision: has_mask() is False then
+    return detector
+
+
+def _load_mask_rcnn(detector: Any, tensors: dict[str, Tensor], file: Path | None) -> None:
     whole = any(name.startswith("backbone.") for name in tensors)
     into = detector if whole else detector.backbone.body
     try:
@@ -189,7 +199,3 @@ def _mask_rcnn(file: Path, classes: int, size: tuple[int, int]) -> nn.Module:
             f"expected a state dict of torchvision's maskrcnn_resnet50_fpn or resnet50 in {file}, got another "
             f"network's ({' '.join(str(error).split())[:160]}...)."
         ) from error
-    heads = detector.roi_heads
-    heads.box_predictor = FastRCNNPredictor(heads.box_predictor.cls_score.in_features, classes + 1)
-    heads.mask_roi_pool = heads.mask_head = heads.mask_predictor = None  # torchvision: has_mask() is False then
-    return detector

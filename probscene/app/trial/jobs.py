@@ -6,7 +6,7 @@
 Rows are trained seed by seed, so that the first seed of all is there first.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -117,16 +117,10 @@ class Job(NamedTuple):
 
     def stages(self, name: str, seed: int, rate: float = 1.0) -> list[Stage]:
         """What a row's detector is shown for a seed."""
-        stages, budget = self.rows[name], self.recipe.num_images
-        last = round(self.finetune_fraction * budget) if len(stages) > 1 else budget
-        before = [(budget - last) // max(1, len(stages) - 1)] * (len(stages) - 1)
-        if before:
-            before[0] += budget - last - sum(before)
-        shown = []
-        for i, (stage, number) in enumerate(zip(stages, [*before, last], strict=True)):
-            parts = tuple(chosen(found, part, seed + 1000 * self.seed) for found, part in stage)
-            shown.append(Stage(parts, number, rate * (FINETUNE_RATE if i else 1.0)))
-        return shown
+        parts = [
+            tuple(chosen(found, part, seed + 1000 * self.seed) for found, part in stage) for stage in self.rows[name]
+        ]
+        return stages_of(parts, self.recipe.num_images, self.finetune_fraction, rate)
 
     def detections(self, name: str, seed: int) -> list[Detections]:
         """What a finished training's detector found, by test image."""
@@ -171,6 +165,26 @@ class Job(NamedTuple):
 
     def _weights(self, name: str, seed: int) -> Path:
         return self.out / "trainings" / f"{name}-{seed}.weights"
+
+
+def stages_of(
+    parts: Sequence[tuple[tuple[Example, ...], ...]], num_images: int, finetune_fraction: float, rate: float = 1.0
+) -> list[Stage]:
+    """Stages, one after the other, that show so many images in all.
+
+    Args:
+        parts: of each stage, see ``Stage``.
+        finetune_fraction: the share of the images that the last of several stages is shown.
+        rate: of the first, a factor of the recipe's; later ones have ``FINETUNE_RATE`` times that.
+    """
+    last = round(finetune_fraction * num_images) if len(parts) > 1 else num_images
+    before = [(num_images - last) // max(1, len(parts) - 1)] * (len(parts) - 1)
+    if before:
+        before[0] += num_images - last - sum(before)
+    return [
+        Stage(part, number, rate * (FINETUNE_RATE if i else 1.0))
+        for i, (part, number) in enumerate(zip(parts, [*before, last], strict=True))
+    ]
 
 
 def _save(found: list[Detections], metadata: dict[str, str], path: Path) -> None:

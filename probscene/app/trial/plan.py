@@ -156,21 +156,33 @@ def check(planned: Plan, loaded: Mapping[str, LabelledSet], tested: LabelledSet,
                 raise DataError(
                     f"expected at least {part.number} images in {part.source} for the set {row.name!r}, got {there}."
                 )
-    of_digest = {example.digest: example for example in tested.examples}
     used = {part.source for row in planned.rows for stage in row.stages for part in stage}
     for name in sorted(used & loaded.keys()):
-        both = [
-            f"{e.path} is {of_digest[e.digest].path}"
-            for e in loaded[name].examples
-            if e.digest in of_digest and len(e.boxes) + len(of_digest[e.digest].boxes)  # empty scenes may be the same
-        ]
-        if both:
-            more = f" and {len(both) - MAX_NAMED_IMAGES} more" if len(both) > MAX_NAMED_IMAGES else ""
-            raise DataError(
-                f"expected test images that are in no set, got {len(both)} in {name!r}: "
-                f"{'; '.join(both[:MAX_NAMED_IMAGES])}{more}. Take them out of one of the two; for a part of "
-                "one folder, name 'real' with --hold-out N."
-            )
+        check_apart(name, loaded[name], tested)
+
+
+def check_apart(name: str, found: LabelledSet, tested: LabelledSet) -> None:
+    """See that no image of a set is one that is tested on, by its pixels.
+
+    Args:
+        name: of the set, for the message.
+
+    Raises:
+        DataError: some are.
+    """
+    of_digest = {example.digest: example for example in tested.examples}
+    both = [
+        f"{e.path} is {of_digest[e.digest].path}"
+        for e in found.examples
+        if e.digest in of_digest and len(e.boxes) + len(of_digest[e.digest].boxes)  # empty scenes may be the same
+    ]
+    if both:
+        more = f" and {len(both) - MAX_NAMED_IMAGES} more" if len(both) > MAX_NAMED_IMAGES else ""
+        raise DataError(
+            f"expected test images that are in no set, got {len(both)} in {name!r}: "
+            f"{'; '.join(both[:MAX_NAMED_IMAGES])}{more}. Take them out of one of the two; for a part of "
+            "one folder, name 'real' with --hold-out N."
+        )
 
 
 def baselines_of(planned: Plan, names: Iterable[str]) -> tuple[str, ...]:

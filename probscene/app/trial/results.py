@@ -14,6 +14,7 @@ from .jobs import Job
 from .plan import Row
 from .scoring import MAIN, average_precision, coco_figures, match, measures
 from .sets import LabelledSet
+from .training import Detections
 
 MEAN = "mean"
 Column = tuple[str, str]
@@ -139,7 +140,7 @@ def score(
         found = [job.detections(row.name, s) for s in range(job.seeds)]
         figures = [coco_figures(tested, each) for each in found]
         coco[row.name] = {key: float(np.mean([f[key] for f in figures])) for key in figures[0]}
-        each = _precisions(tested, found, draws)
+        each = precisions(tested, found, draws)
         columns = list(each)
         for column, values in each.items():
             samples[row.name, column] = over_seeds(values, draws)
@@ -154,8 +155,14 @@ def score(
     return Results(names, tuple(columns), samples, by_seed, ladder, baselines, coco, counts, words)
 
 
-def _precisions(tested: LabelledSet, found: Sequence[Any], draws: Draws) -> Mapping[Column, NDArray[np.float64]]:
-    """By column, ``(S, 1 + B)``: of every class, then of their mean."""
+def precisions(
+    tested: LabelledSet, found: Sequence[Sequence[Detections]], draws: Draws
+) -> Mapping[Column, NDArray[np.float64]]:
+    """By column, ``(S, 1 + B)``: of every class, then of their mean. NaN where there is nothing to find.
+
+    Args:
+        found: for each seed, what was found in each test image.
+    """
     each: dict[Column, NDArray[np.float64]] = {}
     for c, name in enumerate(tested.classes):
         for measure in measures(tested.kitti, name):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from probscene.dataset import is_image
+from probscene.dataset import is_image, listed
 from probscene.decoding import quiet, read, stored
 from probscene.errors import DataError
 from probscene.image_bytes import Fault
@@ -81,6 +81,7 @@ def read_set(
     classes: Iterable[str] | None = None,
     progress: Progress = lambda *_: None,
     same: bool = False,
+    photographs: Path | None = None,
 ) -> LabelledSet:
     """All of a set, its images decoded and its labels checked. Labels of images that are not there are not read, which
     a note says.
@@ -90,6 +91,8 @@ def read_set(
             case, or by ``labels.kitti.TYPES``.
         same: a set of COCO or YOLO must have no others.
         progress: called with the number of images read, and of all.
+        photographs: the folder of the images, of which only some may be labelled; where None, they lie where the format
+            has them.
 
     Raises:
         DataError: no such set; labels that cannot be read, of unknown classes, or with boxes that are none or lie off
@@ -98,7 +101,7 @@ def read_set(
     """
     wanted = None if classes is None else tuple(sorted(map(composed, classes)))
     labels = read_annotations(path)
-    files = _images(labels)
+    files = _images(labels) if photographs is None else listed(photographs)[0]
     if not labels.images or not files:
         actual = f"no image such as {labels.images[0].name}" if labels.images else "none of them"
         raise DataError(
@@ -107,10 +110,15 @@ def read_set(
         )
     found = matched(labels.images, files, files[0].parent, stems=labels.stems)
     lacking = [file for i, file in enumerate(files) if i not in found.entries] if labels.stems else []
-    if lacking:
+    if lacking and photographs is None:
         raise DataError(
             f"expected a label file for each image in {labels.path}, got none of {lacking[0]}; write an empty one "
             "where it shows nothing, or take it out."
+        )
+    if not found.entries:
+        raise DataError(
+            f"expected labels of images in {files[0].parent}, got {path} with none of them, but of "
+            f"{labels.images[0].name}; name the folder of its images."
         )
     # In the order of COCO's list, and in that of the files of others.
     order = list(found.entries) if labels.stems else sorted(found.entries, key=lambda i: found.entries[i])
@@ -153,6 +161,13 @@ def digest_of(found: LabelledSet) -> str:
         for array in (example.boxes, example.classes, example.levels, example.real):
             made.update(array.tobytes())
     return made.hexdigest()
+
+
+def digest_of_pixels(pixels: NDArray) -> str:
+    """Of ``(H, W)`` or ``(H, W, 3)`` as ``decoding.stored`` gives them, grey the same as in RGB."""
+    height, width = pixels.shape[:2]
+    pixels = np.dstack([pixels] * 3) if pixels.ndim == 2 else pixels
+    return hashlib.sha256(f"{height}x{width}".encode() + pixels.tobytes()).hexdigest()
 
 
 class _Object(NamedTuple):
@@ -247,10 +262,3 @@ def _example(path: Path, pixels: NDArray, objects: list[_Object], classes: tuple
     of_class = np.array([-1 if name is None else classes.index(name) for _, name, *_ in objects], np.int64)
     levels = np.array([each.level for each in objects], np.int64)
     return Example(path, cut, of_class, levels, real, (height, width), digest_of_pixels(pixels))
-
-
-def digest_of_pixels(pixels: NDArray) -> str:
-    """Of what ``decoding.stored`` gives, in RGB."""
-    pixels = np.dstack([pixels] * 3) if pixels.ndim == 2 else pixels
-    height, width = pixels.shape[:2]
-    return hashlib.sha256(f"{height}x{width}".encode() + pixels.tobytes()).hexdigest()

@@ -1,6 +1,7 @@
 """Train a detector on labelled images, the same number of images whatever the set, and detect with it.
 
-Everything random comes from the training's seed: the same bytes on one thread, whatever the number of processes.
+Everything random comes from the training's seed: the same bytes on one thread, whatever the number of processes, and
+whether a training goes on from a checkpoint or was never interrupted.
 Axis letters: N objects, H W.
 """
 
@@ -55,6 +56,37 @@ class Detections(NamedTuple):
     scores: NDArray[np.float32]
 
 
+class Checkpoint(NamedTuple):
+    """Where a training is, after a step.
+
+    Attributes:
+        stage: its number.
+        steps: of this stage that are done.
+        weights: the detector's state.
+        optimizer: the state of this stage's.
+        random: the state of torch's random numbers.
+    """
+
+    stage: int
+    steps: int
+    weights: dict[str, Tensor]
+    optimizer: dict[str, Any]
+    random: Tensor
+
+
+class Checkpoints(NamedTuple):
+    """How an interrupted training goes on.
+
+    Attributes:
+        start: where it was interrupted.
+        after_step: called after each step, with a function that gives a checkpoint; the tensors in it are those that
+            are trained on, so write them before it returns.
+    """
+
+    start: Checkpoint | None = None
+    after_step: Callable[[Callable[[], Checkpoint]], None] = lambda checkpoint: None
+
+
 def train(
     detector: nn.Module,
     stages: Sequence[Stage],
@@ -63,22 +95,31 @@ def train(
     seed: Sequence[int],
     shown: Callable[[int], None] = lambda number: None,
     value_range: tuple[float, float] | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> None:
     """Train in place, stage after stage, each with an optimiser and a schedule of its own.
 
     Args:
         size: height and width at which images come.
         seed: words of it.
-        shown: called with the number of images of each step.
+        shown: called with the number of images of each step; first, where there is a start, with those before it.
         value_range: of images of 16 bits, see ``read_rgb``.
+        checkpoints: from its start the same training goes on to the same bytes.
 
     Raises:
         ProbsceneError: the loss is not finite.
     """
-    pictures = Pictures(size, value_range)
-    for number, stage in enumerate(stages):
+    checkpoints = checkpoints or Checkpoints()
+    pictures, start = Pictures(size, value_range), checkpoints.start
+    first = 0 if start is None else start.stage
+    if start is not None:
+        detector.load_state_dict(start.weights)
+        torch.set_rng_state(start.random)
+        here = min(start.steps * recipe.batch_size, stages[first].num_images)
+        shown(here + sum(stage.num_images for stage in stages[:first]))
+    for number, stage in enumerate(stages[first:], first):
         random = np.random.default_rng([*seed, number])
-        _train_stage(detector, stage, recipe, pictures, random, shown)
+        _train_stage(detector, number, stage, recipe, pictures, random, shown, checkpoints)
 
 
 def detect(
@@ -94,7 +135,11 @@ def detect(
         first: see ``Recipe``.
         value_range: see ``read_rgb``.
     """
-    image = read_rgb(path, value_range)
+    return detect_in(detector, read_rgb(path, value_range), size, first)
+
+
+def detect_in(detector: nn.Module, image: NDArray[np.uint8], size: tuple[int, int], first: int) -> Detections:
+    """``detect``, in an image ``(H, W, 3)``."""
     small, scale = fitted(image, size)
     with torch.no_grad():
         found = detector.eval()([_tensor(small)])[0]
@@ -130,18 +175,44 @@ class Pictures:
         return self._kept[example.path]
 
 
+class Augmentation(NamedTuple):
+    """How an image is shown once.
+
+    Attributes:
+        scale: times its size in the frame.
+        mirrored: left and right are swapped.
+        right, down: how far its middle moves, shares of the frame's sides.
+        gain, contrast, colour: factors of brightness, contrast and saturation.
+    """
+
+    scale: float
+    mirrored: bool
+    right: float
+    down: float
+    gain: float
+    contrast: float
+    colour: float
+
+
+def draw_augmentation(random: np.random.Generator) -> Augmentation:
+    """One by chance, whatever the image."""
+    scale = math.exp(random.uniform(math.log(SCALES[0]), math.log(SCALES[1])))
+    mirrored = bool(random.random() < 0.5)
+    right, down = random.uniform(-SHIFT, SHIFT), random.uniform(-SHIFT, SHIFT)
+    return Augmentation(scale, mirrored, right, down, *random.uniform(1 - COLOUR_JITTER, 1 + COLOUR_JITTER, 3))
+
+
 def augmented(
-    example: Example, pictures: Pictures, random: np.random.Generator
+    example: Example, pictures: Pictures, how: Augmentation
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
-    """An image ``(H, W, 3)`` as a training sees it once, mirrored, moved, scaled and lit by chance, and the boxes
-    ``(N, 4)`` and classes ``(N,)`` of its objects."""
+    """An image ``(H, W, 3)`` as a training sees it once, mirrored, moved, scaled and lit, and the boxes ``(N, 4)`` and
+    classes ``(N,)`` of its objects."""
     image, fit = pictures(example)
     height, width = pictures.size
-    scale = math.exp(random.uniform(math.log(SCALES[0]), math.log(SCALES[1])))
-    across = -scale if random.random() < 0.5 else scale
+    scale, across = how.scale, -how.scale if how.mirrored else how.scale
     # The frame's middle comes near the frame's middle.
-    x = width / 2 + random.uniform(-SHIFT, SHIFT) * width - across * width / 2
-    y = height / 2 + random.uniform(-SHIFT, SHIFT) * height - scale * height / 2
+    x = width / 2 + how.right * width - across * width / 2
+    y = height / 2 + how.down * height - scale * height / 2
     move = np.array([[across, 0, x + (across - 1) / 2], [0, scale, y + (scale - 1) / 2]])  # of pixels' middles
     image = cv2.warpAffine(image, move, (width, height), flags=cv2.INTER_LINEAR, borderValue=(PADDING_VALUE,) * 3)
     boxes, classes = example.boxes[example.real] * fit, example.classes[example.real]
@@ -150,7 +221,7 @@ def augmented(
     cut = np.clip(whole, 0, [width, height, width, height])
     sides, before = cut[:, 2:] - cut[:, :2], whole[:, 2:] - whole[:, :2]
     stay = (sides.min(1, initial=np.inf) >= MIN_BOX_SIDE) & (sides.prod(1) >= MIN_BOX_FRACTION * before.prod(1))
-    return _lit(image, random), cut[stay].astype(np.float32), classes[stay]
+    return _lit(image, how), cut[stay].astype(np.float32), classes[stay]
 
 
 def order(parts: tuple[tuple[Example, ...], ...], number: int, random: np.random.Generator) -> Iterator[Example]:
@@ -168,11 +239,13 @@ def _again(part: tuple[Example, ...], random: np.random.Generator) -> Iterator[E
 
 def _train_stage(
     detector: Any,
+    number: int,
     stage: Stage,
     recipe: Recipe,
     pictures: Pictures,
     random: np.random.Generator,
     shown: Callable[[int], None],
+    checkpoints: Checkpoints,
 ) -> None:
     body = {id(p) for p in pretrained_part(detector).parameters()}
     groups = [[p for p in detector.parameters() if p.requires_grad and (id(p) in body) == of] for of in (False, True)]
@@ -180,14 +253,23 @@ def _train_stage(
     rates = (rate, rate * recipe.backbone_factor)
     adam = torch.optim.Adam([{"params": g, "lr": r} for g, r in zip(groups, rates, strict=True)], fused=True)
     steps = math.ceil(stage.num_images / recipe.batch_size)
-    schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: _schedule((step + 1) / steps))
+    start, before = checkpoints.start, 0
+    if start is not None and start.stage == number:
+        adam.load_state_dict(start.optimizer)
+        before = start.steps
     detector.train()
     examples, left = order(stage.parts, stage.num_images, random), stage.num_images
-    while left:
+    for step in range(steps):
         batch = [next(examples) for _ in range(min(recipe.batch_size, left))]
+        how = [draw_augmentation(random) for _ in batch]
+        left -= len(batch)
+        if step < before:  # all that is drawn is drawn again
+            continue
+        for group, highest in zip(adam.param_groups, rates, strict=True):
+            group["lr"] = highest * _schedule((step + 1) / steps)
         images, targets = [], []
-        for example in batch:
-            image, boxes, classes = augmented(example, pictures, random)
+        for example, each in zip(batch, how, strict=True):
+            image, boxes, classes = augmented(example, pictures, each)
             images.append(_tensor(image))
             labels = torch.from_numpy(classes) + recipe.first_label
             targets.append({"boxes": torch.from_numpy(boxes).reshape(-1, 4), "labels": labels})
@@ -198,8 +280,10 @@ def _train_stage(
         loss.backward()
         nn.utils.clip_grad_norm_([p for group in groups for p in group], MAX_GRAD_NORM)
         adam.step()
-        schedule.step()
-        left -= len(batch)
+        done = step + 1
+        checkpoints.after_step(
+            lambda done=done: Checkpoint(number, done, detector.state_dict(), adam.state_dict(), torch.get_rng_state())
+        )
         shown(len(batch))
 
 
@@ -210,12 +294,11 @@ def _schedule(progress: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * (progress - WARMUP_FRACTION) / (1 - WARMUP_FRACTION)))
 
 
-def _lit(image: NDArray, random: np.random.Generator) -> NDArray[np.uint8]:
-    gain, contrast, colour = random.uniform(1 - COLOUR_JITTER, 1 + COLOUR_JITTER, 3)
-    pixels = image.astype(np.float32) * gain
-    pixels = (pixels - pixels.mean()) * contrast + pixels.mean()
+def _lit(image: NDArray, how: Augmentation) -> NDArray[np.uint8]:
+    pixels = image.astype(np.float32) * how.gain
+    pixels = (pixels - pixels.mean()) * how.contrast + pixels.mean()
     pale = pixels.mean(2, keepdims=True)
-    return np.clip((pixels - pale) * colour + pale, 0, 255).astype(np.uint8)
+    return np.clip((pixels - pale) * how.colour + pale, 0, 255).astype(np.uint8)
 
 
 def _tensor(image: NDArray[np.uint8]) -> Tensor:

@@ -26,7 +26,8 @@ from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_text
 from ..fitting.run import RunFolder
 from ..progress import Progress, silent
-from .detector import RECIPES, checked, fingerprint
+from .cut_out import check_not_cut_out, model_file
+from .detector import RECIPES, Recipe, checked, fingerprint
 from .jobs import Job
 from .pictures import draw
 from .plan import REAL, Plan, Row, baselines_of, check, list_of, looser, only, plan, split
@@ -153,11 +154,12 @@ def trial(
 
     Raises:
         ProbsceneError: a setting that makes no sense.
-        DataError: a set that cannot be used; test images among those that are trained on.
+        DataError: a set that cannot be used; test images among those that are trained on, or that a run's pictures were
+            cut out of.
         RunError: the folder holds a trial of other settings.
         MachineError: the disk is full, or a worker was killed.
     """
-    recipe, budget, generated = _recipe(options.detector, options.budget), options.budget, options.generated
+    recipe, budget, generated = recipe_of(options.detector, options.budget), options.budget, options.generated
     options.check()
     positive(workers, "workers")
     tested, photographs = _photographs(test, options, show)
@@ -175,13 +177,16 @@ def trial(
     planned = plan(sets, known, wanted)
     bases = baselines_of(planned, options.baselines)
     loaded = {} if photographs is None else {REAL: photographs}
-    loaded |= {key: _read(path, names, show, same) for key, path in planned.paths.items()}
+    loaded |= {key: read_labelled(path, names, show, same) for key, path in planned.paths.items()}
     for note in dict.fromkeys(note for found in (tested, *loaded.values()) for note in found.notes):
         callback(f"Note: {note}")
     check(planned, loaded, tested, set(known) - {REAL})
     if generated is not None:
         _check_classes(generated, names, same)
-    size, seed, seeds, value_range = options.size or _size(tested), options.seed, options.seeds, options.value_range
+        if (file := model_file(generated.opened)) is not None:
+            check_not_cut_out(file, tested)
+    size = options.size or size_for(example.size for example in tested.examples)
+    seed, seeds, value_range = options.seed, options.seeds, options.value_range
     shared = {
         "format": FORMAT, "classes": list(names), "detector": fingerprint(options.detector),
         "recipe": [recipe.num_images, *recipe[1:]], "last": budget.finetune_fraction, "chain": budget.warm_start,
@@ -198,7 +203,7 @@ def trial(
         callback(f"Note: {note}")
     if generated is not None:
         for key, path in _generate(generated, out / "sets", seed, workers, show).items():
-            loaded[key] = _read(path, names, show)
+            loaded[key] = read_labelled(path, names, show)
         check(planned, loaded, tested, set())
         note = None if photographs is None else looser(photographs, loaded[known[-1]])
         if note is not None:
@@ -237,8 +242,12 @@ def trial(
     return found
 
 
-def _recipe(choice: str, budget: TrainingBudget):
-    """What a detector is trained with."""
+def recipe_of(choice: str, budget: TrainingBudget) -> Recipe:
+    """What a detector is trained with.
+
+    Raises:
+        ProbsceneError: a budget that makes no sense; see also ``checked``.
+    """
     if not 0 < budget.finetune_fraction < 1:
         raise ProbsceneError(f"expected a fine-tuning fraction between 0 and 1, got {budget.finetune_fraction}.")
     recipe = RECIPES[checked(choice)]
@@ -252,20 +261,27 @@ def _recipe(choice: str, budget: TrainingBudget):
     return recipe
 
 
-def _read(path: Path, classes: Iterable[str] | None, show: Progress, same: bool = False) -> LabelledSet:
+def read_labelled(
+    path: Path,
+    classes: Iterable[str] | None,
+    show: Progress,
+    same: bool = False,
+    photographs: Path | None = None,
+) -> LabelledSet:
+    """``read_set``, of ``PATH@LIST`` some of it."""
     folder, names = list_of(path)
-    found = read_set(folder, classes, lambda done, total: show("labels", done, total), same)
+    found = read_set(folder, classes, lambda done, total: show("labels", done, total), same, photographs)
     return found if names is None else only(found, names)
 
 
 def _photographs(test: Path, options: TrialOptions, show: Progress) -> tuple[LabelledSet, LabelledSet | None]:
     """What is tested on, and the photographs to train on, if there are any."""
-    tested = _read(test, options.classes, show)
+    tested = read_labelled(test, options.classes, show)
     real = None if options.real is None else Path(options.real)
     if options.hold_out is not None:
         photographs, tested = split(tested, options.hold_out, options.seed)
     else:
-        photographs = None if real is None else _read(real, tested.classes, show, options.classes is None)
+        photographs = None if real is None else read_labelled(real, tested.classes, show, options.classes is None)
     labelled = {int(c) for e in tested.examples for c in e.classes[e.real]}
     lacking = [name for number, name in enumerate(tested.classes) if number not in labelled]
     if lacking:
@@ -318,9 +334,9 @@ def _generate(generated: GeneratedSets, into: Path, seed: int, workers: int, sho
     return folders
 
 
-def _size(tested: LabelledSet) -> tuple[int, int]:
-    """Of ``DEFAULT_AREA``, in the shape of the test images."""
-    shape = float(np.median([width / height for height, width in (e.size for e in tested.examples)]))
+def size_for(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """Of ``DEFAULT_AREA``, in the shape of images by their heights and widths."""
+    shape = float(np.median([width / height for height, width in sizes]))
     sides = math.sqrt(DEFAULT_AREA / shape), math.sqrt(DEFAULT_AREA * shape)
     height, width = (max(SIDE_MULTIPLE, SIDE_MULTIPLE * round(side / SIDE_MULTIPLE)) for side in sides)
     return height, width
@@ -341,24 +357,35 @@ def _digests(planned: Plan, loaded: Mapping[str, LabelledSet], shared: Mapping[s
     return digests
 
 
+def check_same(record: Path, settings: Mapping[str, Any], what: str, more: str = "") -> None:
+    """See that settings are those in a file.
+
+    Args:
+        what: was begun with them, and
+        more: a last sentence, for messages.
+
+    Raises:
+        RunError: they are not, or the file is damaged.
+    """
+    try:
+        before = json.loads(record.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RunError(f"expected settings in {record}, got a damaged file; name another folder.") from error
+    differing = [key for key in settings if before.get(key) != settings[key]]
+    if differing:
+        was, now = (", ".join(f"{key} {str(s.get(key))[:60]}" for key in differing) for s in (before, settings))
+        raise RunError(
+            f"expected the settings that {what} was begun with ({was}), got {now}; give the same, or name another "
+            f"folder.{more}"
+        )
+
+
 def _bind(out: Path, shared: dict[str, Any]) -> None:
     """Make the folder ready, or see that it holds a trial of the same settings."""
     record = out / "trial.json"
     make_folder(out)
     if record.is_file():
-        try:
-            before = json.loads(record.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise RunError(
-                f"expected a trial's settings in {record}, got a damaged file; name another folder."
-            ) from error
-        differing = [key for key in shared if before.get(key) != shared[key]]
-        if differing:
-            was, now = (", ".join(f"{key} {str(s.get(key))[:60]}" for key in differing) for s in (before, shared))
-            raise RunError(
-                f"expected the settings that the trial in {out} was begun with ({was}), got {now}; give the "
-                "same, or name another folder. Sets and seeds can be added."
-            )
+        check_same(record, shared, f"the trial in {out}", " Sets and seeds can be added.")
         return
     others = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith("."))
     if others:

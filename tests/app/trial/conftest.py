@@ -8,6 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from probscene.app.detectors.folder import TrainedDetector
+from probscene.app.detectors.train import TrainOptions, train
+from probscene.app.trial.trial import TrainingBudget
+
 SIDE = 64
 
 
@@ -44,6 +48,28 @@ def change(folder: Path, how: Callable[[dict], None]) -> Path:
     how(record)
     file.write_text(json.dumps(record), encoding="utf-8")
     return folder
+
+
+@pytest.fixture(scope="session")
+def photographs(tmp_path_factory) -> Path:
+    """The same of the classes of the model of discs; shapes and colours are others."""
+    folder = tmp_path_factory.mktemp("photographs")
+    draw_set(folder / "train", 8, 1, ("red", "blue"))
+    draw_set(folder / "test", 6, 2, ("red", "blue"))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained(discs, photographs, tmp_path_factory) -> TrainedDetector:
+    """A detector that was trained for four steps and is tested on six photographs."""
+    out = tmp_path_factory.mktemp("trained") / "detector"
+    return train(discs.file, photographs / "train", None, out, small_options(test=photographs / "test"))
+
+
+def small_options(**more) -> TrainOptions:
+    """Options of a training of four steps."""
+    budget = TrainingBudget(iterations=4, batch_size=2)
+    return TrainOptions(**{"generate": 4, "size": (64, 64), "budget": budget, **more})
 
 
 @pytest.fixture(scope="session")

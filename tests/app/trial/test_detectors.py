@@ -12,7 +12,7 @@ from torchvision.models import resnet50
 import probscene as ps
 from probscene.app.trial.detector import RECIPES, build
 from probscene.app.trial.sets import read_set
-from probscene.app.trial.training import Pictures, Stage, augmented, detect, fitted, order, train
+from probscene.app.trial.training import Pictures, Stage, augmented, detect, draw_augmentation, fitted, order, train
 from probscene.app.trial.trial import TrainingBudget, TrialOptions, trial
 from probscene.decoding import read_rgb
 from probscene.errors import DataError
@@ -51,6 +51,9 @@ def test_mask_rcnn_is_trained_from_the_weights_of_a_user(drawn, tmp_path):
     recipe = RECIPES["maskrcnn"]
     train(detector, [Stage((examples[:2],), 2)], recipe, (64, 64), (0,))
     found = detect(detector, examples[0].path, (64, 64), recipe.first_label)
+    again = build("maskrcnn", 2, (64, 64))  # without the file, for the trained weights
+    again.load_state_dict(detector.state_dict())
+    assert (detect(again, examples[0].path, (64, 64), recipe.first_label).boxes == found.boxes).all()
     assert set(found.classes.tolist()) <= {0, 1} and (frozen == detector.backbone.body.layer1[0].conv1.weight).all()
     safetensors.torch.save_file({"x": torch.zeros(1)}, file)
     with pytest.raises(DataError, match="maskrcnn_resnet50_fpn or resnet50"):
@@ -62,7 +65,7 @@ def test_boxes_go_with_the_image(drawn):
     pictures, random, right = Pictures((96, 128)), np.random.default_rng(0), []
     for example in read_set(drawn / "train").examples:
         for _ in range(5):
-            image, boxes, classes = augmented(example, pictures, random)
+            image, boxes, classes = augmented(example, pictures, draw_augmentation(random))
             assert image.shape == (96, 128, 3) and len(boxes) == len(classes) <= len(example.boxes)
             for (x0, y0, x1, y1), c in zip(boxes, classes, strict=True):
                 green = image[int((y0 + y1) / 2), int((x0 + x1) / 2), 1]
