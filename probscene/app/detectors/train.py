@@ -12,10 +12,11 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import safetensors.torch
 import torch
+from torchvision.models.detection.fcos import FCOS
 
 import probscene
 from probscene.dataset import range_of
@@ -186,7 +187,7 @@ def train(
     trained = TrainedDetector.at(out)
     if options.onnx and not (out / ONNX).is_file():
         with threads(1):
-            export(trained.network, trained.size, out / ONNX)  # pyright: ignore[reportArgumentType]
+            export(cast(FCOS, trained.network), trained.size, out / ONNX)
     return trained
 
 
