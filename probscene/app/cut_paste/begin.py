@@ -10,6 +10,7 @@ The folder that it writes:
     begun.json           which photographs these pictures are of; they must not stand in a test
 """
 
+import keyword
 import os
 import re
 import shutil
@@ -285,6 +286,11 @@ def _kinds(objects: Iterable[Iterable[Object]]) -> dict[str, str]:
     return kinds
 
 
+def _python_name(name: str) -> str:
+    name = re.sub(r"\W", "_", name)
+    return name if name.isidentifier() and not keyword.iskeyword(name) else f"model_{name}"
+
+
 def _chosen(name: str, some: list[Cutout], rng: np.random.Generator, notes: list[str]) -> list[Cutout]:
     """The cut-outs of a class that are drawn."""
     clear = [one for one in some if one.contrast >= MIN_CONTRAST]
@@ -348,7 +354,7 @@ def _model(
     off = np.abs(np.log(np.maximum(lights, 1.0) / np.median(np.maximum(lights, 1.0))))
     grey = all((image == image[..., :1]).all() for image in found.images)
     return ModelPart(
-        re.sub(r"\W", "_", options.name or out.resolve().name) or "begun",
+        _python_name(options.name or out.resolve().name),
         (height, width),
         1 if grey else 3,
         tuple(parts),

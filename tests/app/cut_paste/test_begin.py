@@ -298,6 +298,14 @@ def test_labels_of_other_photographs(tmp_path):
         made(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["2024-cells", "class", "ärger", "scene"])
+def test_models_and_classes_of_any_name(name, tmp_path):
+    file = photographs(tmp_path, number=2)
+    file.write_text(file.read_text().replace("Big Disc", f"{name} 1/2").replace('"disc"', f'"{name}"'))
+    model, _ = drawn(made(tmp_path, name).path, 2)
+    assert len(model.classes) == 2
+
+
 def test_the_command_says_what_it_made(tmp_path, call):
     photographs(tmp_path)
     out = tmp_path / "made"
