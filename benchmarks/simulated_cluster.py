@@ -7,7 +7,7 @@ import subprocess
 
 
 class Simulated:
-    """Three nodes, whatever was done to them before."""
+    """Three nodes at most, whatever was done to them before."""
 
     def __init__(self):
         from ray.cluster_utils import Cluster
@@ -19,8 +19,8 @@ class Simulated:
     def address(self):
         return self.cluster.address
 
-    def whole(self):
-        """Three nodes that answer, in place of those that are dead or frozen."""
+    def whole(self, number=3):
+        """So many nodes that answer, or more, in place of those that are dead or frozen."""
         for pid in self.stopped:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
@@ -28,7 +28,7 @@ class Simulated:
             self.cluster.remove_node(node, allow_graceful=False)
         self.stopped.clear()
         self.frozen.clear()
-        self.nodes += [self.cluster.add_node(num_cpus=1) for _ in range(3 - len(self.nodes))]
+        self.nodes += [self.cluster.add_node(num_cpus=1) for _ in range(number - len(self.nodes))]
 
     def kill(self):
         """The first node, and all that runs there."""
@@ -44,5 +44,5 @@ class Simulated:
             self.stopped.append(pid)
 
     def shutdown(self):
-        self.whole()
+        self.whole(0)
         self.cluster.shutdown()

@@ -1,4 +1,4 @@
-"""A cluster of three nodes, whatever was done to them before."""
+"""A cluster, whatever was done to its nodes before."""
 
 from pathlib import Path
 
@@ -21,5 +21,6 @@ def _simulated():
 
 @pytest.fixture
 def simulated(_simulated):
-    _simulated.whole()
+    """With one node at least; a test that needs more asks for them, as each takes seconds to start."""
+    _simulated.whole(1)
     return _simulated

@@ -21,7 +21,7 @@ def doubling(pause=0.0, fault=None):
 
 def slow():
     """The work of a crew whose preparation takes its time."""
-    time.sleep(4)
+    time.sleep(1)
     return doubling()
 
 

@@ -73,6 +73,7 @@ def alone(fitted, tmp_path_factory) -> dict[str, bytes]:
 
 
 def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, messages):
+    simulated.whole(3)
     pool, found = nodes.actor_pool(doubling, (0.1,)), []
     while sum(isinstance(member.request, int) for member in pool._members) < 3:  # until every node is at work
         pool.run(range(3), lambda result: None)
@@ -97,6 +98,7 @@ def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, me
 
 
 def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, alone, tmp_path):
+    simulated.whole(3)
     run, made = RunFolder.at(fitted), []
 
     def progress(number, _):
@@ -112,6 +114,7 @@ def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, alone,
 
 
 def test_a_fit_has_the_bytes_of_one_process(simulated, call, discs, target, tmp_path, monkeypatch):
+    simulated.whole(3)
     words = ["fit", discs.file, "--target", target.images, *discs.settings, "--set", "structure.num_scenes=150"]
     assert call(*words, "--out", tmp_path / "alone").code == 0
     parts, run = [], actor_pool.ActorPool.run
@@ -162,7 +165,7 @@ def test_what_a_task_raises_is_told_with_its_node(nodes):
 
 
 def test_a_disk_that_takes_no_files_on_one_node(simulated, nodes, fitted, alone, tmp_path, monkeypatch):
-    simulated.kill()  # two are enough
+    simulated.whole(2)
     run, node, out = RunFolder.at(fitted), simulated.nodes[1].node_id, tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr(datasets, "_actor", partial(unwritable, node, tmp_path / "tried"))
@@ -182,7 +185,7 @@ def test_other_versions_are_refused(nodes, monkeypatch):
 
 
 def test_the_last_node_is_lost(simulated, nodes):
-    for _ in range(2):
+    while len(simulated.nodes) > 1:
         simulated.kill()
 
     def done(_):

@@ -20,7 +20,7 @@ def prepare():
     return neg
 
 def main():
-    spread(prepare, (), 2, [1, 2], print)
+    spread(prepare, (), 1, [1, 2], print)
 """
 GUARDED = SPREAD + '\nif __name__ == "__main__":\n    main()\n'
 ONCE = "import os\nos.mkdir('made')\n" + SPREAD + "\nmain()\n"
@@ -67,7 +67,7 @@ def test_no_file_is_needed_where_there_is_no_script(tmp_path):
     line = (
         "from operator import neg; from functools import partial; from probscene.app.workers.processes import spread; "
     )
-    done = subprocess.run([sys.executable, "-c", line + "spread(partial(partial, neg), (), 2, [1, 2], print)"],
+    done = subprocess.run([sys.executable, "-c", line + "spread(partial(partial, neg), (), 1, [1, 2], print)"],
                           capture_output=True, text=True, timeout=120)  # fmt: skip
     assert done.returncode == 0 and sorted(done.stdout.split()) == ["-1", "-2"], done.stderr
 
@@ -84,4 +84,4 @@ def ends(how):
 )
 def test_a_worker_that_ends_at_work_is_no_fault_of_the_script(how, said):
     with pytest.raises(MachineError, match=f"A worker process {said}"):
-        spread(ends, (how,), 2, [1, 2], print)
+        spread(ends, (how,), 1, [1, 2], print)
