@@ -23,7 +23,8 @@ from .global_head import GlobalHead, global_features
 HIDDEN = 96
 SCORE_THRESHOLDS = 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6  # of which calibration chooses one
 MAX_OBJECTS = 200  # objects in an image
-LOG_SD_RANGE = -6.0, 0.5  # of u, least and largest
+LOG_SD_RANGE = -6.0, -0.7  # of u, least and largest; a uniform one's is -1.2
+MEAN_REACH = 1.5  # of the mean, from the middle
 HARMONICS = 4  # cosine and sine of one turn, and of two
 
 
@@ -197,8 +198,11 @@ def value_loss(output: Tensor, u: Tensor) -> Tensor:
 
 
 def normal(output: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation ``(...)`` of the normal distribution, before it is cut off."""
-    return output[..., 0].clamp(-1.0, 2.0), output[..., 1].clamp(*LOG_SD_RANGE).exp()
+    """Mean and standard deviation ``(...)`` of the normal distribution, before it is cut off. Both are bounded by smooth
+    functions: where a clamp cut them, they would stay, as it has no gradient there."""
+    low, high = LOG_SD_RANGE
+    log_sd = low + F.softplus(high - F.softplus(high - output[..., 1]) - low)
+    return 0.5 + MEAN_REACH * ((output[..., 0] - 0.5) / MEAN_REACH).tanh(), log_sd.exp()
 
 
 def cut_off_mass(mean: Tensor, sd: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from probscene.inference.parameters.reader import (
     Detections,
     find_objects,
     harmonics,
+    normal,
     truncated_mean,
     truncated_quantile,
 )
@@ -42,6 +43,17 @@ def test_cut_normal_distributions_are_scipys(mean, sd, v):
     one, other = torch.tensor(mean).double(), torch.tensor(sd).double()
     assert float(truncated_mean(one, other)) == pytest.approx(reference.mean(), abs=1e-3)
     assert float(truncated_quantile(one, other, torch.tensor(v).double())) == pytest.approx(reference.ppf(v), abs=5e-3)
+
+
+@given(st.floats(-2.0, 3.0), st.floats(-8.0, 8.0))
+def test_what_a_reader_says_can_always_change(mean, log_sd):
+    """Whatever it says: what is cut off has no gradient, and stays."""
+    output = torch.tensor([mean, log_sd, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    said = normal(output)
+    for part, at in zip(said, (0, 1), strict=True):
+        (slope,) = torch.autograd.grad(part, output, retain_graph=True)
+        assert float(slope[at]) > 1e-6
+    assert -1 < float(said[0].detach()) < 2 and 0 < float(said[1].detach()) < 0.5
 
 
 @given(seeds, st.integers(0, 12))
