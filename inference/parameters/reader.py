@@ -198,8 +198,8 @@ def value_loss(output: Tensor, u: Tensor) -> Tensor:
 
 
 def normal(output: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation ``(...)`` of the normal distribution, before it is cut off. Both are bounded by smooth
-    functions: where a clamp cut them, they would stay, as it has no gradient there."""
+    """Mean and standard deviation ``(...)`` of the normal distribution, before it is cut off. Smooth functions bound
+    them: where a clamp cut them they would stay, as it has no gradient there."""
     low, high = LOG_SD_RANGE
     log_sd = low + F.softplus(high - F.softplus(high - output[..., 1]) - low)
     return 0.5 + MEAN_REACH * ((output[..., 0] - 0.5) / MEAN_REACH).tanh(), log_sd.exp()
