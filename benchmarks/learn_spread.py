@@ -15,9 +15,9 @@ of relative gaps within an image; ``gap_number``, the correlation of an image's 
 The floor is the distance of two samples of the truth that are as large as the target. The prior's scenes have the
 learnt structures, so that all rows have the same numbers of digits.
 
-A digit's turn is read by its slant, which differs from digit to digit, and in MNIST's training set is 2 to 3 degrees more
-in the mean than in t10k. The model comes with 450 digits of each class, which a reader may learn by heart; ``--assets
-FOLDER`` draws with the 60,000 of the training set.
+A digit's turn is read by its slant, which differs from digit to digit, and in MNIST's training set is 2 to 3 degrees
+more in the mean than in t10k. The model comes with 450 digits of each class, which a reader may learn by heart;
+``--assets FOLDER`` draws with the 60,000 of the training set.
 """
 
 import argparse
