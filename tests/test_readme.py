@@ -46,7 +46,7 @@ def test_it_is_short():
 
 def test_commands_exist():
     named = re.findall(r"^    probscene +(\w+)", README, re.MULTILINE)
-    assert len(named) == 5
+    assert len(named) == 9
     for command in named:
         assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 

@@ -44,7 +44,7 @@ STAGES = {
     "labels": ("Labelled images", "images"),
     "training": ("Detectors", "images"),
     "scoring": ("Scoring", "sets"),
-    "cutting": ("Cutting out", "photographs"),
+    "cutting": ("Cutting out", "images"),
     "detector": ("Training", "images"),
     "detecting": ("Detecting", "images"),
 }
