@@ -32,7 +32,7 @@ from probscene.app.memory import tune_malloc
 from probscene.app.trial.trial import TrialOptions, trial
 from probscene.decoding import read_rgb
 
-NEAR, SIDE = 0.95, 32
+MIN_CORRELATION, SIDE = 0.95, 32  # of near duplicates; pixels
 
 
 def groups_of(files: list[Path]) -> np.ndarray:
@@ -40,9 +40,9 @@ def groups_of(files: list[Path]) -> np.ndarray:
     small = np.stack([cv2.resize(read_rgb(f).mean(2), (SIDE, SIDE), interpolation=cv2.INTER_AREA) for f in files])
     flat = small.reshape(len(files), -1) - small.mean((1, 2))[:, None]
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
-    near, group = flat @ flat.T > NEAR, np.arange(len(files))
+    is_near, group = flat @ flat.T > MIN_CORRELATION, np.arange(len(files))
     for _ in files:
-        spread = np.where(near, group, len(files)).min(1)
+        spread = np.where(is_near, group, len(files)).min(1)
         if (spread == group).all():
             break
         group = spread
