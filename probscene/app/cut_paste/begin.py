@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 
-from probscene.dataset import ImageFolder, is_image
+from probscene.dataset import ImageFolder, listed
 from probscene.decoding import quiet, read, stored, window
 from probscene.errors import DataError
 from probscene.image_bytes import Fault
@@ -35,11 +35,12 @@ from probscene.image_bytes import Fault
 from ..arguments import checked_seed
 from ..files import machine_error, make_folder, write_json, write_text
 from ..labels.annotations import Annotated, Annotation
+from ..labels.boxes import place_on_canvas
 from ..labels.kitti import DONT_CARE
 from ..labels.naming import composed, matched
 from ..labels.reading import read_annotations
 from ..progress import Display, Progress
-from ..trial.cut_out import FILE
+from ..trial.begun_photographs import FILE
 from ..trial.sets import digest_of_pixels
 from .cutouts import Cutout, Object, are_whole, covered, cut_out, inside, overlaps, parents, turned
 from .grounds import ground_of, light_of
@@ -200,10 +201,8 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
 
 
 def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photographs:
-    if not photos.is_dir():
-        raise DataError(f"expected a folder of photographs, got {photos}; name the folder that they are in.")
     labels = read_annotations(path)
-    files = [file for file in sorted(photos.iterdir()) if is_image(file)]
+    files = listed(photos)[0]
     pairs = matched(labels.images, files, photos, stems=labels.stems)
     if not pairs.entries:
         raise DataError(
@@ -248,26 +247,16 @@ def _canvas(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
 
 def _object(one: Annotation, folder: ImageFolder, i: int, labels: Annotated) -> Object | None:
     """As the canvas has it; None where its middle is not on it."""
-    size, (H, W) = folder.sizes[i], folder.canvas
-    end = 1.0 if labels.kitti else 0.0
-    right, bottom = one.right + end, one.bottom + end
-    if not (one.left < size[1] and right > 0 and one.top < size[0] and bottom > 0):
-        raise DataError(
-            f"expected boxes on the image of {size[1]}x{size[0]} {one.where}, got {one.name} from {one.left:g}, "
-            f"{one.top:g} to {right:g}, {bottom:g}; give the labels of these images, not of images of another size."
-        )
-    top, left, height, width = folder.windows[i] or (0, 0, *size)
-    x = np.clip([one.left, right], 0, size[1]) - left
-    y = np.clip([one.top, bottom], 0, size[0]) - top
-    if not (0 <= x.mean() < width and 0 <= y.mean() < height):
+    box = place_on_canvas(one, folder, i, 1.0 if labels.kitti else 0.0)
+    if box is None:
         return None
-    x, y = np.clip(x, 0, width) * W / width, np.clip(y, 0, height) * H / height
     mask = None
     if one.mask is not None:
+        (H, W), (top, left, height, width) = folder.canvas, folder.windows[i] or (0, 0, *folder.sizes[i])
         part = one.mask()[top : top + height, left : left + width].astype(np.uint8)
         mask = cv2.resize(part, (W, H), interpolation=cv2.INTER_NEAREST).astype(bool)
         mask = mask if mask.any() else None
-    return Object(composed(one.name), (float(x[0]), float(y[0]), float(x[1]), float(y[1])), mask)
+    return Object(composed(one.name), box, mask)
 
 
 def _kinds(objects: Iterable[Iterable[Object]]) -> dict[str, str]:

@@ -107,7 +107,7 @@ def model_text(model: ModelPart) -> str:
         "RADIUS": f"{model.radius:.1f}",
         "IGNORED": "\n    ".join(f'"{part.kind}": {part.longest},' for part in model.classes if part.ignored),
     }
-    parts = ["ALWAYS", *(["APART"] if not model.overlapping else []), *(["DIRT"] if values["IGNORED"] else [])]
+    parts = [*(["APART"] if not model.overlapping else []), *(["DIRT"] if values["IGNORED"] else [])]
     parts += ["ON"] if values["ON"] else []
     lines = [line for line in TEMPLATE.splitlines() if not (found := re.match(r"(\w+)\|", line)) or found[1] in parts]
     text = "\n".join(re.sub(r"^\w+\|", "", line) for line in lines) + "\n"

@@ -34,7 +34,7 @@ from ..labels.naming import composed
 from ..loading import assets_record, load_model
 from ..modules import file_digest, module_digests
 from ..progress import Progress, silent
-from ..trial.cut_out import check_not_cut_out, model_file
+from ..trial.begun_photographs import check_not_cut_out, model_file
 from ..trial.detector import Recipe, build, fingerprint
 from ..trial.jobs import stages_of
 from ..trial.plan import check_apart, looser, split

@@ -117,33 +117,51 @@ def on_canvas(
     """
     small, cut, boxes = 0, 0, []
     for row, each in found.items():
-        size, seen, (H, W) = target.sizes[row], target.windows[row], target.canvas
-        top, left, height, width = (0, 0, *size) if seen is None else seen
         kept = []
         for box in each:
-            right, bottom = box.right + end, box.bottom + end
-            if not (box.left < size[1] and right > 0 and box.top < size[0] and bottom > 0):
-                raise DataError(
-                    f"expected boxes on the image of {size[1]}x{size[0]} {box.where}, got {box.name} from "
-                    f"{box.left:g}, {box.top:g} to {right:g}, {bottom:g}; give the labels of these images, not of "
-                    "images of another size."
-                )
-            x0, x1 = (min(max(x, 0), size[1]) - left for x in (box.left, right))
-            y0, y1 = (min(max(y, 0), size[0]) - top for y in (box.top, bottom))
-            if seen is not None and not (0 <= (x0 + x1) / 2 < width and 0 <= (y0 + y1) / 2 < height):
+            at = place_on_canvas(box, target, row, end)
+            if at is None:
                 cut += 1
             elif round(box.bottom - box.top, 6) < min_height:
                 small += 1
             else:
-                x0, x1 = (min(max(x, 0), width) * W / width for x in (x0, x1))
-                y0, y1 = (min(max(y, 0), height) * H / height for y in (y0, y1))
-                kept.append([classes.index(box.name), x0, y0, x1, y1])
+                kept.append([classes.index(box.name), *at])
         boxes.append(torch.tensor(kept, dtype=torch.float32).reshape(-1, 5))
     if cut:
         notes += (f"{cut} objects that lie where images are cut are not counted.",)
     if small:
         notes += (f"{small} objects of less than {min_height:g} pixels' height are not counted.",)
     return Boxes(list(found), tuple(boxes), classes, notes)
+
+
+def place_on_canvas(
+    one: Annotation, target: Images, row: int, end: float = 0.0
+) -> tuple[float, float, float, float] | None:
+    """x0, y0, x1, y1 of a box of image number ``row``, pixels of the canvas, clipped to it; None where its middle lies
+    where the image is cut.
+
+    Args:
+        end: see ``on_canvas``.
+
+    Raises:
+        DataError: it lies entirely beside its image.
+    """
+    size, seen, (H, W) = target.sizes[row], target.windows[row], target.canvas
+    top, left, height, width = (0, 0, *size) if seen is None else seen
+    right, bottom = one.right + end, one.bottom + end
+    if not (one.left < size[1] and right > 0 and one.top < size[0] and bottom > 0):
+        raise DataError(
+            f"expected boxes on the image of {size[1]}x{size[0]} {one.where}, got {one.name} from "
+            f"{one.left:g}, {one.top:g} to {right:g}, {bottom:g}; give the labels of these images, not of "
+            "images of another size."
+        )
+    x0, x1 = (min(max(x, 0), size[1]) - left for x in (one.left, right))
+    y0, y1 = (min(max(y, 0), size[0]) - top for y in (one.top, bottom))
+    if seen is not None and not (0 <= (x0 + x1) / 2 < width and 0 <= (y0 + y1) / 2 < height):
+        return None
+    x0, x1 = (min(max(x, 0), width) * W / width for x in (x0, x1))
+    y0, y1 = (min(max(y, 0), height) * H / height for y in (y0, y1))
+    return x0, y0, x1, y1
 
 
 def _classes_of_types(

@@ -26,7 +26,7 @@ from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_text
 from ..fitting.run import RunFolder
 from ..progress import Progress, silent
-from .cut_out import check_not_cut_out, model_file
+from .begun_photographs import check_not_cut_out, model_file
 from .detector import RECIPES, Recipe, checked, fingerprint
 from .jobs import Job
 from .pictures import draw

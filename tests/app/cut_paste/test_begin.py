@@ -77,7 +77,7 @@ def made(folder: Path, out="model", **options):
     return begin(folder / "photos", folder / "labels.json", folder / out, BeginOptions(**options), progress=False)
 
 
-def drawn(path: Path, number=32):
+def rendered_prior(path: Path, number=32):
     model = load_model(str(path))
     seed_everything(0)
     return model, renderer_for(model, 1)(sample(model, model.prior, number).drawing)
@@ -111,7 +111,7 @@ def test_its_objects_are_as_large_and_as_bright_as_those_of_the_photographs(begu
             assert (
                 np.abs(sprite[there][:, :3].mean(0) / (210, 190, 170) - 1).max() < 0.15
             )  # the light's differs by so much
-    model, batch = drawn(found.path)
+    model, batch = rendered_prior(found.path)
     sides = (batch.box[..., 2:] - batch.box[..., :2]).amax(-1)
     whole = (batch.visible > 0.99) & (batch.kind == model.grammar.kind("disc"))
     assert 0.75 * 2 * RADIUS["disc"] < float(sides[whole].min()) <= float(sides[whole].max()) < 1.3 * 2 * RADIUS["disc"]
@@ -131,7 +131,7 @@ def test_where_objects_were_the_ground_goes_on(tmp_path):
 
 def test_objects_that_never_overlap_do_not(begun):
     _, found = begun
-    _, batch = drawn(found.path, 64)
+    _, batch = rendered_prior(found.path, 64)
     assert "ps.separate" in found.path.read_text()
     assert float((batch.visible[batch.kind >= 0] > 0.8).float().mean()) > 0.95
 
@@ -179,14 +179,14 @@ def test_little_is_said_to_be_little(tmp_path):
     found = made(tmp_path)
     assert any("disc: 3 objects are all" in note for note in found.notes)
     assert any("One photograph" in note for note in found.notes)
-    drawn(found.path, 4)
+    rendered_prior(found.path, 4)
 
 
 def test_a_class_that_is_always_at_the_border_is_drawn_as_it_is(tmp_path):
     photographs(tmp_path, number=4, each=1, names=("disc",), at=lambda rng, w, h: (0.0, rng.uniform(20, h - 20)))
     found = made(tmp_path)
     assert found.cutouts["disc"] == 4 and any("cut by the border" in note for note in found.notes)
-    drawn(found.path, 4)
+    rendered_prior(found.path, 4)
 
 
 def test_photographs_of_several_sizes_and_of_grey_and_colour(tmp_path):
@@ -194,14 +194,14 @@ def test_photographs_of_several_sizes_and_of_grey_and_colour(tmp_path):
     grey = tmp_path / "photos" / "0.png"
     Image.open(grey).convert("L").save(grey)
     found = made(tmp_path)
-    model, batch = drawn(found.path, 4)
+    model, batch = rendered_prior(found.path, 4)
     assert model.canvas == (96, 128) and model.channels == 3 and batch.image.shape[2:] == (96, 128)
 
 
 def test_what_is_no_object_is_drawn_without_a_label(tmp_path):
     photographs(tmp_path)
     found = made(tmp_path, ignore=("disc",))
-    model, batch = drawn(found.path, 64)
+    model, batch = rendered_prior(found.path, 64)
     assert model.classes == ("big_Disc",) and "DIRT" in found.path.read_text()
     empty = (batch.kind < 0).all(1)
     assert empty.any() and float(batch.image[empty].float().amax((1, 2, 3)).max()) > 190
@@ -303,7 +303,7 @@ def test_labels_of_other_photographs(tmp_path):
 def test_models_and_classes_of_any_name(name, tmp_path):
     file = photographs(tmp_path, number=2)
     file.write_text(file.read_text().replace("Big Disc", f"{name} 1/2").replace('"disc"', f'"{name}"'))
-    model, _ = drawn(made(tmp_path, name).path, 2)
+    model, _ = rendered_prior(made(tmp_path, name).path, 2)
     assert len(model.classes) == 2
 
 
@@ -337,7 +337,7 @@ def test_real_cells(data_dir, tmp_path):
     (tmp_path / "labels.json").write_text(json.dumps(some))
     found = begin(source / "images", tmp_path / "labels.json", tmp_path / "model", progress=False)
     assert min(found.cutouts.values()) > 4
-    model, batch = drawn(found.path, 8)
+    model, batch = rendered_prior(found.path, 8)
     assert torch.isin(batch.kind, torch.tensor([-1, 0, 1])).all() and model.classes == ("dead", "live")
     with Image.open(found.path.parent / "cutouts.png") as sheet:
         assert sheet.size[0] > 500

@@ -13,7 +13,7 @@ import probscene as ps
 from probscene.app.detectors.folder import RECORD, WEIGHTS, TrainedDetector
 from probscene.app.detectors.train import CHECKPOINT, train
 from probscene.app.fitting.run import RunFolder
-from probscene.app.trial.cut_out import model_file
+from probscene.app.trial.begun_photographs import model_file
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.trial import GeneratedSets, TrainingBudget, TrialOptions, trial
 from probscene.decoding import read_rgb
