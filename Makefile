@@ -4,6 +4,8 @@ BENCHMARKS := $(shell grep -l '^def main' benchmarks/*.py)
 BIN := .venv/bin
 STAMP := .venv/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Python keeps what it has compiled, even where the environment says otherwise: a hundred processes import the library.
+export PYTHONDONTWRITEBYTECODE :=
 
 install: $(STAMP)
 	@:
@@ -21,7 +23,7 @@ $(BIN)/python:
 $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 	@echo "Installing into .venv; the first time this downloads about 3 GB and takes a few minutes."
 	@$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[test]'
+	@$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --no-build-isolation --editable '.[test]'
 	@touch $@
 
 demo: install
@@ -40,18 +42,16 @@ docs: install
 
 # Runs the tutorial's code and writes its output and pictures into the page.
 tutorial: install
-	@OMP_NUM_THREADS=1 $(BIN)/python docs/run_page.py docs/tutorial.md
+	@OMP_NUM_THREADS=1 $(BIN)/python docs/run_page.py docs/tutorials/own_model.md
 
 test: install
 	@$(MAKE) --no-print-directory --jobs 3 pytest lint docs
 
 # One thread a process: two processes with one thread each are faster than one with two. Without xdist's own order, in
-# which files of few tests come last, however long these take. Python keeps what it has compiled even where the
-# environment says otherwise: a hundred processes import the library.
+# which files of few tests come last, however long these take. Three for two cores: tests of clusters mostly wait.
 pytest: export OMP_NUM_THREADS := 1
-pytest: export PYTHONDONTWRITEBYTECODE :=
 pytest: install
-	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest --quiet --numprocesses 3 --dist loadfile --no-loadscope-reorder
 
 # An evening's worth. MNIST's files for the benchmarks that need them: make benchmark MNIST=FOLDER
 # Two at a time, for what is learnt and not for speed: make --jobs 2 benchmark. A script that fails does not stop others.

@@ -1,11 +1,11 @@
 """Runs the Python of a documentation page, in order and in one namespace, in an empty folder.
 
-    python docs/run_page.py docs/tutorial.md            # writes the output and the pictures into the page
-    python docs/run_page.py docs/tutorial.md --check    # compares them; numbers may differ, words and lines may not
+    python docs/run_page.py docs/tutorials/own_model.md            # writes output and pictures into the page
+    python docs/run_page.py docs/tutorials/own_model.md --check    # compares all but numbers
 
 A fence that opens with ``python`` is run; ``python NAME.py`` is written to that file instead. A ``text`` fence that
-follows it holds what it printed. A picture of the page, ``pictures/NAME.png``, is the ``NAME.png`` that the code wrote,
-if it wrote one. Fences of other languages, ``py`` among them, are only shown.
+follows it holds what it printed. A picture of the page, ``docs/pictures/NAME.png``, is the ``NAME.png`` that the code
+wrote, if it wrote one. Fences of other languages, ``py`` among them, are only shown.
 """
 
 import argparse
@@ -57,11 +57,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         os.environ["PROBSCENE_CACHE"] = f"{folder}/cache"
         after = run(before)
-        pictures = [Path(name) for name in re.findall(r"\(pictures/([\w-]+\.png)\)", before) if Path(name).is_file()]
+        pictures = [Path(name) for name in re.findall(r"pictures/([\w-]+\.png)\)", before) if Path(name).is_file()]
         if not args.check:
             for picture in pictures:
-                os.makedirs(path.parent / "pictures", exist_ok=True)
-                shutil.copy(picture, path.parent / "pictures" / picture)
+                shutil.copy(picture, Path(__file__).parent / "pictures" / picture)
             path.write_text(after, encoding="utf-8")
             return 0
     lines = difflib.unified_diff(without_numbers(before), without_numbers(after), "page", "run", lineterm="", n=0)

@@ -132,17 +132,17 @@ def test_stabilised_costs_are_those_of_transformed_counts(kind):
     assert not torch.allclose(stabilised(generated, real), plain(generated, real))
 
 
-@pytest.mark.parametrize(("N", "L"), [(40, 800), (800, 40)])
+@pytest.mark.parametrize(("N", "L"), [(40, 400), (400, 40)])
 def test_equal_sizes_take_away_the_bias_of_thin_tails(N, L):
     """Of two samples of one distribution: the mean log ratio where it has a twentieth of its mass."""
     torch.manual_seed(0)
 
     def bias(ratio):
         found = []
-        for _ in range(300):
+        for _ in range(200):
             generated, real = torch.rand(N, 1).log().neg(), torch.rand(L, 1).log().neg()
             found.append(ratio(generated, real)[(generated > 3)[:, 0]].sum() / N)
-        return float(torch.stack(found).mean()), float(torch.stack(found).std()) / 300**0.5
+        return float(torch.stack(found).mean()), float(torch.stack(found).std()) / 200**0.5
 
     (plain, _), (equal, error) = (bias(KDELogRatio(0.1, None, equal_sizes=equal)) for equal in (False, True))
     assert abs(equal) < 4 * error < abs(plain) / 2

@@ -255,7 +255,7 @@ class RemotePlace:
             raise MachineError(
                 f"expected to read and write {self.address}, got {type(error).__name__}: "
                 f"{str(error).splitlines()[0] if str(error) else 'nothing more is known'}. See that the place exists, "
-                "and that this machine has the rights; docs/formats.md says where they are looked for."
+                "and that this machine has the rights; docs/how_to/formats.md says where they are looked for."
             ) from error
 
 

@@ -135,7 +135,7 @@ def _cells(run: RunFolder, net: FeatureNet, images: Tensor) -> Tensor | None:
     if len(shape) != 4 or shape[:2] != (len(images), len(classes)) or not (found >= 0).all():
         raise ModelError(
             f"expected of {type(own).__name__}.cells numbers that are not negative ({len(images)}, {len(classes)}, h, "
-            f"w), got {shape}; see docs/extending.md."
+            f"w), got {shape}; see docs/how_to/own_parts.md."
         )
     return found[:, [classes.index(name) for name in names]]
 

@@ -162,7 +162,7 @@ def test_the_check_draws_again_in_another_order(model, call):
 
 
 def test_the_page_says_what_a_fit_has_drawn():
-    page = (HERE.parents[2] / "docs" / "generators.md").read_text(encoding="utf-8")
+    page = (HERE.parents[2] / "docs" / "how_to" / "generators.md").read_text(encoding="utf-8")
     quick = preset("quick")
     for chosen in (quick, quick.set("parameters=none"), quick.for_photographs()):
         features, training = chosen.make_features().images, chosen.structure
@@ -256,7 +256,7 @@ def test_what_a_program_printed_stands_below_the_message_line_by_line(copied, ca
 
 
 def test_the_page_on_generators_is_a_model_and_its_program(tmp_path, call):
-    page = (HERE.parents[2] / "docs" / "generators.md").read_text(encoding="utf-8")
+    page = (HERE.parents[2] / "docs" / "how_to" / "generators.md").read_text(encoding="utf-8")
     model, draw = re.findall(r"^```py\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (tmp_path / "model.py").write_text(model)
     (tmp_path / "draw.py").write_text(draw)

@@ -22,7 +22,7 @@ def test_the_e_value_has_a_mean_of_at_most_one_under_the_prior():
     for part in net.parameters():
         torch.nn.init.normal_(part, 0, 0.25)
     e = []
-    for _ in range(400):
+    for _ in range(250):
         values = read(torch.rand(1, 3, 2), torch.rand(1, 1), 0.1)
         e.append(log_e_values(net, values, particles=4).exp())
     e = torch.stack(e)
@@ -50,5 +50,5 @@ def test_sites_that_have_the_prior_are_not_learnt_and_others_are():
         return read(u[:, 1:], u[:, 0], 0.1)
 
     net = ParameterNet(1, 5, 5, hidden=16)
-    StochasticEM(net, images(400), 150, learning_rate=1e-2).run()
-    assert significant(log_e_values(net, images(150))).tolist() == [True, True, False, False, True] * 2
+    StochasticEM(net, images(250), 120, learning_rate=1e-2).run()
+    assert significant(log_e_values(net, images(120))).tolist() == [True, True, False, False, True] * 2
