@@ -12,7 +12,7 @@ read from the places is a choice for each class (``reading``), one for renders a
 Renders need not be read: their labels say how much of each object can be seen. The unit of a count is the bandwidth
 of a density of all counts, each in its standard deviations. Things and stuff are blocks (``Blockwise``): stuff is
 counted so that it is not mistaken for things, and is not compared, as in photographs a wood has no definite number of
-trees (``docs/results.md`` has what happens if it is).
+trees (``docs/experiments.md`` has what happens if it is).
 
 Axis letters: N images, C classes, h w places, S scopes, R rules, V renders that nothing is trained on.
 """
