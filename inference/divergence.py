@@ -61,8 +61,8 @@ class KDELogRatio:
     the distributions agree.
 
     The density of the smaller sample comes out too low where it is thin. With many more real than generated scenes, a
-    list with a long tail is therefore learnt longer than the target's, unless ``equal_sizes``. ``docs/experiments.md`` has
-    measurements of both.
+    list with a long tail is therefore learnt longer than the target's, unless ``equal_sizes``.
+    ``docs/experiments.md`` has measurements of both.
 
     Args:
         variance: of the joint kernel, in squared units of what is compared; None is the paper's ``H = d I``, the

@@ -9,7 +9,8 @@ with bilinear antialiasing and without a crop, because objects at the edge count
 network's training; the last feature map is averaged over all places. An image enters with its own shape and about as
 many pixels as the square that the network was trained on, rounded to the network's steps (``_Frozen.entering``): a
 street of 1242 x 375 enters as 416 x 128 where the square has 224. FID usually squashes images to the square instead,
-which makes everything in a street a third as wide and the features less informative (measured in ``docs/experiments.md``).
+which makes everything in a street a third as wide and the features less informative (measured in
+``docs/experiments.md``).
 
 References:
     [1] Tan, Le, *EfficientNet*, ICML 2019, in its Lite form; weights converted from TensorFlow's, Apache licence.

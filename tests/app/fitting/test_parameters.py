@@ -226,7 +226,8 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
         "structure.batches": 4,
         "structure.num_scenes": 60,
     }
-    settings |= {"pretrain.derivations": 300, "parameters.reader_steps": 200, "parameters.steps": 120}
+    settings |= {"pretrain.derivations": 300}
+    settings |= {"parameters.reader_steps": 200, "parameters.reader_images": 6, "parameters.steps": 120}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 30, "parameters.round_steps": 40}
     settings |= {"refine.batches": 2}
     config = preset("quick").set("features=count", settings)
