@@ -1,4 +1,4 @@
-"""Up to five digits from 0 to 4 on a canvas of 128 pixels: Multi-MNIST at the size of a demo, which learns in a minute.
+"""Up to five digits from 0 to 4 on a canvas of 96 pixels: Multi-MNIST at the size of a demo, which learns in a minute.
 
 The prior scatters and turns them; the target is one upright row, with a random distribution of numbers and of digits.
 """
@@ -25,9 +25,9 @@ GRAMMAR = Grammar("""
 """)
 CLASSES = tuple("01234")
 MOST = 5
-CANVAS = 128
+CANVAS = 96
 MAX_STEPS = 20
-SCALE = 0.75  # of a glyph of 28 pixels, so that five stand in a row
+SCALE = 0.6  # of a glyph of 28 pixels, so that five stand in a row
 TURN = math.radians(30)
 MARGIN = math.ceil(SCALE * SIZE / 2 * (math.cos(TURN) + math.sin(TURN)))  # a turned glyph stays on the canvas
 

@@ -32,6 +32,7 @@ from .modules import import_file
 
 BUILT_IN = {
     "multi_mnist": "probscene.models.multi_mnist",
+    "small_digits": "probscene.models.small_digits",
     "aerial2d": "probscene.models.aerial2d",
     "driving": "probscene.models.driving",
     "driving_simple": "probscene.models.driving_simple",
