@@ -23,6 +23,7 @@ from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
 from ..files import make_folder, write_text, write_whole
+from ..style import style_sheet
 from .counts import write_cells
 from .naming import printable
 
@@ -122,6 +123,7 @@ def page(
     return Template(
         resources.files("probscene.app.labels").joinpath("sheet.html").read_text(encoding="utf-8")
     ).substitute(
+        style=style_sheet(),
         title=html.escape(f"Count in {len(names)} pictures: {model}"),
         classes=html.escape(", ".join(classes)),
         before=f"{len(before)} pictures that were labelled before are in the file, too." if before else "",
