@@ -40,7 +40,7 @@ def picture(results: Results) -> Figure:
     images, seeds = results.counts["test_images"], results.counts["seeds"]
     words = (
         f"average precision in %, {images} test images, {seeds} seed{'s' * (seeds != 1)}; "
-        "lines: 95 % of resamples; dark: photographs alone"
+        "lines: 95\N{NO-BREAK SPACE}% of resamples; dark: photographs alone"
     )
     figure.supxlabel(textwrap.fill(words, int(CHARACTERS_AN_INCH * size[0])), fontsize=8, color=INK)
     return figure
@@ -58,7 +58,7 @@ def _panel(axes: Axes, results: Results, column: Column) -> None:
     axes.set_ylim(len(results.rows) - 0.5, -0.5)
     axes.grid(axis="x", color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.tick_params(length=0, labelsize=8, colors=INK)
+    axes.tick_params(length=0, labelsize=8, colors=INK, pad=6)
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set_color(FAINT)
     axes.margins(x=0.06)

@@ -34,8 +34,8 @@ VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" fo
 SITE_COLOURS = {"prior": "prior", "learnt": "learnt", "target": "truth"}  # by what a site is read in
 MAX_DENSITY = 6.0  # of a histogram over u, times the prior's density
 MIN_SHARE = 1e-3  # that is a pixel high
-WIDE, NARROW = (9.6, 2.9), (4.6, 2.5)  # inches
-MAX_NARROW_BARS = 60  # of a chart; with more it is wide
+WIDE, NARROW = (12.0, 3.0), (4.6, 2.5)  # inches
+MAX_NARROW_BARS = 120  # of a chart; with more it is wide
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text, in the page's font
     "font.family": "sans-serif",
@@ -206,7 +206,7 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def _chart(figure: Figure, wide: bool = False) -> str:
-    return f'<div class="chart{" wide" * wide}">{_svg(figure)}</div>'
+    return f'<div class="chart{" wide scroll" * wide}">{_svg(figure)}</div>'
 
 
 def _svg(figure: Figure) -> str:

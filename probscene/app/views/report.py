@@ -36,13 +36,13 @@ from .markup import folded, paragraphs, picture, table, text_table
 from .preview import scenes
 
 SITES = (
-    "Skill is the share of a site's variance that is read in renders. A site's value is given as its place in the "
-    "prior, 0 to 1. Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt "
-    "from; the noise floor is that of two halves of it."
+    "Skill is the share of a site's variance that can be read in renders. Values are quantiles of the prior, 0 to 1. "
+    "Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt from; the noise "
+    "floor is the distance between two halves of them."
 )
 QUANTILES, QUANTILE_SCENES = (0.05, 0.5, 0.95), 1000  # of a site of the scene
-VALUES = "Of sites of the scene the last columns have quantiles of their values, in the program's units."
-READINGS = "read in renders and target, 0 to 1"
+VALUES = "For sites of the whole scene, the last columns give quantiles of their values, in the program's units."
+READINGS = "read in renders\nand target, 0 to 1"
 OF_SITES = {
     "prior": "read in renders with the prior's parameters",
     "learnt": "with learnt parameters",
@@ -123,7 +123,7 @@ def write(
                 f"Run {run.path.resolve()}, {target}, seed {record['seed']}, version {record['version']}"
             ),
             images=_images(run, images),
-            absent="" if images else paragraphs([absent or "The target images were not read."]),
+            absent="" if images else paragraphs([f"No target images: {absent or 'they were not read.'}"]),
             verdict=_verdict(diagnostics) + paragraphs(evaluation.kept),
             legend=_legend({name: LEGEND[name] for name in evaluation.shown}),
             histograms=charts.numbers(evaluation) + charts.classes(evaluation),
@@ -173,8 +173,8 @@ def _about_histograms(evaluation: Evaluation) -> list[str]:
     notes = ["Lines on the bars are 95 % bootstrap intervals."]
     if ESTIMATE in evaluation.shown:
         notes.append(
-            "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; "
-            "its counts are rounded. It is compared with what the same network reads in renders."
+            "The estimate is not the truth: the feature network has seen renders of the prior only, and errs where "
+            "objects crowd; its counts are rounded. It is compared with what the same network reads in renders."
         )
     elif "truth" not in evaluation.shown:
         unread = ", ".join(evaluation.unread)
@@ -206,8 +206,8 @@ def _parts(found: FitDiagnostics | None, images: Images | None) -> str:
         return ""
     real = [pixels(images.load(i)[None])[0] for i in found.real_uncovered]
     pictures = [
-        picture(real, f"Target images least like any generated scene: {', '.join(found.names)}"),
-        picture(list(found.generated_uncovered), "Generated scenes least like any target image"),
+        picture(real, f"Target images least like any generated scene: {', '.join(found.names)}", 4),
+        picture(list(found.generated_uncovered), "Generated scenes least like any target image", 4),
     ]
     return verdict_text.details(found, pictures)
 

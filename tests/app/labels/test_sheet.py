@@ -128,6 +128,7 @@ def test_the_sheet_shows_what_the_model_sees(folder, tmp_path):
     assert not any("src" in each for each in read.all("script")) and not read.all("link")
     used = set(re.findall(r"var\(--(\w+)\)", sheet.page.read_text()))
     assert used and used <= LIGHT.keys() & DARK.keys()
+    assert "The file also holds 1 picture that was labelled before." in sheet.page.read_text()
     pictures = [base64.b64decode(each["src"].removeprefix("data:image/jpeg;base64,")) for each in read.all("img")]
     beside = sorted(path.name for path in (tmp_path / "out" / "images").iterdir())
     assert beside == ["a,1.png.jpg", "b&2.png.jpg", "d.png.jpg"]
