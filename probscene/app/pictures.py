@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from .files import write_whole
+from .style import LIGHT
 
 GAP = 2  # pixels between the images of a grid
 LINE = (96, 96, 96)
@@ -44,15 +45,15 @@ def colour_of(index: int, number: int) -> tuple[int, int, int]:
 def side_by_side(groups: dict[str, list[Pixels]], size: int = 128) -> Pixels:
     """A grid for each group under its caption, one beside the other; images are shrunk to ``size`` pixels."""
     grids = {caption: grid([shrunk(image, size) for image in images]) for caption, images in groups.items()}
-    margin, head = 16, 40
-    width = sum(g.shape[1] for g in grids.values()) + margin * (len(grids) + 1)
+    margin, head, font = 16, 40, ImageFont.load_default(20)
+    widths = [max(g.shape[1], math.ceil(font.getlength(caption))) for caption, g in grids.items()]
     height = max(g.shape[0] for g in grids.values()) + head + margin
-    sheet = Image.new("RGB", (width, height), (255, 255, 255))
-    draw, font, x = ImageDraw.Draw(sheet), ImageFont.load_default(20), margin
-    for caption, picture in grids.items():
-        draw.text((x, head - 10), caption, (20, 20, 20), font, anchor="ls")
+    sheet = Image.new("RGB", (sum(widths) + margin * (len(grids) + 1), height), LIGHT["paper"])
+    draw, x = ImageDraw.Draw(sheet), margin
+    for (caption, picture), width in zip(grids.items(), widths, strict=True):
+        draw.text((x, head - 10), caption, LIGHT["ink"], font, anchor="ls")
         sheet.paste(Image.fromarray(picture), (x, head))
-        x += picture.shape[1] + margin
+        x += width + margin
     return np.asarray(sheet)
 
 

@@ -145,9 +145,9 @@ def _judge(run: RunFolder, target: Images, scenes: int, out: Path, show: Display
     write_json(out / "evaluation.json", found.record() | {"trust": judged.record()})
     report.write(run, found, target, diagnostics=judged)
     sources = policies(run)
-    panels = {"Prior": PRIOR, "Structure alone": STRUCTURE, "Structure and parameters": LEARNT}
+    panels = {"Prior": PRIOR, "Structure alone": STRUCTURE, "Learnt": LEARNT}
     if STRUCTURE not in sources:
-        panels = {"Prior": PRIOR, "Learnt": LEARNT}
+        del panels["Structure alone"]
     pictures = {
         caption: pixels(preview(model, sources.get(name, model.prior), SAMPLES, 0).image)
         for caption, name in panels.items()

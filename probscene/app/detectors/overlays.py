@@ -22,7 +22,8 @@ def overlay(image: NDArray[np.uint8], found: Detections, classes: tuple[str, ...
         x0, y0, x1, y1 = map(float, box)
         colour, words = colour_of(int(number), len(classes)), f"{classes[number]} {score:.2f}"
         draw.rectangle((x0, y0, max(x0, x1 - 1), max(y0, y1 - 1)), outline=colour, width=2)
-        where, anchor = ((x0, y0 - 1), "ls") if y0 > size + 2 else ((x0, y1), "la")
+        x = max(0, min(x0, width - font.getlength(words)))
+        where, anchor = ((x, y0 - 1), "ls") if y0 > size + 2 else ((x, y1), "la")
         draw.rectangle(draw.textbbox(where, words, font, anchor), fill=(0, 0, 0))
         draw.text(where, words, colour, font, anchor)
     return np.asarray(picture)

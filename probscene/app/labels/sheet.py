@@ -23,6 +23,7 @@ from probscene.decoding import read_rgb
 from probscene.errors import DataError
 
 from ..files import make_folder, write_text, write_whole
+from ..style import style_sheet
 from .counts import write_cells
 from .naming import printable
 
@@ -114,7 +115,7 @@ def page(
     items = "".join(
         f'<section data-image="{html.escape(name)}"><a class="picture"><img alt="{html.escape(name)}" '
         f'src="data:image/jpeg;base64,{base64.b64encode(data).decode("ascii")}"></a><div class="counts">'
-        f"<h2>{number}. {html.escape(name)}</h2>{_inputs(name, classes)}</div></section>\n"
+        f"<h2>{number}. {_broken_at_underscores(name)}</h2>{_inputs(name, classes)}</div></section>\n"
         for number, (name, data) in enumerate(zip(names, pictures, strict=True), 1)
     )
     about = {"classes": classes, "before": before}
@@ -122,18 +123,30 @@ def page(
     return Template(
         resources.files("probscene.app.labels").joinpath("sheet.html").read_text(encoding="utf-8")
     ).substitute(
+        style=style_sheet(),
         title=html.escape(f"Count in {len(names)} pictures: {model}"),
         classes=html.escape(", ".join(classes)),
-        before=f"{len(before)} pictures that were labelled before are in the file, too." if before else "",
+        before=_labelled_before(len(before)) if before else "",
         items=items,
         about=json.dumps(about | {"key": f"probscene-{digest}"}).replace("<", "\\u003c"),
     )
 
 
+def _labelled_before(number: int) -> str:
+    pictures = f"{number} pictures that were" if number > 1 else "1 picture that was"
+    return f"The file also holds {pictures} labelled before."
+
+
+def _broken_at_underscores(text: str) -> str:
+    """Markup of a name whose line may break after any underscore."""
+    return html.escape(text).replace("_", "_<wbr>")
+
+
 def _inputs(name: str, classes: tuple[str, ...]) -> str:
     label = html.escape(name)
     return "".join(
-        f'<label>{html.escape(c)}<input type="text" inputmode="numeric" autocomplete="off" data-class="{number}" '
+        f"<label><span>{_broken_at_underscores(c)}</span>"
+        f'<input type="text" inputmode="numeric" autocomplete="off" data-class="{number}" '
         f'aria-label="{html.escape(c)} in {label}"></label>'
         for number, c in enumerate(classes)
     )

@@ -34,7 +34,8 @@ VARIABLES = {INK: "var(--ink)", FAINT: "var(--faint)"} | {c: f"var(--{name})" fo
 SITE_COLOURS = {"prior": "prior", "learnt": "learnt", "target": "truth"}  # by what a site is read in
 MAX_DENSITY = 6.0  # of a histogram over u, times the prior's density
 MIN_SHARE = 1e-3  # that is a pixel high
-WIDE, NARROW = (9.6, 2.9), (5.6, 2.5)  # inches
+WIDE, NARROW = (12.0, 3.0), (4.6, 2.5)  # inches
+MAX_NARROW_BARS = 120  # of a chart; with more it is wide
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text, in the page's font
     "font.family": "sans-serif",
@@ -78,12 +79,12 @@ def nested(evaluation: Evaluation) -> list[str]:
         return charts
     for c, kind in enumerate(evaluation.classes):
         each = {name: source.kinds[c].histogram() for name, source in sources.items()}
-        charts.append(_counts(each, f"{kind} per image", "share of images", kind, NARROW))
+        charts.append(_counts(each, f"{kind} per image", "share of images", kind))
     for what, tallies in nested_counts(sources, evaluation.classes).items():
         each = {name: found.histogram() for name, found in tallies.items()}
         if len(each) > 1:
             share = "share of images" if what.endswith("per image") else "share"
-            charts.append(_counts(each, what, share, what, NARROW))
+            charts.append(_counts(each, what, share, what))
     return charts
 
 
@@ -127,18 +128,17 @@ def curves(log: list[dict]) -> list[str]:
     return charts
 
 
-def _counts(each: dict[str, Histogram], x: str, y: str, salt: str, size: tuple[float, float] = WIDE) -> str:
+def _counts(each: dict[str, Histogram], x: str, y: str, salt: str) -> str:
     """Shares by count, up to the last that can be seen."""
     bins = 1 + max(int(np.flatnonzero(found.share >= MIN_SHARE).max(initial=0)) for found in each.values())
     each = {name: Histogram(*(x[:bins] for x in found)) for name, found in each.items()}
-    return _bars(each, range(bins), x, y, salt, size)
+    return _bars(each, range(bins), x, y, salt)
 
 
-def _bars(
-    each: dict[str, Histogram], bins: Sequence[int | str], x: str, y: str, salt: str, size: tuple[float, float] = WIDE
-) -> str:
+def _bars(each: dict[str, Histogram], bins: Sequence[int | str], x: str, y: str, salt: str) -> str:
+    wide = len(each) * len(bins) > MAX_NARROW_BARS
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt, "axes.grid": True}):
-        figure, axes = _figure(*size)
+        figure, axes = _figure(*(WIDE if wide else NARROW))
         width = 0.82 / len(each)
         for i, (name, found) in enumerate(each.items()):
             at = np.arange(len(found.share)) + (i - (len(each) - 1) / 2) * width
@@ -152,7 +152,7 @@ def _bars(
         axes.tick_params(length=0)
         figure.draw_without_rendering()  # which lays it out
         label_bins(axes, bins)
-        return _svg(figure)
+        return _chart(figure, wide)
 
 
 def label_bins(axes: Axes, bins: Sequence[int | str]) -> None:
@@ -182,7 +182,7 @@ def _curve(
     title: str, x: str, at: np.ndarray, value: np.ndarray, spread: np.ndarray | None = None, log: bool = False
 ) -> str:
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": title, "axes.grid": True}):
-        figure, axes = _figure(3.8, 2.1)
+        figure, axes = _figure(*NARROW)
         if spread is not None:
             axes.fill_between(at, value - spread, value + spread, color=SOURCES["learnt"], alpha=0.15, linewidth=0)
         axes.plot(at, value, color=SOURCES["learnt"], linewidth=1.6)
@@ -197,12 +197,16 @@ def _curve(
         axes.set_title(title)
         axes.set_xlabel(x)
         axes.tick_params(length=0)
-        return _svg(figure)
+        return _chart(figure)
 
 
 def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     figure = Figure((width, height), layout="constrained")
     return figure, figure.add_subplot()
+
+
+def _chart(figure: Figure, wide: bool = False) -> str:
+    return f'<div class="chart{" wide scroll" * wide}">{_svg(figure)}</div>'
 
 
 def _svg(figure: Figure) -> str:

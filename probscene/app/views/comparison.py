@@ -14,11 +14,12 @@ from ..evaluation.compare import TRUTH, Comparison, Row
 from ..evaluation.sources import ESTIMATE, PRIOR, START
 from ..evaluation.structure_counts import ALL, OTHERS, group_label
 from ..files import make_folder, write_whole
+from ..style import LIGHT
 from .charts import label_bins
 
-COLOURS = {PRIOR: "#9aa3ad", START: "#8e7cc3", TRUTH: "#30363d", ESTIMATE: "#30363d"}
-RUNS = ("#2b7bba", "#e07b39", "#3a9a5b", "#b04f9e", "#c9a227", "#5c6bc0")
-INK, FAINT = "#1f2328", "#d0d7de"
+COLOURS = {name: LIGHT[name] for name in (PRIOR, START, TRUTH, ESTIMATE)}
+RUNS = (LIGHT["learnt"], "#b04f9e", "#0f8b8d", "#c9a227", "#8c564b", "#6b8e23")
+INK, FAINT = LIGHT["ink"], LIGHT["faint"]
 CLASSES = "class of an object"  # the row of ``Comparison.shares_of_classes``
 MAX_CLASS_ROWS = 4  # more classes share one row
 MIN_SHARE = 2e-3  # that is a pixel high
@@ -103,7 +104,7 @@ def _cell(axes: Axes, row: Row, name: str, reference: str | None, colour: str, b
         axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center", va="center", fontsize=8, color=INK)
     if known is not None and reference is not None and name != reference:
         outline = np.pad(known, (0, max(0, bins - len(known))))[:bins]
-        axes.stairs(outline, np.arange(bins + 1) - 0.5, color=COLOURS[reference], linewidth=1.0)
+        axes.stairs(outline, np.arange(bins + 1) - 0.5, color=INK, linewidth=1.0)
     axes.set_xlim(-0.7, bins - 0.3)
     axes.set_ylim(0, 1.05 * highest)
     axes.set_yticks([])

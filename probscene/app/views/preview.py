@@ -85,6 +85,6 @@ def labelled(image: Pixels, batch: RenderBatch, i: int, model: SceneModel) -> Pi
         colour = colour_of(model.classes.index(name), len(model.classes))
         x0, y0, x1, y1 = box
         draw.rectangle((x0, y0, x1 - 1, y1 - 1), outline=colour)
-        above = y0 > size + 2
-        draw.text((x0, y0 - 1 if above else y1), name, colour, font, anchor="ls" if above else "la")
+        above, x = y0 > size + 2, max(0, min(x0, picture.width - font.getlength(name)))
+        draw.text((x, y0 - 1 if above else y1), name, colour, font, anchor="ls" if above else "la")
     return np.asarray(picture)

@@ -1,8 +1,6 @@
-"""``probscene report``: one self-contained HTML page about a run: samples, histograms, curves, configuration."""
+"""``probscene report``: one self-contained HTML page about a run: images, verdict, histograms, the rest folded."""
 
-import base64
 import html
-import io
 import json
 from importlib import resources
 from pathlib import Path
@@ -10,12 +8,12 @@ from string import Template
 from typing import Any
 
 import torch
-from PIL import Image
 from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import DataError, RunError
 from probscene.inference.parameters.sites import site_name
+from probscene.policy import Policy
 from probscene.sampling import sample
 from probscene.threads import threads
 
@@ -24,25 +22,27 @@ from ..evaluation.diagnose import FitDiagnostics, diagnose
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.labels import TargetLabels
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
-from ..evaluation.sources import ESTIMATE, READ, START
+from ..evaluation.sources import ESTIMATE, READ, START, baseline_policies
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
 from ..fitting.pipeline import open_target
 from ..fitting.run import RunFolder
 from ..fitting.store import OTHER, timing
-from ..pictures import Pixels, grid, pixels, shrunk
+from ..pictures import pixels
 from ..progress import STAGES, Display
+from ..style import style_sheet
 from . import charts, tables, verdict_text
+from .markup import folded, paragraphs, picture, table, text_table
 from .preview import scenes
 
-IMAGES_PER_ROW = 8
 SITES = (
-    "Skill is the share of a site's variance that is read in renders. A site's value is given as its place in the "
-    "prior, 0 to 1. Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt "
-    "from; the noise floor is that of two halves of it."
+    "Skill is the share of a site's variance that can be read in renders. Values are quantiles of the prior, 0 to 1. "
+    "Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt from; the noise "
+    "floor is the distance between two halves of them."
 )
 QUANTILES, QUANTILE_SCENES = (0.05, 0.5, 0.95), 1000  # of a site of the scene
-VALUES = "Of sites of the scene the last columns have quantiles of their values, in the program's units."
+VALUES = "For sites of the whole scene, the last columns give quantiles of their values, in the program's units."
+READINGS = "read in renders\nand target, 0 to 1"
 OF_SITES = {
     "prior": "read in renders with the prior's parameters",
     "learnt": "with learnt parameters",
@@ -52,9 +52,9 @@ LEGEND = {
     "prior": "prior",
     START: "initialisation: the policy that the guide was pretrained on",
     "learnt": "learnt",
-    "truth": "truth (labels)",
-    READ: "read: what the feature network counts in learnt renders",
-    ESTIMATE: "estimate: what it counts in the target's images, without labels",
+    "truth": "target, truth (labels)",
+    READ: "learnt, read: what the feature network counts in learnt renders",
+    ESTIMATE: "target, estimate: what it counts in the target's images, without labels",
 }
 
 
@@ -117,79 +117,123 @@ def write(
     write_text(
         out,
         page.substitute(
+            style=style_sheet(),
             title=html.escape(f"probscene: {model.name}"),
             subtitle=html.escape(
                 f"Run {run.path.resolve()}, {target}, seed {record['seed']}, version {record['version']}"
             ),
-            trust=_verdict(diagnostics, images),
-            headline=_headline(evaluation),
-            samples=_samples(run, images, absent),
-            sites=_sites(run),
+            images=_images(run, images),
+            absent="" if images else paragraphs([f"No target images: {absent or 'they were not read.'}"]),
+            verdict=_verdict(diagnostics) + paragraphs(evaluation.kept),
             legend=_legend({name: LEGEND[name] for name in evaluation.shown}),
-            numbers=charts.numbers(evaluation),
-            classes=charts.classes(evaluation),
-            nested=_nested(evaluation),
-            figures=_figures(evaluation),
-            note=_note(evaluation),
-            curves="".join(f'<div class="chart card">{chart}</div>' for chart in charts.curves(_log(run))),
-            grammar=html.escape(str(model.grammar)),
-            timing=_timing(run),
-            configuration=_table(["setting", "value"], _flat(record)),
+            histograms=charts.numbers(evaluation) + charts.classes(evaluation),
+            note=" ".join(_about_histograms(evaluation)),
+            details=_details(run, evaluation, images, diagnostics),
         ),
     )
     return out
 
 
-def _verdict(found: FitDiagnostics | None, images: Images | None) -> str:
-    if found is None or images is None:
+def _images(run: RunFolder, target: Images | None) -> str:
+    """A grid of images of each source, the target's last."""
+    height, width = run.model.canvas
+    number, columns = (8, 2) if width > 1.5 * height else (9, 3)
+    parts = [
+        picture(pixels(scenes(run.model, policy, number, 0).image), caption, columns)
+        for caption, policy in _sources(run).items()
+    ]
+    if target is not None:
+        spread = torch.linspace(0, len(target) - 1, min(number, len(target))).long().tolist()
+        parts.append(picture([pixels(target.load(i)[None])[0] for i in spread], "Target: some of the images", columns))
+    return "\n".join(parts)
+
+
+def _sources(run: RunFolder) -> dict[str, Policy]:
+    """What scenes are drawn of, by the caption of their picture, in the order of a fit."""
+    found, baselines = policies(run), baseline_policies(run.model)
+    kept = PRIOR not in found
+    shown = {"Prior: kept by this fit" if kept else "Prior: before learning": baselines[PRIOR]}
+    if START in baselines:
+        shown["Initialisation: the policy that the guide was pretrained on"] = baselines[START]
+    if STRUCTURE in found:
+        shown["Structure alone: learnt structure, the prior's parameters"] = found[STRUCTURE]
+        shown["Learnt: structure and parameters"] = found[LEARNT]
+    elif not kept:
+        shown["Learnt: structure; parameters keep the prior"] = found[LEARNT]
+    return shown
+
+
+def _verdict(found: FitDiagnostics | None) -> str:
+    if found is None:
         return "<p>There is no verdict: no scenes were rendered to compare with target images.</p>"
-    if found.structure is None:
-        return verdict_text.section(found, "", "")
-    real = [pixels(images.load(i)[None])[0] for i in found.real_uncovered]
-    return verdict_text.section(
-        found,
-        _picture(real, f"Target images least like any generated scene: {', '.join(found.names)}"),
-        _picture(list(found.generated_uncovered), "Generated scenes least like any target image"),
+    return verdict_text.sentence(found)
+
+
+def _about_histograms(evaluation: Evaluation) -> list[str]:
+    notes = ["Lines on the bars are 95 % bootstrap intervals."]
+    if ESTIMATE in evaluation.shown:
+        notes.append(
+            "The estimate is not the truth: the feature network has seen renders of the prior only, and errs where "
+            "objects crowd; its counts are rounded. It is compared with what the same network reads in renders."
+        )
+    elif "truth" not in evaluation.shown:
+        unread = ", ".join(evaluation.unread)
+        why = f"{unread} cannot be read in its images" if unread else "there are neither labels nor an estimate"
+        notes.append(f"The target has no bars: {html.escape(why)}.")
+    return notes
+
+
+def _details(run: RunFolder, evaluation: Evaluation, images: Images | None, diagnostics: FitDiagnostics | None) -> str:
+    """Everything else, folded."""
+    nested, curves = "".join(charts.nested(evaluation)), "".join(charts.curves(_log(run)))
+    return "".join(
+        [
+            folded("Verdict by parts", _parts(diagnostics, images)),
+            folded(f"Warnings ({len(evaluation.warnings)})", paragraphs(evaluation.warnings)),
+            folded("Distances", _distances(evaluation)),
+            folded("Histograms by what counts depend on", f'<div class="charts">{nested}</div>' if nested else ""),
+            folded("Sites: where things stand and how they look", _sites(run)),
+            folded("Learning curves", f'<div class="charts">{curves}</div>' if curves else ""),
+            folded("Grammar", f"<pre>{html.escape(str(run.model.grammar))}</pre>"),
+            folded("Times", _timing(run)),
+            folded("Configuration", text_table(["setting", "value"], _flat(run.record))),
+        ]
     )
 
 
-def _headline(evaluation: Evaluation) -> str:
-    rows = []
-    for b, found in evaluation.distances().items():
+def _parts(found: FitDiagnostics | None, images: Images | None) -> str:
+    if found is None or images is None or found.structure is None:
+        return ""
+    real = [pixels(images.load(i)[None])[0] for i in found.real_uncovered]
+    pictures = [
+        picture(real, f"Target images least like any generated scene: {', '.join(found.names)}", 4),
+        picture(list(found.generated_uncovered), "Generated scenes least like any target image", 4),
+    ]
+    return verdict_text.details(found, pictures)
+
+
+def _distances(evaluation: Evaluation) -> str:
+    """The distances before and after learning, then every table of the evaluation that the charts do not hold."""
+    cards = []
+    for b, measured in evaluation.distances().items():
         to = "to the truth" if b == "truth" else "to the network's estimate"
         for key, what in (("number", "number of objects"), ("classes", "classes")):
-            figures = " → ".join(_figure(distances[key]) for distances in found.values())
-            rows.append(f'<div class="card">{what}, {to}<b>{figures}</b></div>')
-    warnings = "".join(f"<p>{html.escape(text)}</p>" for text in (*evaluation.kept, *evaluation.warnings))
-    if not rows:
-        return f"<p>There are neither labels nor an estimate to compare with.</p>{warnings}"
-    initialisation = ", of the initialisation" if START in evaluation.sources else ""
-    note = f"Total variation: of the prior{initialisation}, and of what was learnt."
-    return f'<div class="row tiles">{"".join(rows)}</div><p class="soft">{note}</p>{warnings}'
-
-
-def _samples(run: RunFolder, images: Images | None, absent: str) -> str:
-    """A row of images of each source."""
-    found = policies(run)
-    order = [name for name in (PRIOR, STRUCTURE, LEARNT) if name in found]
-    rows = {name: pixels(scenes(run.model, found[name], IMAGES_PER_ROW, 0).image) for name in order}
-    parts = [_picture(pictures, source_caption(run, name), IMAGES_PER_ROW) for name, pictures in rows.items()]
-    if images is None:
-        return "".join([*parts, f"<p>{html.escape(absent or 'The target images were not read.')}</p>"])
-    spread = torch.linspace(0, len(images) - 1, min(IMAGES_PER_ROW, len(images))).long().tolist()
-    some = [pixels(images.load(i)[None])[0] for i in spread]
-    return "".join([*parts, _picture(some, "Target: some of the images", IMAGES_PER_ROW)])
-
-
-def source_caption(run: RunFolder, source: str) -> str:
-    """What a source of scenes is, in words."""
-    if source == LEARNT and STRUCTURE in policies(run):
-        return "Structure and parameters: all that was learnt"
-    return {
-        PRIOR: "Prior: before learning",
-        STRUCTURE: "Structure alone: learnt structure, the prior's parameters",
-        LEARNT: "Learnt: structure; parameters keep the prior",
-    }[source]
+            figures = " → ".join(_figure(distances[key]) for distances in measured.values())
+            cards.append(f'<div class="card">{what}, {to}<b>{figures}</b></div>')
+    parts = ["<p>There are neither labels nor an estimate to compare with.</p>"]
+    if cards:
+        initialisation = ", of the initialisation" if START in evaluation.sources else ""
+        note = f"Total variation: of the prior{initialisation}, and of what was learnt."
+        parts = [f'<div class="cards">{"".join(cards)}</div><p class="soft">{note}</p>']
+    compared = *tables.distances(evaluation, spread=True), *tables.nested(evaluation, spread=True)
+    for found in (*compared, *tables.errors(evaluation), *tables.likelihoods(evaluation), *tables.images(evaluation)):
+        head = [str(column.header).replace(" *", "") for column in found.columns]
+        rows = zip(*(map(str, column.cells) for column in found.columns), strict=True)
+        parts.append(f"<h3>{html.escape(str(found.title).replace(' *', ''))}</h3>{text_table(head, rows)}")
+        if found.caption:
+            parts.append(f'<p class="soft">{html.escape(str(found.caption))}</p>')
+    notes = *(f"Note: {note}" for note in evaluation.notes), *(f"Read: {line}" for line in evaluation.readings)
+    return "\n".join([*parts, paragraphs(notes)])
 
 
 def _sites(run: RunFolder) -> str:
@@ -199,18 +243,16 @@ def _sites(run: RunFolder) -> str:
         return "<p>Parameters were not learnt: where things stand and how they look keeps the prior.</p>"
     sites, values = record["sites"], scene_values(run)
     is_read = any(site["skill"] is not None or "read" in site for site in sites)
-    head = ["site", "of", ""]
-    head += ["skill", "prior", "this fit", "noise floor", "read in renders and target, 0 to 1"] if is_read else []
+    head = ["site", "of", "parameters"]
+    head += ["skill", "distance\nprior", "distance\nthis fit", "noise\nfloor", READINGS] if is_read else []
     head += [f"{name}: {', '.join(f'{q:.0%}' for q in QUANTILES)}" for name in ("prior", "learnt")] if values else []
     rows = []
     for site in sites:
         what = f"keeps the prior: {site['because']}"
         if site["learnt"]:
             what = "learnt" if record["kept"] == "learnt" else "learnt, and not kept"
-        cells = [
-            html.escape(cell)
-            for cell in (site["name"], ", ".join(site["kinds"]) or "the scene" * (site["name"] in values), what)
-        ]
+        of = ", ".join(site["kinds"]) or "the scene" * (site["name"] in values)
+        cells = [html.escape(site["name"]), html.escape(of), f"<p>{html.escape(what)}</p>"]
         read = site.get("read")
         if is_read:
             distances = [_figure(read["distance"][key]) for key in ("prior", "learnt", "floor")] if read else ["–"] * 3
@@ -219,13 +261,11 @@ def _sites(run: RunFolder) -> str:
         if values:
             before, after = values.get(site["name"], (None, None))
             cells += [_numbers(before), _numbers(after if site["learnt"] else None)]
-        rows.append("".join(f"<td>{cell}</td>" for cell in cells))
-    first = "".join(f"<th>{name}</th>" for name in head)
-    body = "".join(f"<tr>{row}</tr>" for row in rows)
+        rows.append(cells)
     kept = _not_kept(record) if any(site["learnt"] for site in sites) and record["kept"] != "learnt" else ""
     legend = f'<p class="legend">{_legend(OF_SITES)}</p>' if is_read else ""
     notes = " ".join([*([SITES] if is_read else []), *([VALUES] if values else [])])
-    return f'{kept}{legend}<div class="chart"><table><tr>{first}</tr>{body}</table></div><p class="soft">{notes}</p>'
+    return f'{kept}{legend}{table(head, rows, "sites")}<p class="soft">{notes}</p>'
 
 
 def scene_values(run: RunFolder) -> dict[str, tuple[list[float], list[float] | None]]:
@@ -266,47 +306,6 @@ def _legend(words: dict[str, str]) -> str:
     )
 
 
-def _picture(images: list[Pixels], caption: str, columns: int | None = None) -> str:
-    data = io.BytesIO()
-    Image.fromarray(grid([shrunk(image, 128) for image in images], columns)).save(data, "PNG", optimize=True)
-    source = base64.b64encode(data.getvalue()).decode("ascii")
-    caption = html.escape(caption)
-    return (
-        f'<figure><img alt="{caption}" src="data:image/png;base64,{source}"><figcaption>{caption}</figcaption></figure>'
-    )
-
-
-def _note(evaluation: Evaluation) -> str:
-    notes = [f"Note: {html.escape(note)}" for note in evaluation.notes]
-    notes += [f"Read: {html.escape(line)}" for line in evaluation.readings]
-    if ESTIMATE in evaluation.sources:
-        notes.append(
-            "The estimate is no truth: the feature network has seen prior renders alone, and errs where objects crowd; "
-            "its counts are rounded. It is compared with what the same network reads in renders."
-        )
-    return " ".join(notes)
-
-
-def _nested(evaluation: Evaluation) -> str:
-    found = "".join(f'<div class="chart card">{chart}</div>' for chart in charts.nested(evaluation))
-    return f'<h3>By what counts depend on</h3><div class="row two">{found}</div>' if found else ""
-
-
-def _figures(evaluation: Evaluation) -> str:
-    """Every table of the evaluation that the charts do not hold."""
-    parts = []
-    compared = *tables.distances(evaluation, spread=True), *tables.nested(evaluation, spread=True)
-    for table in (*compared, *tables.errors(evaluation), *tables.likelihoods(evaluation), *tables.images(evaluation)):
-        head = [str(column.header).replace(" *", "") for column in table.columns]
-        rows = list(zip(*(column.cells for column in table.columns), strict=True))
-        parts.append(
-            f'<h3>{html.escape(str(table.title).replace(" *", ""))}</h3><div class="chart">{_table(head, rows)}</div>'
-        )
-        if table.caption:
-            parts.append(f'<p class="soft">{html.escape(str(table.caption))}</p>')
-    return "".join(parts)
-
-
 def _log(run: RunFolder) -> list[dict[str, Any]]:
     path = run.path / "log.jsonl"
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
@@ -318,7 +317,7 @@ def _timing(run: RunFolder) -> str:
         return "<p>No times were recorded.</p>"
     names = {stage: name for stage, (name, _) in STAGES.items()} | {OTHER: "Other: between stages"}
     rows = [(names[stage], f"{spent[stage]:.1f} s") for stage in names if stage in spent]
-    return _table(["stage", "time"], [*rows, ("All", f"{sum(spent.values()):.1f} s")])
+    return text_table(["stage", "time"], [*rows, ("All", f"{sum(spent.values()):.1f} s")])
 
 
 def _flat(record: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -327,12 +326,6 @@ def _flat(record: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
         inner = isinstance(value, dict)
         rows += _flat(value, f"{prefix}{key}.") if inner else [(f"{prefix}{key}", str(value))]
     return rows
-
-
-def _table(head: list[str], rows: list[tuple[str, str]]) -> str:
-    first = "".join(f"<th>{html.escape(name)}</th>" for name in head)
-    body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
-    return f"<table><tr>{first}</tr>{body}</table>"
 
 
 def _figure(value: float | None) -> str:

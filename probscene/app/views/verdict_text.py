@@ -1,7 +1,6 @@
 """A verdict in a terminal and in the report."""
 
 import html
-from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console
@@ -14,6 +13,7 @@ from ..evaluation.components import ABSENT
 from ..evaluation.diagnose import FitDiagnostics
 from ..evaluation.explain import percent
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE
+from .markup import paragraphs, text_table
 
 STATISTICS_HEAD = ("", "this fit", "noise floor")
 FLOOR = "The noise floor is the distance between two halves of the real images."
@@ -70,18 +70,27 @@ def show_parts(record: dict[str, Any], console: Console) -> None:
         console.print(text, soft_wrap=True)
 
 
-def section(found: FitDiagnostics, real: str, generated: str) -> str:
-    """HTML for the report; ``real`` and ``generated`` are its pictures."""
+def sentence(found: FitDiagnostics) -> str:
+    """HTML for the report: the verdict with its reason, and what to do."""
+    record = found.record()
+    if record["verdict"] is None:
+        return f"<p>No verdict. {html.escape(found.absent)}</p>"
+    word, reason = record["verdict"], html.escape(record["because"])
+    word = html.escape(word[:1].upper() + word[1:])
+    return f'<p class="verdict"><b>{word}</b>: {reason}</p>{paragraphs([record["remedy"]])}'
+
+
+def details(found: FitDiagnostics, pictures: list[str]) -> str:
+    """HTML for the report: the verdict's parts and the figures of structure; nothing where there is no verdict."""
     record = found.record()
     if found.structure is None or record["verdict"] is None:
-        return f"<p>No verdict. {html.escape(found.absent)}</p>"
-    head = (record["because"], record["remedy"], *basis(record))
+        return ""
     more = (*remedies(record), *by_class(record), *sites(record), *_sentences(found))
-    statistics = _table(STATISTICS_HEAD, rows(found.structure.statistics))
+    statistics = text_table(STATISTICS_HEAD, rows(found.structure.statistics))
     return (
-        f'<div class="card">Verdict<b>{html.escape(record["verdict"])}</b></div>{_paragraphs(head)}'
-        f'{_table(PARTS_HEAD, parts(record))}<p class="soft">{OVERALL}</p>{_paragraphs(more)}'
-        f'<div class="row two">{real}{generated}</div><h3>Structure</h3>{statistics}'
+        f'{paragraphs(basis(record))}{text_table(PARTS_HEAD, parts(record))}<p class="soft">{OVERALL}</p>'
+        f'{paragraphs(more)}<div class="charts">{"".join(pictures)}</div>'
+        f"<h3>Statistics of structure, without labels</h3>{statistics}"
     )
 
 
@@ -178,16 +187,6 @@ def _sentences(found: FitDiagnostics) -> list[str]:
         text = found.agreement.sentence(found.structure.verdict)
         sentences += [] if text.startswith(found.record()["because"]) else [text]
     return [*sentences, found.prior_warning] if found.prior_warning else sentences
-
-
-def _paragraphs(texts: Iterable[str]) -> str:
-    return "".join(f"<p>{html.escape(text)}</p>" for text in texts)
-
-
-def _table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
-    first = "".join(f"<th>{name}</th>" for name in head)
-    rest = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in body)
-    return f'<div class="chart"><table><tr>{first}</tr>{rest}</table></div>'
 
 
 def _energy(found: EnergyTest, unit: float | None = None) -> tuple[str, str]:

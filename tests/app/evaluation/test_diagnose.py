@@ -200,7 +200,10 @@ def test_both_commands_say_it(call, seeing, drawn, tmp_path):
     done = call("report", seeing, "--out", tmp_path / "r.html", "--num", 300, "--scenes", 120)
     assert done.code == 0, done.err
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "Can this fit be trusted?" in page and "Target images least like any generated scene: 000" in page
+    before, after = page.split("<details>", 1)
+    (said,) = re.findall(r'<p class="verdict"><b>([^<]+)</b>: ([^<]+)</p>', before)
+    assert all(said) and before.index("Target: some") < before.index(said[0]) < before.index("<h2>Histograms")
+    assert "Verdict by parts" in after and "Target images least like any generated scene: 000" in after
 
 
 def test_a_fit_ends_with_its_verdict_which_is_that_of_every_command_on_its_images(call, drawn, discs, words, tmp_path):

@@ -22,6 +22,7 @@ from probscene.app.labels.counts import read_table
 from probscene.app.labels.partial_labels import read_partial_labels
 from probscene.app.labels.selection import MIN_CLASS_IMAGES, PRESENT, propose
 from probscene.app.labels.sheet import page, write_sheet
+from probscene.app.style import DARK, LIGHT
 from probscene.dataset import ImageFolder
 from probscene.errors import DataError
 
@@ -125,6 +126,9 @@ def test_the_sheet_shows_what_the_model_sees(folder, tmp_path):
     assert [each["data-image"] for each in read.all("section")] == list(sheet.names)
     assert len(read.all("input")) == 6 and all("id" not in each for each in read.all("input"))
     assert not any("src" in each for each in read.all("script")) and not read.all("link")
+    used = set(re.findall(r"var\(--(\w+)\)", sheet.page.read_text()))
+    assert used and used <= LIGHT.keys() & DARK.keys()
+    assert "The file also holds 1 picture that was labelled before." in sheet.page.read_text()
     pictures = [base64.b64decode(each["src"].removeprefix("data:image/jpeg;base64,")) for each in read.all("img")]
     beside = sorted(path.name for path in (tmp_path / "out" / "images").iterdir())
     assert beside == ["a,1.png.jpg", "b&2.png.jpg", "d.png.jpg"]

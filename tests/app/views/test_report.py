@@ -21,7 +21,7 @@ from probscene.app.fitting.run import RunFolder
 from probscene.app.loading import load_model
 from probscene.app.progress import Display
 from probscene.app.views import charts
-from probscene.app.views.report import _sites, report, scene_values
+from probscene.app.views.report import _sites, _sources, report, scene_values
 from probscene.errors import DataError, RunError
 from probscene.model import SceneModel
 
@@ -29,16 +29,22 @@ VOID = {"meta", "img", "br"}
 
 
 class Page(HTMLParser):
-    """Checks that elements close in order; collects references, pictures and text."""
+    """Checks that elements close in order; collects references, text, and the text that is not folded.
+
+    ``tables`` has the class of the element that each table stands in.
+    """
 
     def __init__(self, text: str):
         super().__init__()
-        self.open, self.references, self.text = [], [], ""
+        self.open, self.references, self.text, self.visible, self.tables = [], [], "", "", []
         self.feed(text)
         self.close()
         assert not self.open
 
     def handle_starttag(self, tag, attributes):
+        if tag == "table":
+            self.tables.append(self.parent)
+        self.parent = dict(attributes).get("class", "")
         if tag not in VOID:
             self.open.append(tag)
         self.references += [value for key, value in attributes if key in ("src", "href", "xlink:href")]
@@ -51,6 +57,8 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         self.text += data
+        if "details" not in self.open and "style" not in self.open:
+            self.visible += data
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +82,28 @@ def test_the_page_shows_target_prior_and_learnt(text):
     assert [caption.split(":")[0] for caption, _ in pictures] == ["Prior", "Learnt", "Target"]
     for _, data in pictures:
         with Image.open(io.BytesIO(base64.b64decode(data, validate=True))) as picture:
-            assert picture.size == (8 * 66 + 2, 66 + 2)
+            assert picture.size == (3 * 66 + 2, 3 * 66 + 2)
             assert len(picture.convert("RGB").getcolors(1 << 16)) > 10
+
+
+def test_images_come_first_then_the_verdict_then_histograms_and_the_rest_is_folded(text):
+    visible = re.findall(r"<h2>(.*?)</h2>", text.split("<details>")[0])
+    assert visible == ["Images", "Verdict", "Histograms", "Details"]
+    titles = re.findall(r"<details><summary>(.*?)</summary>", text)
+    assert text.count("<details") == len(titles) and "<details open" not in text  # none is open
+    assert titles[-6:] == ["Distances", "Sites: where things stand and how they look", "Learning curves", "Grammar",
+                           "Times", "Configuration"]  # fmt: skip
+    page = Page(text)
+    assert "There is no verdict" in page.visible and "truth (labels)" in page.visible
+    assert not any(words in page.visible for words in ("structure.batches", "mean cost", "Parameters were not learnt"))
+
+
+def test_tables_scroll_and_break_no_word(text):
+    tables = Page(text).tables
+    assert tables and all(parent.split()[0] == "scroll" for parent in tables)
+    style = text[text.index("<style>") : text.index("</style>")]
+    assert re.search(r"\.scroll \{[^}]*overflow-x: auto", style) and re.search(r"th, td \{[^}]*nowrap", style)
+    assert not re.search(r"word-break|overflow-wrap: anywhere|hyphens", style)
 
 
 def test_the_page_shows_figures_curves_grammar_time_and_configuration(text, fitted):
@@ -118,7 +146,7 @@ def test_the_page_shows_every_site_and_what_is_read_of_it(kept, fitted, tmp_path
     run = with_sites(fitted, tmp_path / "run", kept)
     made = report(run, Display(), num=100, judged_by=0).read_text(encoding="utf-8")
     page = Page(made)
-    section = page.text[page.text.index("Where things stand") : page.text.index("Histograms")]
+    section = page.text[page.text.index("Sites: where things stand") : page.text.index("Learning curves")]
     assert made.count('<div class="site"><svg') == 2
     for what in ("0.900", "0.250", "0.125", "0.020", "red, blue", "keeps the prior: it cannot be read in <renders>"):
         assert what in section, what
@@ -168,12 +196,21 @@ def test_the_page_shows_structure_alone_beside_all_that_was_learnt(fitted, tmp_p
     run.guide.with_parameters = lambda model: model
     made = report(run, Display(), num=100, judged_by=0).read_text(encoding="utf-8")
     captions = [caption.split(":")[0] for caption in re.findall(r'<img alt="([^"]+)"', made)]
-    assert captions == ["Prior", "Structure alone", "Structure and parameters", "Target"]
+    assert captions == ["Prior", "Structure alone", "Learnt", "Target"]
+
+
+def test_the_page_shows_the_initialisation_and_a_prior_that_was_kept(discs):
+    model = load_model(str(discs.file))
+    run = SimpleNamespace(model=replace(model, pretraining=model.target(0).prior), guide=copy.copy(model.prior))
+    assert [name.split(":")[0] for name in _sources(run)] == ["Prior", "Initialisation", "Learnt"]
+    run = SimpleNamespace(model=model, guide=model.prior)
+    assert list(_sources(run)) == ["Prior: kept by this fit"]
 
 
 def test_colours_are_the_pages_own(text):
     assert not any(stand_in in text for stand_in in charts.VARIABLES)
     used = set(re.findall(r"var\((--\w+)\)", text))
+    assert len(used) > 8
     light, dark = text.split("@media (prefers-color-scheme: dark)")
     for name in used:
         assert f"{name}: #" in light and f"{name}: #" in dark.split("</style>")[0], name

@@ -13,12 +13,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from PIL import ImageFont
 from rich.console import Console
 
 from probscene.app.evaluation.compare import Comparison
 from probscene.app.evaluation.evaluate import Evaluation
 from probscene.app.evaluation.sources import Source
 from probscene.app.evaluation.structure_counts import group_label
+from probscene.app.pictures import LINE, side_by_side
+from probscene.app.trial import pictures
+from probscene.app.trial.results import MEAN, Results
 from probscene.app.views import charts, comparison, tables
 from probscene.relations import PerParent
 
@@ -160,3 +165,47 @@ def test_a_comparisons_labels_never_touch():
     for axes in figure.axes:
         labels_apart(axes)
     assert [text.get_text() for text in figure.axes[-1].get_xticklabels()] == list(classes)
+
+
+def inside(figure) -> None:
+    """No text of a figure is cut off."""
+    figure.draw_without_rendering()
+    width, height = figure.bbox.width, figure.bbox.height
+    found = figure.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible() and artist.get_text())
+    for text in found:
+        box = text.get_window_extent()
+        assert box.x0 >= -1 and box.y0 >= -1 and box.x1 <= width + 1 and box.y1 <= height + 1, text.get_text()
+
+
+@pytest.mark.parametrize("classes", [("car",), ("car", "a class with a rather long name", "c", "d", "e", "f", "g")])
+@pytest.mark.parametrize(
+    "rows", [("real",), ("real 20", "prior, with a name that takes more than one line"), "abcdefg"]
+)
+def test_nothing_of_a_trials_picture_is_cut_off(classes, rows):
+    columns = tuple((name, "AP50") for name in (*classes, MEAN))
+    samples = {(row, column): np.zeros(4) for row in rows for column in columns}
+    by_seed = {key: np.zeros(1) for key in samples}
+    counts = {"test_images": 2, "seeds": 1, "resamples": 3}
+    found = Results(tuple(rows), columns, samples, by_seed, {rows[0]: 20}, (), {}, counts, "")
+    figure = pictures.picture(found)
+    inside(figure)
+    titles = [axes.title.get_window_extent() for axes in figure.axes]
+    assert all(one.x1 <= other.x0 for one, other in pairwise(titles))
+    assert "2 test images, 1 seed;" in " ".join(figure.get_supxlabel().split())
+    assert all(0 <= axes.get_xlim()[0] and axes.get_xlim()[1] <= 100 for axes in figure.axes)
+
+
+def test_nothing_of_a_comparison_is_cut_off():
+    names = ("prior", "a_run_with_a_name_longer_than_its_column", "truth")
+    sources = {name: streets(i) for i, name in enumerate(names)}
+    run = RUN
+    inside(comparison.picture(Comparison(run, "images", ("car", "tree"), sources, runs={names[1]: run})))
+
+
+def test_captions_of_grids_side_by_side_do_not_touch():
+    tiny = np.zeros((8, 8, 3), np.uint8)
+    caption = "a caption wider than its grid"
+    room = ImageFont.load_default(20).getlength(caption)
+    sheet = side_by_side({caption: [tiny], "other": [tiny]})
+    (starts,) = np.nonzero((sheet[40] == LINE).all(1) & ~(np.roll(sheet[40], 1, 0) == LINE).all(1))
+    assert len(starts) == 2 and starts[1] - starts[0] >= room
