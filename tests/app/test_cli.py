@@ -1,16 +1,21 @@
 """The command line: what it does, and that whatever goes wrong says so in one line and leaves nothing half-written."""
 
 import errno
+import itertools
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
 from PIL import Image
 
 import probscene
+from probscene.app.cli import app
 from probscene.app.cli.options import PresetName
 from probscene.app.fitting import pipeline as fit
 from probscene.app.fitting.config import DIVERGENCES
@@ -21,6 +26,7 @@ from probscene.inference.guides.lstm import GUIDES
 from .conftest import check_fault, copied
 
 ROOT = Path(__file__).resolve().parents[2]
+COMMANDS = typer.main.get_command(app).commands
 
 
 def test_help_is_quick_because_it_imports_nothing_heavy():
@@ -44,6 +50,40 @@ def test_version_and_help(call):
     assert call("version").out == f"probscene {probscene.__version__}\n"
     commands = ("check", "preview", "fit", "generate", "evaluate", "report", "compare", "demo", "version")
     assert all(f"\n  {command} " in call("--help").out for command in commands)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fits_two_screens_and_options_two_lines(name):
+    lines = COMMANDS[name].get_help(typer.Context(COMMANDS[name], terminal_width=100)).splitlines()
+    assert len(lines) <= 80 and all(len(line) <= 100 for line in lines)
+    beginnings = [i for i, line in enumerate(lines) if not line.startswith("   ")]  # a third line is indented, too
+    assert max(after - before for before, after in itertools.pairwise([*beginnings, len(lines)])) <= 2
+
+
+def test_many_options_stand_under_headings_and_few_under_one(call):
+    found = {name: re.findall(r"^(\w[\w ]*):$", call(name, "--help").out, re.MULTILINE) for name in ("fit", "preview")}
+    assert found == {
+        "fit": ["Arguments", "Options", "Method", "Images", "Computing"],
+        "preview": ["Arguments", "Options"],
+    }
+
+
+def test_commands_end_with_the_next_one(call, discs, fitted, target, tmp_path):
+    """As a line whose command is there, with its options; the words in capitals are the reader's to fill in."""
+    for words, after in (
+        (["check", discs.file], "preview"),
+        (["preview", discs.file, "--out", tmp_path / "p.png", "--num", 1], "fit"),
+        (["preview", fitted, "--out", tmp_path / "p.png", "--num", 1], "generate"),
+        (["fit", "--resume", "--out", fitted], "report"),
+        (["generate", fitted, "--num", 1, "--out", tmp_path / "d"], "train"),
+        (["evaluate", fitted, "--target", target.images, "--labels", target.labels, "--scenes", 0], "report"),
+    ):
+        last = call(*words).out.splitlines()[-1]
+        _, program, name, *arguments = shlex.split(last)
+        assert last.startswith("Next: ") and (program, name) == ("probscene", after)
+        COMMANDS[name].make_context(name, arguments)
+    sharded = call("generate", fitted, "--num", 2, "--out", tmp_path / "e", "--shard", "0/2")
+    assert "Next: the same command without --shard" in sharded.out
 
 
 def test_presets_are_those_of_the_library():
