@@ -108,7 +108,7 @@ def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tm
     done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
     assert done.code == 0, done.err
     said = " ".join(done.err.split())
-    assert "No site can be moved, so where things stand and how they look keeps the prior." in said
+    assert "No site can be moved, so position and appearance keep the prior." in said
     run = RunFolder.at(out)
     assert run.parameters["kept"] == "prior" and run.guide.with_parameters is None
     assert run.parameters["sites"][2]["because"] == "how near images look does not depend on it"
