@@ -38,7 +38,7 @@ def test_a_reason_has_the_figures_that_decided(verdict):
     assert found.verdict is verdict
     said, x = structure_reason(found), found.statistics
     figure = {
-        Verdict.GOOD: f"total variation above {x.difference.detectable:.2f} in any one feature would have been detected",
+        Verdict.GOOD: f"total variation above {x.difference.detectable:.2f} in any one feature would have been",
         Verdict.NOT_FITTED: "differ significantly, most in all features together (total variation ",
         Verdict.UNDERFIT: f"(total variation {x.difference.total_variation:.2f}).",
         Verdict.MODE_COLLAPSE: f"{x.modes.collapsed.sum()} of {len(x.modes.real)} clusters",
