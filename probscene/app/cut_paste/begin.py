@@ -172,7 +172,7 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
         grounds.append(np.clip(ground_of(image, there, rng) * gain, 0, 255).round().astype(np.uint8))
         covers.append(float(there.mean()))
         show("cutting", i + 1, len(found.images))
-    if renamed := [f"{name} {kind}" for name, kind in kinds.items() if name != kind]:
+    if renamed := [f"{name} is {kind}" for name, kind in kinds.items() if name != kind]:
         notes.append(f"Classes are renamed in the model and in labels.json: {', '.join(renamed)}.")
     ignored = {name for name in kinds if composed(name) in map(composed, options.ignore)}
     chosen = {name: _chosen(name, some, rng, notes) for name, some in cut.items()}

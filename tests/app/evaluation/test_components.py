@@ -254,7 +254,7 @@ def site(learnt, because="", skill=0.9, prior=None):
         (site(False, "scenes come no nearer", prior=0.03), "learnt", False),  # the target has the prior's
         (site(False, "scenes come no nearer", prior=0.3), "learnt", True),
         (site(False, "scenes come no nearer", 0.3, prior=0.03), "learnt", True),  # read with too little skill to say so
-        (site(False, "how near images look does not depend on it", None), "learnt", True),
+        (site(False, "the similarity of images does not depend on it", None), "learnt", True),
     ],
 )
 def test_a_site_is_in_doubt_where_it_keeps_a_prior_that_may_not_be_the_targets(of, kept, doubtful):
