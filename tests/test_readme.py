@@ -4,6 +4,7 @@ import functools
 import re
 from pathlib import Path
 
+import yaml
 from typer.testing import CliRunner
 
 import probscene as ps
@@ -38,6 +39,12 @@ def test_python_runs(tmp_path, monkeypatch, capsys):
     assert "torch.Size([16, 3, 256, 256])" in capsys.readouterr().out
     assert (tmp_path / "dataset" / "annotations.json").is_file()
     assert len(names["target"]["boxes"]) == len(names["target"]["labels"])
+
+
+def test_the_citation_is_of_this_version():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (cited["cff-version"], cited["version"]) == ("1.2.0", ps.__version__)
+    assert {"message", "title", "authors", "references"} <= cited.keys()
 
 
 def test_it_is_short():
