@@ -40,7 +40,7 @@ lint: install
 docs: install
 	@$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --doctree-dir build/doctrees docs build/docs
 
-# Runs the tutorial's code and writes its output and pictures into the page.
+# Runs the tutorial's code and writes its output and pictures into the page and its notebook.
 tutorial: install
 	@OMP_NUM_THREADS=1 $(BIN)/python docs/run_page.py docs/tutorials/own_model.md
 

@@ -1,4 +1,4 @@
-"""probscene: learn which scene structures occur in unlabelled images, then generate labelled ones.
+"""probscene: learn the distribution of scenes from unlabelled images, then generate labelled ones.
 
     import probscene as ps
 

@@ -124,7 +124,7 @@ def check_grammar(grammar: Grammar, prior: Policy, max_steps: int, samples: int 
     if report.unused:
         rules = ", ".join(f"'{grammar.rules[k]}'" for k in report.unused)
         warnings.append(
-            f"The prior never chooses {rules}, and the guide is first taught by the prior; "
+            f"The prior never chooses {rules}, and the guide is pretrained on the prior; "
             "give each a weight above 0, or delete it."
         )
     return replace(report, faults=tuple(faults), warnings=tuple(warnings))

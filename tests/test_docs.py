@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import json
 import re
 import subprocess
 import sys
@@ -61,6 +62,23 @@ def test_the_script_that_does_so_says_where_they_differ(tmp_path):
     assert run.returncode == 1 and "-two #" in run.stderr and "+one #" in run.stderr
     assert subprocess.run(words).returncode == 0
     assert "```text\none 1\n```" in (tmp_path / "page.md").read_text()
+
+
+def test_the_notebook_is_the_page():
+    page, file = ROOT / "docs" / "tutorials" / "own_model.md", ROOT / "docs" / "tutorials" / "own_model.ipynb"
+    made = import_file(ROOT / "docs" / "run_page.py").notebook(page)
+    found = json.loads(file.read_text(encoding="utf-8"))
+    assert found == made, "write it again: python docs/run_page.py docs/tutorials/own_model.md --notebook"
+    code = ["".join(cell["source"]) for cell in found["cells"] if cell["cell_type"] == "code"]
+    fences = re.findall(r"^```python(?: \S+)?\n(.*?)\n```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    opened = [source for source in code if source.startswith("from PIL import Image")]
+    assert [
+        source.partition("%%writefile tabletop.py\n")[2] or source for source in code if source not in opened
+    ] == fences
+    outputs = [output for cell in found["cells"] for output in cell.get("outputs", [])]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == len(opened) == 2
+    assert sum(output["output_type"] == "stream" for output in outputs) == page.read_text().count("```text")
+    assert file.stat().st_size < 400_000
 
 
 def test_every_command_has_a_section():

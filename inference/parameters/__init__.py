@@ -1,1 +1,1 @@
-"""Learning the parameters of scenes: where things stand and how they look."""
+"""Learning the parameters of scenes: position and appearance."""

@@ -140,7 +140,7 @@ class CalibratedReader:
         number = [*self.node_sites, *self.scene_sites].index(site)
         if not self.skill.readable[number]:
             return "it cannot be read in renders"
-        return f"it was read {int(self.num_readings[number])} times in the target, of {MIN_OBJECTS} that it takes"
+        return f"it was read {int(self.num_readings[number])} times in the target, fewer than {MIN_OBJECTS}"
 
     def readings(self, images: Tensor) -> dict[str, Tensor]:
         """u of each learnt site as it is read in ``(L, C, H, W)`` uint8 images, of all objects that have it or of all

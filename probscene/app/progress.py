@@ -26,8 +26,8 @@ from rich.text import Text
 
 STAGES = {
     "reading": ("Target's images", "images"),
-    "likeness": ("Likeness", "images"),
-    "looking": ("Looking at images", "images"),
+    "likeness": ("Domain shift", "images"),
+    "looking": ("Image features", "images"),
     "features": ("Feature network", "steps"),
     "readings": ("Readings", "images"),
     "target": ("Target's features", "images"),
@@ -176,7 +176,7 @@ class Display(AbstractContextManager):
             if self.console.is_terminal or now - self._said < EVERY:
                 return
             if stage is None or stage.ended:
-                self.say(f"Preparing what comes next, for {_clock(now - self._last)}")
+                self.say(f"Preparing the next stage, for {_clock(now - self._last)}")
                 return
             unit = self.units[stage.name]
             parts = [f"{STAGES[stage.name][0]}: {stage.done} of {stage.total} {unit}"]

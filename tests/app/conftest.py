@@ -1,6 +1,7 @@
 """A target folder, and a run that the command line has fitted to it in a few seconds."""
 
 import os
+import shlex
 import signal
 import struct
 import sys
@@ -12,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from probscene.app.cli import app, main
@@ -20,6 +22,7 @@ from probscene.app.evaluation.labels import counts_of_dataset
 from probscene.app.labels.counts import write_counts
 from probscene.app.loading import load_model
 
+COMMANDS = typer.main.get_command(app).commands
 DISCS = Path(__file__).with_name("discs.py")
 STRUCTURE = {
     "features.schedule.steps": 48,
@@ -66,9 +69,20 @@ def _quick_verdicts(few_and_small_images):
 
 
 def probscene(*words) -> SimpleNamespace:
-    """Call the command line in this process: ``code``, ``out`` and ``err``."""
+    """Call the command line in this process: ``code``, ``out`` and ``err``; what succeeds says what to do next."""
     result = CliRunner().invoke(app, [str(word) for word in words])
+    if result.exit_code == 0 and words[0] in COMMANDS and words[0] != "version" and "--help" not in words:
+        check_next(result.stdout)
     return SimpleNamespace(code=result.exit_code, out=result.stdout, err=result.stderr)
+
+
+def check_next(out: str) -> None:
+    """The last line is a sentence, or a command that there is, with its options."""
+    last = out.splitlines()[-1]
+    assert last.startswith("Next: ")
+    if last.startswith("Next: probscene "):
+        _, _, name, *arguments = shlex.split(last.partition(", ")[0])
+        COMMANDS[name].make_context(name, arguments)
 
 
 @pytest.fixture(scope="session")

@@ -74,7 +74,7 @@ def test_bad_files_are_left_out_and_other_sizes_resized_where_it_says_so(call, d
     assert result.err.count("000003.png") == 1 and result.err.count("resized to 64x64") == 1
     lines = [line for line in result.err.splitlines() if not line.startswith(("Note: ", "Warning: "))]
     stages = [line.split(":")[0] for line in lines]
-    first = ["Target's images", "Likeness", "Feature network", "Target's features"]
+    first = ["Target's images", "Domain shift", "Feature network", "Target's features"]
     assert stages == [*first, "Pretraining", "Structure", "Outcome"]
     assert len(RunFolder.at(tmp_path / "run").read_tensors("real")["features"]) == 40
 

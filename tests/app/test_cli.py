@@ -1,13 +1,16 @@
 """The command line: what it does, and that whatever goes wrong says so in one line and leaves nothing half-written."""
 
 import errno
+import itertools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
 from PIL import Image
 
 import probscene
@@ -18,7 +21,7 @@ from probscene.app.fitting.presets import PRESETS, QUICK
 from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES
 
-from .conftest import check_fault, copied
+from .conftest import COMMANDS, check_fault, copied
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -44,6 +47,36 @@ def test_version_and_help(call):
     assert call("version").out == f"probscene {probscene.__version__}\n"
     commands = ("check", "preview", "fit", "generate", "evaluate", "report", "compare", "demo", "version")
     assert all(f"\n  {command} " in call("--help").out for command in commands)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fits_two_screens_and_options_two_lines(name):
+    lines = COMMANDS[name].get_help(typer.Context(COMMANDS[name], terminal_width=100)).splitlines()
+    assert len(lines) <= 80 and all(len(line) <= 100 for line in lines)
+    beginnings = [i for i, line in enumerate(lines) if not line.startswith("   ")]  # a third line is indented, too
+    assert max(after - before for before, after in itertools.pairwise([*beginnings, len(lines)])) <= 2
+
+
+def test_many_options_stand_under_headings_and_few_under_one(call):
+    found = {name: re.findall(r"^(\w[\w ]*):$", call(name, "--help").out, re.MULTILINE) for name in ("fit", "preview")}
+    assert found == {
+        "fit": ["Arguments", "Options", "Method", "Images", "Computing"],
+        "preview": ["Arguments", "Options"],
+    }
+
+
+def test_commands_name_the_next_one(call, discs, fitted, target, tmp_path):
+    for words, after in (
+        (["check", discs.file], "preview"),
+        (["preview", discs.file, "--out", tmp_path / "p.png", "--num", 1], "fit"),
+        (["preview", fitted, "--out", tmp_path / "p.png", "--num", 1], "generate"),
+        (["fit", "--resume", "--out", fitted], "report"),
+        (["generate", fitted, "--num", 1, "--out", tmp_path / "d"], "train"),
+        (["generate", fitted, "--num", 2, "--out", tmp_path / "e", "--shard", "0/2"], "the same command without"),
+        (["evaluate", fitted, "--target", target.images, "--labels", target.labels, "--scenes", 0], "report"),
+    ):
+        said = call(*words).out.splitlines()[-1]
+        assert said.removeprefix("Next: ").removeprefix("probscene ").startswith(after)
 
 
 def test_presets_are_those_of_the_library():

@@ -65,7 +65,7 @@ def test_interrupted_it_says_how_to_go_on_and_does(call, child, discs, target, f
     interrupted = child(kind, "structure", 2, words)
     assert interrupted.code == 1 and "Traceback" not in interrupted.err
     last = interrupted.err.splitlines()[-1]
-    assert last == f"Interrupted; go on with: {shlex.join(['probscene', *map(str, words), '--resume'])}"
+    assert last == f"Interrupted; continue with: {shlex.join(['probscene', *map(str, words), '--resume'])}"
     assert call(*shlex.split(last.partition("probscene ")[2])).code == 0
     assert (out / "guide.safetensors").read_bytes() == (fitted / "guide.safetensors").read_bytes()
 
@@ -78,4 +78,4 @@ def test_interrupted_before_the_run_exists_the_same_command_is_named(call, discs
     words = ["fit", discs.file, "--target", target.images, "--out", tmp_path / "run"]
     result = call(*words)
     assert result.code == 1 and not (tmp_path / "run").exists()
-    assert result.err == f"Interrupted; go on with: {shlex.join(['probscene', *map(str, words)])}\n"
+    assert result.err == f"Interrupted; continue with: {shlex.join(['probscene', *map(str, words)])}\n"

@@ -112,7 +112,7 @@ def test_a_beat_between_reports_counts_the_time_down_and_before_all_stages_says_
     for later in (29, 1, 0, 29, 1):
         clock.now += later
         display.beat()
-    assert out.getvalue().splitlines() == [f"Preparing what comes next, for {t}" for t in ("0:30", "1:00")]
+    assert out.getvalue().splitlines() == [f"Preparing the next stage, for {t}" for t in ("0:30", "1:00")]
     display("structure", 0, 10)
     for done in (1, 2):
         clock.now += 20

@@ -38,7 +38,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
     for c, name in enumerate(net.classes):
         if name in net.stuff:
             found = without_labels(read, c)
-            because = f"{found.mean:.1f} an image, not compared: stuff has no definite number"
+            because = f"{found.mean:.1f} an image, not compared, as stuff has no count"
             found = found._replace(readable=True, because=because)
         elif net.size[c] < MIN_PIXELS:
             found = without_labels(read, c)._replace(readable=False, because=_too_small(net, c))
@@ -102,4 +102,4 @@ def _too_small(net: PretrainedCountNet, c: int) -> str:
         remedy = f"a canvas of at least {round(height * scale)} x {round(width * scale)} pixels shows it"
     else:
         remedy = "cut the photographs into parts"
-    return f"not readable, {pixels:.1f} pixels of what the network sees where {needed:.1f} are needed: {remedy}"
+    return f"not readable, {pixels:.1f} pixels in the network's input of {needed:.1f} needed: {remedy}"

@@ -183,7 +183,7 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
     without, surely = float(np.abs(off).mean()), MAX_BIAS * float(off.std(ddof=1)) / math.sqrt(len(y))
     as_by_labels = without <= ERROR_RATIO * error + ERROR_SLACK and abs(off.mean()) <= surely + ERROR_SLACK
     if free.readable and as_by_labels and _no_worse(without, scores(all_of_free, y).mean(), histogram):
-        because = f"{free.because}; {len(y)} labels bear it out (error {without:.2f} an image, {of_histogram})"
+        because = f"{free.because}; {len(y)} labels confirm it (error {without:.2f} an image, {of_histogram})"
         return free._replace(by="labels", error=without, because=because)
     found = of_all[:, scope, rule]
     unlike = _unlike(seen[:, scope, rule], found)
@@ -207,8 +207,8 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
         and abs(seen_mean - mean) > MAX_MEAN_DIFFERENCE * max(seen_mean, mean)
     ):
         because = (
-            f"{free.because}; the labels do not go with what is seen (r = {with_free:.2f}, {mean:.1f} labelled for "
-            f"{seen_mean:.1f} read) and are not used; see whether all objects of this class are labelled"
+            f"{free.because}; the labels do not correlate with the readings (r = {with_free:.2f}, {mean:.1f} labelled "
+            f"for {seen_mean:.1f} read) and are not used; check that all objects of this class are labelled"
         )
         return free._replace(error=error, because=because)
     steps = _steps(of_all[:, scope, 0], y)

@@ -39,7 +39,7 @@ def fit(
     resume: bool = False,
     execution: Execution | None = None,
 ) -> Run:
-    """Learn which structures occur in unlabelled images, where things stand and how they look.
+    """Learn the structure, position and appearance of scenes from unlabelled images.
 
     Args:
         model: a scene model, the name of a built-in one, or a Python file; ``ModelFile`` for one that is drawn with a

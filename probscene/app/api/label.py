@@ -96,13 +96,13 @@ def _proposed(
     spread = [i * len(images) // CONSIDERED for i in range(CONSIDERED)] if len(images) > CONSIDERED else None
     considered = list(range(len(images))) if spread is None else sorted({*spread, *labelled})
     if spread is not None:
-        show.say(f"Note: {len(considered)} of {len(images)} images are looked at, evenly spread over all.")
+        show.say(f"Note: {len(considered)} of {len(images)} images are considered, evenly spread over all.")
     nets: list[FeatureNet] = [pretrained("efficientnet")]
     own = None if run is None else run.network()
     if own is not None and class_counts(model, tuple(own.names), torch.zeros(0, len(own.names))) is not None:
         nets.append(own)
     elif run is not None:
-        show.say("Note: the run has no network that counts; images are chosen by their looks alone.")
+        show.say("Note: the run has no network that counts; images are chosen by appearance alone.")
     looks, *found = _seen(images, considered, nets, show)
     counts = None
     if found:

@@ -6,56 +6,59 @@ from typing import Annotated
 import typer
 
 from ..arguments import range_given, size_given, words_given
-from .application import app
-from .options import BoxMargin, Seed, ValueRange
+from .application import command, command_line
+from .options import (
+    Batch,
+    BoxMargin,
+    Detector,
+    FinetuneFraction,
+    Iterations,
+    MinVisible,
+    Rate,
+    Seed,
+    Size,
+    ValueRange,
+)
 
 
-@app.command()
+@command()
 def train(
     model_or_run: Annotated[
-        str, typer.Argument(metavar="MODEL_OR_RUN", help="A finished run, or a model, whose prior is drawn.")
+        str, typer.Argument(metavar="MODEL_OR_RUN", help="Finished run, or a model, whose prior is drawn.")
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    *,
     real: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Photographs, some of them labelled; or a labelled set alone.")
+        Path | None, typer.Option(metavar="DIR", help="Photographs, some of them labelled; or a labelled set.")
     ] = None,
     labels: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Their labels: COCO, KITTI or YOLO; PATH@LIST for some.")
     ] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
     test: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Labelled photographs to test it on; PATH@LIST for some.")
+        Path | None, typer.Option(metavar="PATH", help="Labelled photographs to test on; PATH@LIST for some.")
     ] = None,
     hold_out: Annotated[
-        int | None, typer.Option(metavar="N", help="Test it on N of the labelled photographs, instead of --test.")
+        int | None, typer.Option(metavar="N", help="Test on N of the labelled photographs, instead of --test.")
     ] = None,
-    generate: Annotated[int, typer.Option(metavar="N", help="How many images of the run it is shown first.")] = 600,
-    min_visible: Annotated[
-        float, typer.Option(metavar="FRACTION", help="No label there for objects of which less is visible.")
-    ] = 0.2,
-    box_margin: BoxMargin = 0,
-    classes: Annotated[
-        str | None, typer.Option(metavar="NAME,...", help="What it learns; the model's classes if not given.")
-    ] = None,
-    detector: Annotated[str, typer.Option(metavar="NET", help="efficientnet or maskrcnn=FILE.")] = "efficientnet",
-    iterations: Annotated[
-        int | None, typer.Option(metavar="N", help="Steps of the training; 600, of maskrcnn 5000.")
-    ] = None,
-    batch: Annotated[int | None, typer.Option(metavar="N", help="Images a step; 4, of maskrcnn 2.")] = None,
-    rate: Annotated[float | None, typer.Option(metavar="X", help="Of Adam; the detector's if not given.")] = None,
-    finetune_fraction: Annotated[
-        float, typer.Option(metavar="FRACTION", help="Of the images it is shown, that are photographs.")
-    ] = 0.5,
-    size: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Images come so large; about 256x192 if not given.")
-    ] = None,
+    generate: Annotated[int, typer.Option(metavar="N", help="Generated images to train on first.")] = 600,
     seed: Seed = 0,
-    workers: Annotated[
-        int, typer.Option(metavar="W", help="Processes that generate; the bytes do not depend on it.")
-    ] = 1,
-    value_range: ValueRange = None,
+    workers: Annotated[int, typer.Option(metavar="N", help="Processes; the bytes do not depend on it.")] = 1,
     onnx: Annotated[bool, typer.Option("--onnx", help="Also write detector.onnx.")] = False,
-) -> None:
-    """Train a detector on generated images, then on labelled photographs, and keep it."""
+    classes: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="Classes to detect; the model's if not given.", rich_help_panel="Labels"),
+    ] = None,
+    min_visible: MinVisible = 0.2,
+    box_margin: BoxMargin = 0,
+    detector: Detector = "efficientnet",
+    size: Size = None,
+    iterations: Iterations = None,
+    batch: Batch = None,
+    rate: Rate = None,
+    finetune_fraction: FinetuneFraction = 0.5,
+    value_range: ValueRange = None,
+) -> str:
+    """Train a detector on generated images, then on labelled photographs."""
     from rich.console import Console
 
     from ..api import calls
@@ -79,24 +82,26 @@ def train(
     )
     trained = calls.train(model_or_run, real, labels, out, options, workers=workers)
     show_scores(trained, Console(highlight=False))
-    print(f"The detector is in {out}; probscene predict {out} PHOTOS --out predicted.json labels photographs with it.")
+    print(f"The detector is in {out}")
+    return command_line("predict", out, "PHOTOS", "--out", "predicted.json")
 
 
-@app.command()
+@command()
 def predict(
-    detector: Annotated[Path, typer.Argument(metavar="DETECTOR", help="A folder, made by 'probscene train'.")],
-    photos: Annotated[list[Path], typer.Argument(metavar="PHOTOS...", help="A folder of photographs, or photographs.")],
-    out: Annotated[Path, typer.Option(metavar="PATH", help="The file to write; of YOLO a new folder.")],
+    detector: Annotated[Path, typer.Argument(metavar="DETECTOR", help="Folder that 'probscene train' wrote.")],
+    photos: Annotated[list[Path], typer.Argument(metavar="PHOTOS", help="Photographs, or folders of them.")],
+    out: Annotated[Path, typer.Option(metavar="PATH", help="JSON file to write; for YOLO a new folder.")],
     format: Annotated[str, typer.Option(metavar="FORMAT", help="coco or yolo.")] = "coco",
     min_score: Annotated[
-        float | None, typer.Option(metavar="X", help="Of what is written; if not given, where it made fewest errors.")
+        float | None,
+        typer.Option(metavar="X", help="Lowest score to write; that of fewest errors if not given."),
     ] = None,
     overlays: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Also draw what is found on each photograph.")
+        Path | None, typer.Option(metavar="DIR", help="Also draw the detections on each photograph.")
     ] = None,
-    skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = False,
-) -> None:
-    """Write what a trained detector finds in photographs, as labels with scores."""
+    skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out images that do not decode.")] = False,
+) -> str:
+    """Label photographs with a trained detector."""
     from rich.console import Console
 
     from ..api import calls
@@ -105,3 +110,6 @@ def predict(
     found = calls.predict(detector, photos, out, format, min_score=min_score, overlays=overlays, skip_bad=skip_bad)
     show_predictions(found, Console(highlight=False))
     print(f"The labels are in {out}" + (f", the pictures in {overlays}" if overlays is not None else ""))
+    if overlays is None:
+        return f"{command_line('predict', detector, *photos, '--out', out, '--overlays', 'DIR')}, to see them."
+    return f"label the photographs that {overlays / 'label_next.txt'} lists, and train again with them."

@@ -1,6 +1,5 @@
 """``probscene fit``, ``demo`` and ``version``."""
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -10,68 +9,89 @@ import probscene
 from probscene.errors import ProbsceneError
 
 from ..arguments import checked_seed, range_given
-from .application import app
+from .application import command, command_line
 from .options import Assets, Cache, ClusterAddress, NoCache, PresetName, Seed, ValueRange
 
 
-@app.command()
+@command()
 def fit(
     ctx: typer.Context,
-    out: Annotated[Path, typer.Option(metavar="RUN", help="The run folder to write.")],
-    model: Annotated[str | None, typer.Argument(metavar="MODEL", help="A built-in model or a .py file.")] = None,
-    target: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of PNG, JPEG or TIFF images.")] = None,
-    preset: Annotated[PresetName | None, typer.Option(help="How long to learn; 'default' if not given.")] = None,
-    divergence: Annotated[
-        str | None, typer.Option(metavar="NAME", help="What is descended: kde, js, witness, mmd, or FILE.py:NAME.")
+    *,
+    model: Annotated[str | None, typer.Argument(metavar="MODEL", help="Built-in model or .py file.")] = None,
+    target: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of unlabelled images: PNG, JPEG or TIFF.")
     ] = None,
-    guide: Annotated[
-        str | None, typer.Option(metavar="NAME", help="What learns: lstm, pcfg, grammar-vae, or FILE.py:NAME.")
+    out: Annotated[Path, typer.Option(metavar="RUN", help="Run folder to write.")],
+    preset: Annotated[
+        PresetName | None,
+        typer.Option(metavar="NAME", help="quick, default (if not given), street, paper, paper-aerial, paper-driving."),
     ] = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="A few labels: counts.csv, COCO .json, KITTI label_2 or YOLO labels."),
+    ] = None,
+    learn: Annotated[
+        str | None,
+        typer.Option(metavar="WHAT", help="structure, or structure,parameters (position and appearance)."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Random seed; 0 if not given.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One setting, such as structure.batches=40; repeat for more."),
+    ] = None,
+    skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out images that do not decode.")] = None,
+    no_verdict: Annotated[bool, typer.Option("--no-verdict", help="Do not judge the fit.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     features: Annotated[
         str | None,
         typer.Option(
             metavar="NET",
-            help="count, count=efficientnet, presence[=counts], efficientnet, inception[=FILE], resnet50[=FILE], "
-            "FILE.py:NAME.",
+            help="Feature network: count, count=efficientnet, presence[=counts], efficientnet, inception[=FILE], "
+            "resnet50[=FILE] or FILE.py:NAME.",
+            rich_help_panel="Method",
         ),
-    ] = None,
-    learn: Annotated[
-        str | None,
-        typer.Option(metavar="WHAT", help="structure, or structure,parameters: where things stand and how they look."),
     ] = None,
     parameters: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="How the latter are learnt: likelihood; tilting, for photographs; or meta-sim, a baseline.",
+            help="Learning of parameters: likelihood, tilting (photographs) or meta-sim.",
+            rich_help_panel="Method",
         ),
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Another value of it, such as structure.batches=40."),
+    divergence: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Divergence to minimise: kde, js, witness, mmd or FILE.py:NAME.",
+            rich_help_panel="Method",
+        ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="The same seed gives the same result; 0 if not given.")] = None,
-    skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = None,
-    threads: Annotated[int | None, typer.Option(help="As OMP_NUM_THREADS says if not given, else all cores.")] = None,
+    guide: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Distribution over structures: lstm, pcfg, grammar-vae or FILE.py:NAME.",
+            rich_help_panel="Method",
+        ),
+    ] = None,
     scenarios: Annotated[
         str | None,
-        typer.Option(metavar="NAME,...", help="Of a model that has several; a guide learns each. All if not given."),
-    ] = None,
-    labels: Annotated[
-        Path | None,
         typer.Option(
-            metavar="PATH", help="Of a few of the images: a counts.csv, COCO's .json, KITTI's label_2, YOLO's labels."
+            metavar="NAME,...", help="Scenarios of the model to use; all if not given.", rich_help_panel="Method"
         ),
     ] = None,
+    value_range: ValueRange = None,
     assets: Assets = None,
+    threads: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="OMP_NUM_THREADS, or all cores, if not given.", rich_help_panel="Computing"),
+    ] = None,
+    cluster: ClusterAddress = None,
     cache: Cache = None,
     no_cache: NoCache = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was interrupted.")] = False,
-    no_verdict: Annotated[bool, typer.Option("--no-verdict", help="Do not judge the fit at its end.")] = False,
-    cluster: ClusterAddress = None,
-    value_range: ValueRange = None,
-) -> None:
-    """Learn which structures occur in a folder of unlabelled images, and say how near that came."""
+) -> str:
+    """Fit a model to a folder of unlabelled images, and judge the fit."""
     from rich.console import Console
 
     from ..api.fit import DEFAULT, fit_and_diagnose, fit_request
@@ -100,24 +120,25 @@ def fit(
         raise
     if done.diagnostics is not None:
         show_parts(done.diagnostics.record(), Console(highlight=False))
-    print(f"Learnt. Look at it with: probscene report {shlex.quote(str(out))}")
+    return command_line("report", out)
 
 
-@app.command()
+@command()
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")] = Path("demo"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("demo"),
     seed: Seed = 0,
     cache: Cache = None,
     no_cache: NoCache = False,
-) -> None:
-    """The whole path on handwritten digits that come with the install; about a quarter of an hour on two cores."""
+) -> str:
+    """Run the whole method on handwritten digits; about a quarter of an hour on two cores."""
     from ..api.demo import demo
     from ..fitting.pipeline import Execution
 
     demo(out, checked_seed(seed), execution=Execution(cache=False if no_cache else cache or True))
+    return command_line("begin", "PHOTOS", "--labels", "LABELS", "--out", "DIR")
 
 
-@app.command()
+@command()
 def version() -> None:
     """Print the version."""
     print(f"probscene {probscene.__version__}")

@@ -1,4 +1,4 @@
-"""``probscene check``, ``preview``, ``view``, ``label``: what is done with a model, or with what a run has learnt."""
+"""``probscene begin``, ``check``, ``preview``, ``view`` and ``label``: what is done with a model or a run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,32 +8,33 @@ import typer
 from probscene.errors import ModelError
 
 from ..arguments import checked_seed
-from .application import app
+from .application import command, command_line
 from .options import Assets, Model, Seed, ValueRange
 
 
-@app.command()
+@command()
 def begin(
-    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="A folder of photographs.")],
-    labels: Annotated[
-        Path, typer.Option(metavar="PATH", help="Boxes or masks of some of them: COCO, KITTI or YOLO.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write: a model and its pictures.")],
-    name: Annotated[str | None, typer.Option(metavar="NAME", help="Of the model; the folder's if not given.")] = None,
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs.")],
+    labels: Annotated[Path, typer.Option(metavar="PATH", help="Boxes or masks in some of them: COCO, KITTI or YOLO.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write: a model and its pictures.")],
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name of the model; the folder's name if not given.")
+    ] = None,
     canvas: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of its scenes; most photographs' if not given.")
+        str | None,
+        typer.Option(metavar="WIDTHxHEIGHT", help="Size of scenes; the most frequent of the photographs if not given."),
     ] = None,
     turn: Annotated[
         bool | None,
-        typer.Option("--turn/--upright", help="Objects lie in any direction; as they do if neither is given."),
+        typer.Option("--turn/--upright", help="Rotate objects, or do not; class by class if neither is given."),
     ] = None,
     ignore: Annotated[
-        str, typer.Option(metavar="NAME,...", help="Classes of what is no object, drawn without a label.")
+        str, typer.Option(metavar="NAME,...", help="Classes to draw without a label, such as dirt.")
     ] = "ignore",
     seed: Seed = 0,
     value_range: ValueRange = None,
-) -> None:
-    """Make a first model of a few labelled photographs: their objects, cut out, on what is left of them."""
+) -> str:
+    """Make a first model from a few labelled photographs, by cutting out their objects."""
     from ..arguments import range_given, size_given, words_given
     from ..cut_paste.begin import BeginOptions
     from ..cut_paste.begin import begin as made
@@ -50,17 +51,18 @@ def begin(
     for note in found.notes:
         print(f"Note: {note}")
     counted = ", ".join(f"{found.cutouts[name]} of {number} {name}" for name, number in found.objects.items())
-    print(f"Cut out: {counted}; {found.grounds} grounds. Look at {out / 'cutouts.png'}, and delete what is cut badly.")
-    print(f"The model is {found.path}; try: probscene preview {found.path} --out preview.png")
+    print(f"Cut out: {counted}; {found.grounds} backgrounds. The model is {found.path}")
+    print(f"Look at {out / 'cutouts.png'}, and delete the files of bad cut-outs from {out / 'cutouts'}.")
+    return command_line("preview", found.path, "--out", "preview.png")
 
 
-@app.command()
+@command()
 def check(
     model: Model,
     assets: Assets = None,
-    render: Annotated[bool, typer.Option("--render", help="Also see whether its generator can be relied on.")] = False,
-) -> None:
-    """Say whether a model's grammar is sound and its program runs, what can be seen of it, and what to fix."""
+    render: Annotated[bool, typer.Option("--render", help="Also test the model's own generator.")] = False,
+) -> str:
+    """Check a model's grammar and program, and say what to fix."""
     from ..checking.generator_check import check_generator
     from ..checking.model_check import check_model
     from ..fitting.presets import images_drawn
@@ -76,61 +78,82 @@ def check(
             raise ModelError(found.fault)
     if report.faults:
         raise ModelError(f"expected a model without faults, got {model} with {len(report.faults)}; fix them first.")
+    return command_line("preview", model, "--out", "preview.png", *_given(assets))
 
 
-@app.command()
+@command()
 def preview(
-    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a finished run.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write, a PNG.")],
-    num: Annotated[int, typer.Option(help="How many scenes.")] = 16,
+    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="Model or finished run.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="PNG to write.")],
+    num: Annotated[int, typer.Option(metavar="N", help="Number of scenes.")] = 16,
     seed: Seed = 0,
     boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes and class names.")] = False,
     assets: Assets = None,
-) -> None:
-    """Draw a grid of scenes: of a model's prior, or of what a run has learnt."""
+) -> str:
+    """Draw a grid of scenes of a model's prior, or of a fit."""
     from ..views.preview import preview
 
     preview(model_or_run, out, num, checked_seed(seed), boxes, assets)
     print(f"{num} scenes in {out}")
+    return _after_looking(model_or_run, assets)
 
 
-@app.command()
+@command()
 def view(
-    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a finished run.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="scene.rrd for Rerun's viewer, or scene.glb (glTF, 3D).")],
-    num: Annotated[int, typer.Option(help="How many scenes, one after the other; a .glb holds one.")] = 1,
+    model_or_run: Annotated[str, typer.Argument(metavar="MODEL_OR_RUN", help="Model or finished run.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="scene.rrd for Rerun's viewer, or scene.glb for 3D models.")
+    ],
+    num: Annotated[int, typer.Option(metavar="N", help="Number of scenes; a .glb holds one.")] = 1,
     seed: Seed = 0,
     assets: Assets = None,
-) -> None:
-    """Write scenes that one can turn: of a model's prior, or of what a run has learnt."""
+) -> str:
+    """Write scenes of a model's prior, or of a fit, for a 3D viewer."""
     from ..views.export import view
 
     view(model_or_run, out, num, checked_seed(seed), assets)
     print(f"{num} {'scene' if num == 1 else 'scenes'} in {out}")
+    return _after_looking(model_or_run, assets)
 
 
-@app.command()
+@command()
 def label(
     model_or_run: Annotated[
-        str, typer.Argument(metavar="MODEL_OR_RUN", help="A model, or a run: one that counts proposes better.")
+        str, typer.Argument(metavar="MODEL_OR_RUN", help="Model, or a run, which proposes better.")
     ],
-    target: Annotated[Path, typer.Argument(metavar="TARGET", help="A folder of PNG, JPEG or TIFF images.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write: a sheet, a CSV, the pictures.")],
-    number: Annotated[int, typer.Option(metavar="N", help="How many images to label.")] = 10,
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="Folder of PNG, JPEG or TIFF images.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write: an HTML page, a CSV and the images.")],
+    number: Annotated[int, typer.Option(metavar="N", help="Number of images to label.")] = 10,
     labels: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Of images that are labelled already; others are proposed.")
+        Path | None, typer.Option(metavar="PATH", help="Labels there are already; other images are proposed.")
     ] = None,
     seed: Seed = 0,
-    skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out files that do not decode.")] = False,
+    skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out images that do not decode.")] = False,
     assets: Assets = None,
     value_range: ValueRange = None,
-) -> None:
-    """Propose which images to label next, and write the sheet in which to count."""
+) -> str:
+    """Propose which images to label next, and write a page to count objects in."""
     from ..api import label
     from ..arguments import range_given
     from ..fitting.begin import ModelFile
+    from ..fitting.run import RunFolder, is_run
     from ..targets import TargetImages
 
     images = TargetImages(target, skip_bad, range_given(value_range))
     sheet = label.label(ModelFile(model_or_run, assets), images, out, number, labels, seed=seed)
-    print(f"Count in {len(sheet.names)} pictures: open {sheet.page} in a browser, or fill in {sheet.table}")
+    print(f"Count the objects of {len(sheet.names)} images: open {sheet.page} in a browser, or fill in {sheet.table}")
+    model = RunFolder.at(Path(model_or_run)).record["model"] if is_run(model_or_run) else model_or_run
+    fit = command_line("fit", model, "--target", target, "--labels", sheet.table, *_given(assets), "--out", "RUN")
+    return f"{fit}, when all are counted"
+
+
+def _after_looking(model_or_run: str, assets: Path | None) -> str:
+    from ..fitting.run import is_run
+
+    if is_run(model_or_run):
+        return command_line("generate", model_or_run, "--num", 10_000, "--out", "DATASET")
+    return command_line("fit", model_or_run, "--target", "PHOTOS", *_given(assets), "--out", "RUN")
+
+
+def _given(assets: Path | None) -> tuple[object, ...]:
+    return () if assets is None else ("--assets", assets)

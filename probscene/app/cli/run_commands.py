@@ -5,12 +5,13 @@ from typing import Annotated
 
 import typer
 
-from .application import app
+from .application import command, command_line
 from .options import (
     BoxMargin,
     ClusterAddress,
     JudgedScenes,
     MinHeight,
+    MinVisible,
     RunPath,
     Seed,
     SomeLabels,
@@ -19,42 +20,51 @@ from .options import (
 )
 
 
-@app.command()
+@command()
 def generate(
     run: RunPath,
-    num: Annotated[int, typer.Option(metavar="N", help="How many images.")],
-    out: Annotated[
-        str, typer.Option(metavar="DIR", help="The folder to write, or an address such as s3://bucket/folder.")
-    ],
+    *,
+    num: Annotated[int, typer.Option(metavar="N", help="Number of images.")],
+    out: Annotated[str, typer.Option(metavar="DIR", help="Folder to write, or an address such as s3://bucket/folder.")],
     format: Annotated[
         list[str] | None,
         typer.Option(
             metavar="FORMAT",
             help="coco (if not given), panoptic, yolo, yolo-seg, yolo-obb, yolo-pose, kitti, webdataset, depth, or "
-            "images for no labels; again for more.",
+            "images for no labels; repeat for more.",
         ),
     ] = None,
     seed: Seed = 0,
-    workers: Annotated[int, typer.Option(metavar="W", help="Processes; the bytes do not depend on it.")] = 1,
-    min_visible: Annotated[
-        float, typer.Option(metavar="FRACTION", help="No label for objects of which less is visible, 0 to 1.")
-    ] = 0.0,
-    shard: Annotated[
-        str | None,
-        typer.Option(metavar="I/N", help="One of N commands, I from 0, that make it together; none finishes it."),
-    ] = None,
-    cluster: ClusterAddress = None,
-    flat: Annotated[bool, typer.Option("--flat", help="One folder also for more than 10,000 images.")] = False,
+    workers: Annotated[int, typer.Option(metavar="N", help="Processes; the bytes do not depend on it.")] = 1,
+    min_visible: MinVisible = 0.0,
     box_margin: BoxMargin = 0,
-    amodal: Annotated[bool, typer.Option("--amodal", help="Also masks of whole objects, in COCO and shards.")] = False,
+    amodal: Annotated[
+        bool,
+        typer.Option("--amodal", help="Add masks of whole objects (COCO, WebDataset).", rich_help_panel="Labels"),
+    ] = False,
     values: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SITE,...", help="Sites whose values annotations have, in COCO and shards; again for more."
+            metavar="SITE,...",
+            help="Add values of these sites to annotations (COCO, WebDataset).",
+            rich_help_panel="Labels",
         ),
     ] = None,
-) -> None:
-    """Write a labelled dataset of the learnt structures; the same command goes on after an interruption."""
+    flat: Annotated[
+        bool,
+        typer.Option("--flat", help="Write all images into one folder, however many.", rich_help_panel="Computing"),
+    ] = False,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            metavar="I/N",
+            help="Make part I of N, I from 0; together they are the dataset.",
+            rich_help_panel="Computing",
+        ),
+    ] = None,
+    cluster: ClusterAddress = None,
+) -> str:
+    """Write a labelled dataset of a fit. After an interruption, repeat the command to continue."""
     from ..datasets.generate import DatasetOptions, generate, workers_or_cluster
     from ..fitting.run import RunFolder
     from ..progress import Display
@@ -70,36 +80,45 @@ def generate(
         dataset = generate(opened, num, out, seed, processes, format or "coco", said, options)
     print(f"{dataset.num} images in {dataset.path}, {dataset.made} of them made now")
     if not dataset.finished:
-        print("When all shards are done, the same command without --shard writes the files of labels.")
+        return "the same command without --shard, when all shards are done; it writes the label files."
+    return command_line("train", run, "--real", "PHOTOS", "--labels", "LABELS", "--out", "DETECTOR")
 
 
-@app.command()
+@command()
 def evaluate(
     run: RunPath,
-    target: Annotated[Path, typer.Option(metavar="DIR", help="The images to judge by.")],
+    *,
+    target: Annotated[Path, typer.Option(metavar="DIR", help="Folder of images to compare with.")],
     labels: Annotated[
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="A counts.csv (image,CLASS,...), a provenance.jsonl, COCO's .json, KITTI's label_2, or YOLO's labels.",
+            help="Their labels: counts.csv, provenance.jsonl, COCO .json, KITTI label_2 or YOLO labels.",
         ),
     ] = None,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
-    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
-    features: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NET", help="KID and FID by run, efficientnet, inception[=FILE], resnet50[=FILE]; many."),
-    ] = None,
-    num_images: Annotated[
-        str, typer.Option("--images", metavar="N", help="At most so many a side for KID and FID, or all.")
-    ] = "1000",
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write all figures to this file.")] = None,
+    num: Annotated[int, typer.Option(metavar="N", help="Structures to sample.")] = 10000,
     scenes: JudgedScenes = None,
     some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
     visible: Visible = None,
+    features: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NET",
+            help="KID and FID by run, efficientnet, inception[=FILE] or resnet50[=FILE]; repeat for more.",
+            rich_help_panel="Images",
+        ),
+    ] = None,
+    num_images: Annotated[
+        str,
+        typer.Option(
+            "--images", metavar="N", help="Images a side for KID and FID at most, or all.", rich_help_panel="Images"
+        ),
+    ] = "1000",
     value_range: ValueRange = None,
-) -> None:
-    """Say whether a fit can be trusted, and compare its structures with the truth or with what the network sees."""
+) -> str:
+    """Judge a fit, and compare its counts with labels or with the network's."""
     from rich.console import Console
 
     from ..arguments import number_or_all, range_given
@@ -130,20 +149,23 @@ def evaluate(
     tables.show(found, console)
     if json is not None:
         write_json(json, found.record() | ({} if judged is None else {"trust": judged.record()}))
+    return command_line("report", run, *(() if labels is None else ("--labels", labels)))
 
 
-@app.command()
+@command()
 def report(
     run: RunPath,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="report.html in the run folder if not given.")
+        Path | None, typer.Option(metavar="FILE", help="HTML file to write; report.html in RUN if not given.")
     ] = None,
-    labels: Annotated[Path | None, typer.Option(metavar="PATH", help="Of the run's target, as of evaluate.")] = None,
-    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
+    labels: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Labels of the run's target, as in evaluate.")
+    ] = None,
+    num: Annotated[int, typer.Option(metavar="N", help="Structures to sample.")] = 10000,
     scenes: JudgedScenes = None,
     some_labels: SomeLabels = False,
     visible: Visible = None,
-) -> None:
+) -> str:
     """Write one self-contained HTML page about a run."""
     from ..api import calls
     from ..evaluation.labels import TargetLabels
@@ -151,26 +173,24 @@ def report(
     truth = None if labels is None else TargetLabels(labels, some_labels)
     path = calls.report(run, out, truth, num=num, scenes=scenes, visible=visible)
     print(f"The report is {path}")
+    return command_line("generate", run, "--num", 10_000, "--out", "DATASET")
 
 
-@app.command()
+@command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Finished runs of one model.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write, a PNG.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Finished runs of one model.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="PNG to write.")],
     target: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="The images to judge by; the runs' own if not given.")
+        Path | None, typer.Option(metavar="DIR", help="Folder of images to compare with; the runs' own if not given.")
     ] = None,
-    labels: Annotated[
-        Path | None,
-        typer.Option(metavar="PATH", help="Of the target, as of evaluate, for the truth."),
-    ] = None,
+    labels: Annotated[Path | None, typer.Option(metavar="PATH", help="Their labels, as in evaluate.")] = None,
     some_labels: SomeLabels = False,
     min_height: MinHeight = 0.0,
     visible: Visible = None,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all figures there, too.")] = None,
-    num: Annotated[int, typer.Option(help="How many structures are sampled.")] = 10000,
-) -> None:
-    """Draw the prior, several runs and the truth side by side, and print how far each is from the truth."""
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write all figures to this file.")] = None,
+    num: Annotated[int, typer.Option(metavar="N", help="Structures to sample.")] = 10000,
+) -> str:
+    """Draw prior, runs and truth side by side, and print their distances."""
     from rich.console import Console
 
     from ..api import calls
@@ -186,3 +206,4 @@ def compare(
     print(f"The picture is {out}")
     if json is not None:
         write_json(json, found.record())
+    return command_line("generate", "RUN", "--num", 10_000, "--out", "DATASET")

@@ -1,4 +1,4 @@
-"""``probscene trial``: what is a labelled set worth to a detector?"""
+"""``probscene trial``: what a labelled set is worth to a detector."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,70 +8,100 @@ import typer
 from probscene.errors import ProbsceneError
 
 from ..arguments import range_given, size_given, words_given
-from .application import app
-from .options import BoxMargin, Seed, ValueRange
+from .application import command, command_line
+from .options import (
+    Batch,
+    BoxMargin,
+    Detector,
+    FinetuneFraction,
+    Iterations,
+    MinVisible,
+    Rate,
+    Seed,
+    Size,
+    ValueRange,
+)
 
 
-@app.command()
+@command()
 def trial(
-    test: Annotated[
-        Path, typer.Option(metavar="PATH", help="Labelled real images: COCO, KITTI or YOLO; PATH@LIST for some.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder to write.")],
+    *,
+    test: Annotated[Path, typer.Option(metavar="PATH", help="Labelled photographs to test on; PATH@LIST for some.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    hold_out: Annotated[
+        int | None, typer.Option(metavar="N", help="Test on N photographs of --test only, and train on the others.")
+    ] = None,
+    run: Annotated[Path | None, typer.Option(metavar="RUN", help="Fit to generate training images with.")] = None,
+    real: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Labelled photographs to train on, instead of --hold-out.")
+    ] = None,
     sets: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="NAME=SET",
-            help="PATH, PATH:N, A,B (B after A), A+B (mixed), real:N, learnt; again for more.",
+            help="Training set: PATH, PATH:N, real:N, learnt, A,B (B after A) or A+B (mixed); repeat for more.",
         ),
     ] = None,
-    hold_out: Annotated[
-        int | None, typer.Option(metavar="N", help="Test on N images of --test alone; the others are 'real'.")
-    ] = None,
-    real: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Labelled photographs to train on, where not by --hold-out.")
-    ] = None,
-    real_numbers: Annotated[
-        str | None, typer.Option(metavar="N,...", help="Sets of so many of them; 10,20,50,all if not given, or none.")
-    ] = None,
-    run: Annotated[Path | None, typer.Option(metavar="RUN", help="A fit of which sets are generated.")] = None,
-    sources: Annotated[
-        str, typer.Option(metavar="NAME,...", help="Which of its sets: prior, start (of pretraining), learnt.")
-    ] = "prior,start,learnt",
-    generate: Annotated[int, typer.Option(metavar="N", help="How many images of each.")] = 600,
-    min_visible: Annotated[
-        float, typer.Option(metavar="FRACTION", help="No label there for objects of which less is visible.")
-    ] = 0.2,
-    box_margin: BoxMargin = 0,
-    classes: Annotated[
-        str | None, typer.Option(metavar="NAME,...", help="What it is about; all classes if not given.")
-    ] = None,
-    detector: Annotated[str, typer.Option(metavar="NET", help="efficientnet or maskrcnn=FILE.")] = "efficientnet",
-    iterations: Annotated[
-        int | None, typer.Option(metavar="N", help="Steps of a training; 600, of maskrcnn 5000.")
-    ] = None,
-    batch: Annotated[int | None, typer.Option(metavar="N", help="Images a step; 4, of maskrcnn 2.")] = None,
-    rate: Annotated[float | None, typer.Option(metavar="X", help="Of Adam; the detector's if not given.")] = None,
-    finetune_fraction: Annotated[
-        float, typer.Option(metavar="FRACTION", help="Of the images of a training, for the last of A,B.")
-    ] = 0.5,
-    warm_start: Annotated[
-        bool, typer.Option("--warm-start", help="Each set starts from the detector of the set before.")
-    ] = False,
-    size: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Images come so large; about 256x192 if not given.")
-    ] = None,
+    generate: Annotated[int, typer.Option(metavar="N", help="Images to generate for each set.")] = 600,
     seeds: Annotated[int, typer.Option(metavar="N", help="Trainings of each set.")] = 5,
     seed: Seed = 0,
-    baseline: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Compare the sets with this one; the first if not given.")
+    workers: Annotated[int, typer.Option(metavar="N", help="Processes; the results do not depend on it.")] = 1,
+    real_numbers: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N,...",
+            help="Sets of so many photographs; 10,20,50,all if not given, or none.",
+            rich_help_panel="Training sets",
+        ),
     ] = None,
-    resamples: Annotated[int, typer.Option(metavar="N", help="Of test images and seeds, for intervals.")] = 1000,
-    workers: Annotated[int, typer.Option(metavar="W", help="Processes; the results do not depend on it.")] = 1,
+    sources: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help="Policies of RUN; start is the initialisation.",
+            rich_help_panel="Training sets",
+        ),
+    ] = "prior,start,learnt",
+    classes: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="Classes to detect; all if not given.", rich_help_panel="Labels"),
+    ] = None,
+    min_visible: MinVisible = 0.2,
+    box_margin: BoxMargin = 0,
+    detector: Detector = "efficientnet",
+    size: Size = None,
+    iterations: Iterations = None,
+    batch: Batch = None,
+    rate: Rate = None,
+    finetune_fraction: FinetuneFraction = 0.5,
+    warm_start: Annotated[
+        bool,
+        typer.Option(
+            "--warm-start",
+            help="Initialise the detector of each set from that of the set before.",
+            rich_help_panel="Detector",
+        ),
+    ] = False,
+    baseline: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Set to compare with; the first if not given; repeat for more.",
+            rich_help_panel="Comparison",
+        ),
+    ] = None,
+    resamples: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help="Bootstrap resamples, for intervals.",
+            rich_help_panel="Comparison",
+        ),
+    ] = 1000,
     value_range: ValueRange = None,
-) -> None:
-    """Say what labelled sets are worth: train one detector on each, test it on labelled real images."""
+) -> str:
+    """Compare training sets by the detectors that are trained on them."""
     from rich.console import Console
 
     from ..api import calls
@@ -107,6 +137,8 @@ def trial(
     found = calls.trial(test, out, named, options, workers=workers)
     show(found, Console(highlight=False))
     print(f"All figures are in {out / 'results.json'}, the picture is {out / 'results.png'}")
+    photos = ("PHOTOS", "--labels", "LABELS") if real is None else (real,)
+    return command_line("train", run or "MODEL_OR_RUN", "--real", *photos, "--out", "DETECTOR")
 
 
 def _numbers(text: str) -> list[int | None]:

@@ -172,8 +172,8 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
         grounds.append(np.clip(ground_of(image, there, rng) * gain, 0, 255).round().astype(np.uint8))
         covers.append(float(there.mean()))
         show("cutting", i + 1, len(found.images))
-    if renamed := [f"{name} {kind}" for name, kind in kinds.items() if name != kind]:
-        notes.append(f"In the model and in labels.json, classes are called otherwise: {', '.join(renamed)}.")
+    if renamed := [f"{name} is {kind}" for name, kind in kinds.items() if name != kind]:
+        notes.append(f"Classes are renamed in the model and in labels.json: {', '.join(renamed)}.")
     ignored = {name for name in kinds if composed(name) in map(composed, options.ignore)}
     chosen = {name: _chosen(name, some, rng, notes) for name, some in cut.items()}
     empty = [name for name, some in chosen.items() if not some]
@@ -185,7 +185,7 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
     for name in empty:
         notes.append(f"{name}: no object could be cut out, so that the model has no such class; label larger ones.")
     if len(grounds) == 1:
-        notes.append("One photograph is all there is: scenes have one ground. Label a few more.")
+        notes.append("Only one photograph is labelled, so scenes have one background. Label a few more.")
     best = np.argsort(covers, kind="stable")[:MAX_GROUNDS]
     usable = {n: on for n, on in relation.items() if chosen[n] and chosen[on] and not {n, on} & ignored}
     model = _model(found, chosen, kinds, _Roles(ignored, usable), options, out)
@@ -284,7 +284,7 @@ def _chosen(name: str, some: list[Cutout], rng: np.random.Generator, notes: list
     """The cut-outs of a class that are drawn."""
     clear = [one for one in some if one.contrast >= MIN_CONTRAST]
     if clear and len(clear) < len(some):
-        notes.append(f"{name}: {len(some) - len(clear)} objects that look like their ground are not drawn.")
+        notes.append(f"{name}: {len(some) - len(clear)} objects that look like their background are not drawn.")
         some = clear
     if len(some) >= MIN_TO_CHOOSE:
         area = np.log([max((one.rgba[..., 3] > 127).sum(), 1) for one in some])

@@ -98,7 +98,7 @@ def predict(
     if format not in FORMATS:
         raise ProbsceneError(f"expected the format coco or yolo, got {format!r}.")
     if min_score is not None and not 0 <= min_score <= 1:
-        raise ProbsceneError(f"expected a least score from 0 to 1, got {min_score}.")
+        raise ProbsceneError(f"expected a lowest score from 0 to 1, got {min_score}.")
     out = Path(out)
     if format == "yolo" and out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise DataError(f"expected a new or empty folder for YOLO's labels, got {out}, which is none; name another.")

@@ -35,7 +35,7 @@ def show_predictions(found: Predictions, console: Console) -> None:
         number = np.array([(each.classes == c).sum() for each in found.found])
         table.add_row(name, str(number.sum()), str((number > 0).sum()))
     console.print(table)
-    console.print(f"Scores of at least {found.min_score:.3g}, {found.reason}.", soft_wrap=True)
+    console.print(f"Scores are at least {found.min_score:.3g}, {found.reason}.", soft_wrap=True)
     if found.label_next:
         console.print(f"Worth labelling next: {', '.join(found.label_next)}", markup=False, soft_wrap=True)
 

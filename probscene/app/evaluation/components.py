@@ -138,9 +138,9 @@ def verdict_components(
 def prior_sites(run: RunFolder) -> dict[str, str]:
     """Sites that keep the prior, and why; empty where no parameters were to be learnt."""
     if not run.parameters and run.config.parameters is not None:
-        return {site.name: f"{run.features.name} features read no parameters" for site in find_sites(run.model)}
+        return {site.name: f"{run.features.name} features cannot read parameters" for site in find_sites(run.model)}
     kept = run.parameters.get("kept") == PRIOR
-    none = "scenes came no nearer to held-out images by what was learnt"
+    none = "what was learnt came no nearer to held-out images"
     sites = run.parameters.get("sites", [])
     return {site["name"]: site["because"] or none for site in sites if kept or not site["learnt"]}
 
@@ -191,7 +191,7 @@ def _layout(run: RunFolder, sources: dict[str, SourceFeatures], seed: int) -> tu
     """Good only where no class is no better than in the prior."""
     if not sources[TARGET].layouts:
         reason = f"Not judged: {run.features.name} features do not say where objects are."
-        return VerdictComponent(None, reason, "Take --features count to have it judged."), {}
+        return VerdictComponent(None, reason, "Fit with --features count to have it judged."), {}
     names, found = list(sources[TARGET].layouts), {}
     for name in names:
         samples, tests = _samples(sources, lambda source, name=name: source.layouts[name]), len(names) - 1
@@ -206,9 +206,11 @@ def _more_data(sources: dict[str, SourceFeatures]) -> str:
     """What would narrow a comparison's interval: more of the smaller sample, up to what is compared."""
     target, scenes = (len(sources[name].looks.features) for name in (TARGET, LEARNT))
     if target < scenes:
-        return "More photographs would tell."
+        return "More photographs would decide it."
     return (
-        "More scenes would tell: --scenes." if scenes < NUM_IMAGES else "As many images as are looked at do not tell."
+        "More scenes would decide it: --scenes."
+        if scenes < NUM_IMAGES
+        else "The most images that are compared do not decide it."
     )
 
 
@@ -220,10 +222,10 @@ def _component(
         return VerdictComponent(None, reason, "Fix the structure first.")
     grade, reason = figures.grade, residual_reason(figures)
     if grade is None:
-        reason = f"Of {figures.rows} images neither what was learnt nor the prior can be told from the target."
+        reason = f"With {figures.rows} images, neither the fit nor the prior differs significantly from the target."
         return VerdictComponent(None, reason, more_data, figures, UNSURE)
     if worse and grade is Grade.GOOD:
-        grade, reason = Grade.BETTER, f"{reason} By themselves these are not nearer than in the prior: {worse}."
+        grade, reason = Grade.BETTER, f"{reason} Classes that alone are no better than the prior: {worse}."
     return VerdictComponent(grade, reason, component_remedy(run, name, grade, figures, more_data), figures, str(grade))
 
 

@@ -187,8 +187,8 @@ def usable(run: RunFolder) -> str:
     bad = ", ".join(name for name in things if name in run.unread)
     if not classes or not bad:
         return f"All classes can be read in the target's images: {good}." if good else ""
-    cannot = f"{bad} cannot be read in the target's images and keep the prior: label ten of them (probscene label)."
-    return f"Can be used: {good}; {cannot}" if good else f"No class can be used: {cannot}"
+    cannot = f"not readable in the target's images: {bad}, which keep the prior. Label ten images (probscene label)."
+    return f"Usable: {good}; {cannot}" if good else f"No class is usable; {cannot}"
 
 
 class _ThumbnailNet:

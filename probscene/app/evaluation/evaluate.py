@@ -115,9 +115,9 @@ class Evaluation:
         """The same in one sentence; empty where there is nothing."""
         short = ", ".join(dict.fromkeys(found.name for found in self.saturated_lists if not found.beyond_prior))
         images = len({row for found in self.unreachable_counts for row in found.rows})
-        parts = [f"lists pile up at their longest ({short})"] if short else []
-        parts += [f"{images} images have numbers of objects that the model cannot have"] if images else []
-        return f"Mind the prior: {' and '.join(parts)}; the warnings say what to change." if parts else ""
+        parts = [f"lists reach their maximum length ({short})"] if short else []
+        parts += [f"{images} images have counts that the model cannot generate"] if images else []
+        return f"The prior is too narrow: {' and '.join(parts)}; the warnings say what to change." if parts else ""
 
     def distance(self, a: str, b: str) -> dict[str, Any]:
         """Distances of source ``a`` from ``b``: total variation of the number of objects and of the pooled class

@@ -17,17 +17,17 @@ from ..fitting.run import RunFolder
 from .source_features import STRUCTURE
 
 STRUCTURE_REMEDY = {
-    Verdict.GOOD: "Use it; look at the images named below, and label a few to be sure that the network counts rightly.",
-    Verdict.MODE_COLLAPSE: "Fit again with another seed or a lower learning rate, with the KDE objective and "
-    "leave_one_out, or pretrain on a wider prior.",
-    Verdict.OUT_OF_SUPPORT: "Look at these images: widen the prior or the grammar, so that it can make them, or leave "
-    "them out of the target folder.",
-    Verdict.DOMAIN_SHIFT: "Check that the target folder belongs to this model; if it does, its renders do not look "
-    "like the images: change its sprites and their scale",
+    Verdict.GOOD: "Use the fit. Look at the images named below, and label a few to check the network's counts.",
+    Verdict.MODE_COLLAPSE: "Fit again with another seed or a lower learning rate, with --divergence kde and "
+    "--set structure.baseline=leave_one_out, or pretrain on a wider prior.",
+    Verdict.OUT_OF_SUPPORT: "Look at these images. Widen the prior or the grammar so that the model can make them, "
+    "or remove them from the target folder.",
+    Verdict.DOMAIN_SHIFT: "Check that the target folder belongs to this model. If it does, its renders look unlike "
+    "the images: change its sprites and their scale",
 }
 PHOTO = (
-    "Put scene.photo(...), with light, colour, focus and noise, into the model, or sprites and textures nearer to the "
-    "images."
+    "Add scene.photo(...), with light, colour, blur and noise, to the model, or use sprites and textures that look "
+    "more like the images."
 )
 LONGER = {
     LIKELIHOOD: ("parameters.steps", "parameters.rounds"),
@@ -35,7 +35,7 @@ LONGER = {
     META_SIM: ("parameters.steps",),
 }
 NO_SITES = {
-    TILTING: "Give the model sites of the whole scene that images show.",
+    TILTING: "Give the model sites of the whole scene, such as light, whose values show in the images.",
     META_SIM: "Give the model continuous sites.",
 }
 DOUBTFUL_DOMAIN_SHARE = 0.2  # of the real images: said beside another verdict
@@ -50,48 +50,46 @@ def structure_reason(found: StructureVerdict) -> str:
     feature = "all features together"
     if differ.feature is not None:
         feature = f"the feature {x.feature_names[differ.feature]!r}"
-    difference = f"{number} can be told apart, most by {feature} (total variation {differ.total_variation:.2f})"
+    difference = f"{number} differ significantly, most in {feature} (total variation {differ.total_variation:.2f})"
     shifted = f"{percent(x.domain_shift_share)} of the real images"
     doubt = x.by_patches and x.domain_shift_share > DOUBTFUL_DOMAIN_SHARE
-    doubt = f" {shifted} show what is unlike anything in scenes." if doubt else ""
+    doubt = f" {shifted} show something that no scene shows." if doubt else ""
     if verdict is Verdict.DOMAIN_SHIFT:
         if x.by_patches:
-            return f"{shifted} show what is unlike anything in scenes."
-        return f"{shifted} are by their features farther from every scene than two random scenes are from one another."
+            return f"{shifted} show something that no scene shows."
+        return f"{shifted} have features that are farther from every scene than two random scenes are from each other."
     if verdict is Verdict.OUT_OF_SUPPORT:
-        rest = "; without them generated and real features are less than half as far apart"
+        rest = "; without them, generated and real features are less than half as far apart"
         return f"{_out_of_support(x.real_out_of_support)}{rest if found.outliers_explain else ''}."
     if verdict is Verdict.NOT_FITTED:
-        return f"{difference}, while generated and prior scenes cannot be told apart.{doubt}"
+        return f"{difference}, while generated and prior scenes do not.{doubt}"
     if verdict is Verdict.MODE_COLLAPSE:
         lost = x.modes.collapsed
         real, generated = (percent(float(shares[lost].sum())) for shares in (x.modes.real, x.modes.generated))
         return (
-            f"{int(lost.sum())} of {len(lost)} clusters, {real} of the real images, are {generated} of the generated "
-            "ones: surely less than a quarter of their share."
+            f"{int(lost.sum())} of {len(lost)} clusters hold {real} of the real images and {generated} of the "
+            "generated ones, significantly less than a quarter."
         )
     if verdict is Verdict.UNDERFIT:
         return f"{difference}.{doubt}"
-    detectable = ", as far as features that hardly vary say"
+    detectable = "the features hardly vary"
     if differ.detectable is not None:
-        detectable = (
-            f": differences above a total variation of {differ.detectable:.2f} in any one feature would be seen"
-        )
+        detectable = f"a total variation above {differ.detectable:.2f} in any one feature would have been detected"
     return (
-        f"{number} cannot be told apart{detectable}; {percent(x.real_uncovered.share)} of the real images are like no "
-        f"generated scene (between real halves up to {percent(x.real_uncovered.floor)})."
+        f"{number} do not differ significantly; {detectable}. {percent(x.real_uncovered.share)} of the real images are "
+        f"like no generated scene (noise floor: up to {percent(x.real_uncovered.floor)})."
     )
 
 
 def structure_remedy(run: RunFolder, verdict: Verdict) -> str:
     """What to do about structure."""
     if verdict is Verdict.NOT_FITTED:
-        return f"The guide still makes what the prior makes. {longer(run, ('structure.batches',))}"
+        return f"The guide has hardly moved away from the prior. {longer(run, ('structure.batches',))}"
     if verdict is Verdict.UNDERFIT:
         fit_longer = longer(run, ("structure.batches",))
-        return f"{fit_longer} Where a class is read wrongly that does not help: {label_images(run)}."
+        return f"{fit_longer} If the network counts a class wrongly, that does not help: {label_images(run)}."
     if verdict is Verdict.DOMAIN_SHIFT:
-        features = "" if run.features.pretrained else ", or take pretrained features"
+        features = "" if run.features.pretrained else ", or use pretrained features"
         return f"{STRUCTURE_REMEDY[verdict]}{features}."
     return STRUCTURE_REMEDY[verdict]
 
@@ -99,14 +97,14 @@ def structure_remedy(run: RunFolder, verdict: Verdict) -> str:
 def residual_reason(figures: ResidualRatio) -> str:
     """The sentence with the figures that a grade of layout or looks rests on."""
     if figures.ratio is None:
-        return "It is farther from the target than chance leaves, and the prior is not."
+        return "Its distance from the target is above the noise floor, and the prior's is not."
     low, ratio, high = (
         f"{100 * max(0.0, share):.0f} %" if np.isfinite(share) else "any share"
         for share in (figures.low, figures.ratio, figures.high)
     )
     nearest = STRUCTURE if figures.nearest == STRUCTURE else "the prior"
     share = f"{ratio} ({low} to {high}) of the squared distance of {nearest} from the target is left"
-    return f"{share}{'; chance alone would leave as much' if figures.close else ''}."
+    return f"{share}{', which is within the noise floor' if figures.close else ''}."
 
 
 def component_remedy(run: RunFolder, part: str, grade: Grade, figures: ResidualRatio, more_data: str) -> str:
@@ -126,8 +124,8 @@ def component_remedy(run: RunFolder, part: str, grade: Grade, figures: ResidualR
 
 def doubtful_sites_reason(names: tuple[str, ...]) -> tuple[str, str]:
     """Why the whole is not judged for sites that keep the prior, and what to do."""
-    reason = f"Every part is good, but {', '.join(names)} kept the prior, and nothing shows that the target has it."
-    return reason, f"Set these priors by hand, and say infer={{{LEARN!r}: False}} of those that are meant as they are."
+    reason = f"Every part is good, but {', '.join(names)} kept the prior, which may not be the target's."
+    return reason, f"Set these priors by hand, and mark those that are right with infer={{{LEARN!r}: False}}."
 
 
 def label_images(run: RunFolder) -> str:
@@ -142,7 +140,7 @@ def longer(run: RunFolder, names: tuple[str, ...]) -> str:
     settings = run.config.flat()
     values = [settings[name] for name in names]
     options = " ".join(f"--set {name}={max(1, 2 * value)}" for name, value in zip(names, values, strict=True))
-    return f"Fit again for longer, such as twice the {' and '.join(map(str, values))} of this fit: {options}."
+    return f"Fit for longer, such as twice as long: {options}."
 
 
 def percent(share: float) -> str:
@@ -151,8 +149,8 @@ def percent(share: float) -> str:
 
 def _out_of_support(found: UncoveredShare) -> str:
     return (
-        f"{percent(found.share)} of the real images are like no generated and no prior scene (between real halves at "
-        f"most {percent(found.floor)})"
+        f"{percent(found.share)} of the real images are like no generated and no prior scene (noise floor: up to "
+        f"{percent(found.floor)})"
     )
 
 
@@ -162,15 +160,16 @@ def _learn_parameters(run: RunFolder) -> str:
     method = record.get("method", LIKELIHOOD)
     if not record:
         if run.config.parameters is None:
-            return f"Learn parameters, too: fit again with --learn {BOTH}."
-        return f"These features read no parameters: fit again with --features count, or --parameters {TILTING}."
+            return f"Fit again with --learn {BOTH}."
+        return f"These features cannot read parameters: fit again with --features count, or --parameters {TILTING}."
     if not any(site["learnt"] for site in record["sites"]):
         if method == LIKELIHOOD:
-            return f"The reader reads no site. {longer(run, ('parameters.reader_steps',))}"
+            return f"The reader cannot read any site. {longer(run, ('parameters.reader_steps',))}"
         return NO_SITES[method]
     if record["kept"] != "learnt":
         return (
-            "What was learnt came no nearer to held-out images, and is unused: take the default preset or more images."
+            "Learnt parameters came no nearer to held-out images than the prior, so the prior is kept: use the default "
+            "preset or more images."
         )
     return longer(run, LONGER[method])
 
@@ -179,7 +178,7 @@ def _unread_sites(record: dict[str, Any]) -> str:
     names = [site["name"] for site in record.get("sites", []) if not site["learnt"]]
     if not names:
         return ""
-    what = "Set the priors of these by hand, or write the program so that images show them."
+    what = "Set their priors by hand, or change the program so that their values show in images."
     return f"Not learnt: {', '.join(names)}. {what}"
 
 
@@ -191,7 +190,7 @@ def _far_sites(record: dict[str, Any]) -> str:
     for site in record["sites"]:
         distance = site.get("read", {}).get("distance")
         if site["learnt"] and distance and distance["learnt"] > FAR_SITE_FLOORS * distance["floor"]:
-            text = f"{site['name']} ({distance['learnt']:.3f}, floor {distance['floor']:.3f})"
+            text = f"{site['name']} ({distance['learnt']:.3f}, noise floor {distance['floor']:.3f})"
             far.append((distance["learnt"], text))
     names = ", ".join(text for _, text in sorted(far, reverse=True))
-    return f"Farthest from what is read in the target: {names}." if names else ""
+    return f"Sites whose readings are farthest from the target's: {names}." if names else ""

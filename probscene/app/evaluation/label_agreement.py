@@ -79,12 +79,12 @@ class Agreement(NamedTuple):
         """In words, with the figures of the worst histogram."""
         figures = self._figures
         if self.agrees(verdict):
-            which = "as near to the labels as labels are to one another" if self.close else "far from the labels"
+            which = "within the noise floor of the labels" if self.close else "above the noise floor"
             return f"The labels agree: learnt structures are {which} ({figures})."
         if self.close:
             return (
-                f"The labels disagree: learnt structures are right ({figures}), so it is the features of the images "
-                "that differ."
+                f"The labels disagree: learnt structures are right ({figures}), so only the features of the images "
+                "differ."
             )
         return f"{self._disagreement} {self._full_remedy}"
 
@@ -93,17 +93,17 @@ class Agreement(NamedTuple):
         """Of the worst histogram."""
         found = self.histograms[self.worst]
         return (
-            f"{self.worst}: total variation {found.distance:.3f}; seen on {self.sample_size} of each, "
-            f"{found.resampled:.3f}, by chance {found.floor:.3f} and up to {found.high:.3f}"
+            f"{self.worst}: total variation {found.distance:.3f}; of samples of {self.sample_size}, "
+            f"{found.resampled:.3f}, noise floor {found.floor:.3f}, up to {found.high:.3f}"
         )
 
     @property
     def _disagreement(self) -> str:
-        return f"The labels disagree: features match and structures do not ({self._figures})."
+        return f"The labels disagree: the features match, and the structures do not ({self._figures})."
 
     @property
     def _full_remedy(self) -> str:
-        return f"Wrongly read in the images: {', '.join(self.wrong)}. {self.remedy[:1].upper()}{self.remedy[1:]}."
+        return f"Counted wrongly in the images: {', '.join(self.wrong)}. {self.remedy[:1].upper()}{self.remedy[1:]}."
 
     def corrected(self, verdict: dict[str, Any]) -> dict[str, Any]:
         """A verdict on parts and classes, for JSON, in which nothing is good that the labels disagree with."""

@@ -84,14 +84,13 @@ class SaturatedList:
         return self.name if self.rank is None else f"{self.name} at rank {self.rank + 1}"
 
     def __str__(self) -> str:
-        what = "are longer than" if self.beyond_prior else "have length"
-        end = "the prior's longest" if self.beyond_prior else "the longest that the model allows"
-        text = f"{self.which}: {_percent(self.learnt)} of the learnt lists {what} {self.longest}, {end}"
+        what = "are longer than the prior's maximum" if self.beyond_prior else "have the model's maximum length"
+        text = f"{self.which}: {_percent(self.learnt)} of the learnt lists {what}, {self.longest}"
         text += f" ({_percent(self.declared)} {'in pretraining' if self.beyond_prior else 'in the prior'})"
         if self.longer_images is not None:
             text += f", and the network counts more in {_percent(self.longer_images)} of the images"
-        guess = "" if self.longer_images else " as a first try"
-        return f"{text}. Where the images have more, give it room{guess}: {self.remedy}."
+        guess = "" if self.longer_images else ", as a first try"
+        return f"{text}. If the images have more, allow longer lists{guess}: {self.remedy}."
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
@@ -109,8 +108,8 @@ def saturation_warnings(found: Iterable[SaturatedList]) -> list[str]:
     if beyond:
         lists = ", ".join(f"{one.which} up to {one.length} ({_percent(one.learnt)} are longer)" for one in beyond)
         warnings.append(
-            "Note: learnt lists are longer than the prior's longest, as pretraining allows; if images have such, the "
-            f"prior should, too: {lists}."
+            "Note: learnt lists are longer than the prior's maximum, as pretraining allows; if images have such lists, "
+            f"widen the prior: {lists}."
         )
     return warnings
 
@@ -228,12 +227,12 @@ class UnreachableCounts:
     remedy: str = ""
 
     def __str__(self) -> str:
-        who = f"{len(self.rows)} of {self.of} images" + ("" if self.labelled else ", as the network counts,")
+        who = f"{len(self.rows)} of {self.of} images" + ("" if self.labelled else ", by the network's counts,")
         show = "show" if len(self.rows) != 1 or self.of != 1 else "shows"
-        extreme = "the most" if self.side == MORE else "the fewest"
-        text = f"{who} {show} {self.side} than {self.limit} {self.what}, {extreme} that the model can have"
+        extreme = "maximum" if self.side == MORE else "minimum"
+        text = f"{who} {show} {self.side} than {self.limit} {self.what}, the model's {extreme}"
         files = ", ".join(self.names[:NAMED_IMAGES]) + (", ..." if len(self.names) > NAMED_IMAGES else "")
-        return f"{text}{f' ({files})' if files else ''}. To allow it: {self.remedy}."
+        return f"{text}{f' ({files})' if files else ''}. To allow that: {self.remedy}."
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
@@ -350,13 +349,13 @@ class _Sets:
                 return f"give {qualified_name(grammar, v)} a weight above 0 for {rules} in the prior"
         if allows(Support(grammar, grammar.legal[:, None, None])):
             symbols = [qualified_name(grammar, v) for v in range(len(grammar.nonterminals)) if self.impossible_rules(v)]
-            return f"widen the prior in more than one place, of {', '.join(symbols)}"
+            return f"widen the prior of several nonterminals: {', '.join(symbols)}"
         kind = grammar.kinds[self.kinds[s][0]]
         if len(self.kinds[s]) > 1 or sign > 0:
             name = kind[:1].upper() + kind[1:]
-            return f"make a list of it in the grammar, such as {name}s -> {kind} {name}s | ε, where it stands alone now"
+            return f"make it a list in the grammar, such as {name}s -> {kind} {name}s | ε"
         alone = sorted({str(rule) for rule in grammar.rules if kind in dict(rule.flatten()[0])})
-        return f"give the grammar a way to do without it, such as ε beside '{alone[0]}'"
+        return f"let the grammar leave it out, such as by ε beside '{alone[0]}'"
 
     def shortest_end(self, allows: Callable[[Support], bool], bounds: ListBounds, needed: int) -> int | None:
         """The shortest end of a list that is enough, at most as many elements more as are needed."""

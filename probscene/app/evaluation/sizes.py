@@ -120,10 +120,10 @@ def with_sizes(found: VerdictComponents, by_class: dict[str, Sizes]) -> VerdictC
     reason = "; ".join(f"{name}: {size}" for name, size in by_class.items()) + "."
     wrong = [name for name, size in by_class.items() if size.grade is Grade.NO_BETTER]
     remedy = (
-        f"Sizes of {', '.join(wrong)} are wrong: set the priors of the sites that they hang on by these figures, and "
-        "leave those sites out of learning (infer={'learn': False})."
+        f"Sizes of {', '.join(wrong)} are wrong: set the priors of the sites that determine them by these figures, "
+        "and exclude those sites from learning (infer={'learn': False})."
         if wrong
-        else "More boxes would tell."
+        else "More boxes would decide it."
         if grade is None
         else ""
     )
@@ -131,7 +131,7 @@ def with_sizes(found: VerdictComponents, by_class: dict[str, Sizes]) -> VerdictC
     parts = found.parts | {"sizes": component}
     looks, worse = parts["looks"], ", ".join(name for name, size in by_class.items() if size.worse)
     if worse and looks.grade in (Grade.GOOD, Grade.BETTER):
-        reason = f"{looks.reason} But the sizes of {worse} are farther from those given than the prior's."
+        reason = f"{looks.reason} But the sizes of {worse} are farther from the labelled ones than the prior's."
         lowered = {"grade": Grade.NO_BETTER, "verdict": str(Grade.NO_BETTER), "reason": reason, "remedy": remedy}
         parts["looks"] = replace(looks, **lowered)
     return replace(found, parts=parts)

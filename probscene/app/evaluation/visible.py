@@ -135,8 +135,8 @@ def hidden_note(
         return ()
     text = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in shares.items())
     return (
-        "Counts are compared with whole structures; in learnt scenes less than a quarter can be seen of some objects "
-        f"({text}). If labels leave out what is hidden, add --visible {HARDLY_VISIBLE:g}, or --visible CLASS=SHARE.",
+        "Counts are compared with whole structures; in learnt scenes, less than a quarter of some objects is visible "
+        f"({text}). If labels leave out hidden objects, add --visible {HARDLY_VISIBLE:g}, or --visible CLASS=SHARE.",
     )
 
 

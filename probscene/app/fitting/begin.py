@@ -225,9 +225,9 @@ def _chosen(config: FitConfig, model: SceneModel, images: Images, labelled: bool
         return config.for_renders()
     photographs = config.for_photographs()
     show.say(
-        f"Note: the target's images look unlike the model's renders ({share:.0%} of them like none), so features that "
-        f"count in photographs are taken; --features {config.features.renders.name} keeps the others, --features "
-        f"{photographs.make_features().name} says so from the start."
+        f"Note: domain shift: {share:.0%} of the target's images look unlike any render of the model, so --features "
+        f"{photographs.make_features().name}, for photographs, is used instead of {config.features.renders.name}. "
+        "Give --features to choose."
     )
     return photographs
 

@@ -53,7 +53,9 @@ def sites_record(learning: ImageLevelTraining) -> list[dict[str, Any]]:
     for site in learning.sites:
         because, is_learnt = site.keeps, site in learning.learnt
         if not because and not is_learnt:
-            because = "how near images look does not depend on it" if site.of_scene else "it is not of the whole scene"
+            because = (
+                "the similarity of images does not depend on it" if site.of_scene else "it is not of the whole scene"
+            )
         about = {"name": site.name, "kinds": site.kinds, "learnt": is_learnt}
         about |= {"fitted": site in learning.guide.sites if learning.guide is not None else False}
         sites.append(about | {"skill": None, "because": because})

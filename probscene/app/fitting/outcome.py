@@ -40,7 +40,7 @@ def feature_mask(net: FeatureNet) -> Tensor | None:
 
 def give_up(run: RunFolder) -> str:
     """Keep the prior, as no feature can be read; why, in a sentence."""
-    because = "Nothing can be read in the target's images, so that nothing can be learnt from them"
+    because = "Nothing can be read in the target's images, so nothing can be learnt from them"
     _keep_prior(run, {"kept": "prior", "because": because})
     return f"{because}; the prior is kept."
 
@@ -151,20 +151,18 @@ def _worse_said(worse: dict[str, tuple[float, float]]) -> str:
         return ""
     each = ", ".join(f"{name} ({learnt:.2f} against {labels:.2f})" for name, (learnt, labels) in worse.items())
     return (
-        "Learnt scenes predict the labels worse than the labels' own histogram does, by the continuous ranked "
-        f"probability score in objects: {each}. Label more images, and fit again with all of them."
+        "By the continuous ranked probability score, in objects, learnt scenes predict the labels worse than the "
+        f"labels' own histogram does: {each}. Label more images, and fit again with all of them."
     )
 
 
 def _said(changed: dict[str, tuple[float, float]]) -> str:
     if not changed:
         return ""
-    each = ", ".join(
-        f"{name} (from {before:.2f} to {after:.2f} in a structure)" for name, (before, after) in changed.items()
-    )
+    each = ", ".join(f"{name} (from {before:.2f} to {after:.2f} a scene)" for name, (before, after) in changed.items())
     return (
-        "Not readable in the target's images, and yet of another number than in the prior, as they go with what was "
-        f"learnt of other classes: {each}. Label ten images to have them compared."
+        "These classes cannot be counted in the target's images, and their counts changed with those of other classes: "
+        f"{each}. Label ten images to have them compared."
     )
 
 

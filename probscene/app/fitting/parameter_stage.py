@@ -64,8 +64,12 @@ def learn_parameters(
     by_reading = isinstance(schedule, ParameterSchedule)
     joint = isinstance(schedule, MetaSimSchedule) and isinstance(run.model.grammar, JointGrammar)
     if joint or (by_reading and backbone is None):
-        who = "models of several scenarios are" if joint else f"{run.features.name} features are"
-        say(f"Where things stand and how they look keeps the prior: {who} not read for it yet.")
+        why = (
+            "meta-sim takes no models of several scenarios"
+            if joint
+            else f"{run.features.name} features do not read them"
+        )
+        say(f"Position and appearance keep the prior: {why}.")
         return
     kept = run.read_tensors(NAME)
     if kept is None:
@@ -141,12 +145,12 @@ def _said(record: dict[str, Any]) -> str:
     others = ", ".join(site["name"] for site in sites if not site["learnt"])
     if not named:
         why = "read in renders" if read else "moved"
-        return f"No site can be {why}, so where things stand and how they look keeps the prior."
-    said = f"Sites that are learnt{', with the share of their variance that is read' * read}: {', '.join(named)}."
-    said += f" Keeping the prior: {others}." if others else ""
+        return f"No site can be {why}, so position and appearance keep the prior."
+    said = f"Learnt sites{', with the explained variance of their readings' * read}: {', '.join(named)}."
+    said += f" Sites that keep the prior: {others}." if others else ""
     if record["kept"] != "learnt":
         said += (
-            f" All keep the prior, as learnt scenes come no nearer to held-out images, {record['learnt']:.2f} against "
-            f"{record['prior']:.2f} in energy distance."
+            f" All keep the prior, as learnt scenes come no nearer to held-out images (energy distance "
+            f"{record['learnt']:.2f}, of the prior {record['prior']:.2f})."
         )
     return said

@@ -256,7 +256,7 @@ class RunFolder(Storage):
         """
         tensors = self.read_tensors("guide")
         if tensors is None:
-            raise RunError(f"expected a finished fit in {self.path}, got an unfinished one; go on with --resume.")
+            raise RunError(f"expected a finished fit in {self.path}, got an unfinished one; continue with --resume.")
         if PRIOR_KEPT in tensors:
             return self.model.prior
         guide = self.new_guide()

@@ -121,7 +121,7 @@ def own_net(run: RunFolder) -> FeatureNet:
     """
     net = run.network()
     if net is None:
-        raise RunError(f"expected the feature network in {run.path}, got none; go on with --resume.")
+        raise RunError(f"expected the feature network in {run.path}, got none; continue with --resume.")
     return net
 
 

@@ -262,7 +262,7 @@ def looser(photographs: LabelledSet, made: LabelledSet) -> str | None:
     words = ", ".join(f"{name} {a:.0f} for {b:.0f}" for name, (a, b) in known.items())
     return (
         f"Boxes of the photographs are wider than those of generated images, in pixels of these: {words} (median "
-        f"root of the area). If people left room around the same objects, --box-margin {margin} leaves it, too."
+        f"root of the area). If people drew loose boxes around the same objects, use --box-margin {margin}."
     )
 
 

@@ -68,7 +68,7 @@ def legend(results: Results) -> str:
     return (
         f"{counts['test_images']} test images, {counts['seeds']} seeds, {results.budget} for every set. Below each "
         f"figure its 95 % interval: {counts['resamples']:,} resamples of test images and seeds, the same for all sets. "
-        "An * marks a difference whose interval leaves out 0. Worth: as many labelled photographs alone reach the mean."
+        "* marks a difference whose interval excludes 0. Worth: as many labelled photographs alone reach the same mean."
     )
 
 

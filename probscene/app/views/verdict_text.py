@@ -20,9 +20,9 @@ FLOOR = "The noise floor is the distance between two halves of the real images."
 PARTS_HEAD = ("", "verdict", "this fit", "structure alone", "prior", "noise floor")
 DISTANCES = (LEARNT, STRUCTURE, PRIOR)
 OVERALL = (
-    "Energy distances from the target: of the run's features, of where objects stand in images with as many of them, "
-    "and of EfficientNet's features; sizes are medians of boxes. The whole is as good as its worst part. "
-    f"{FLOOR}"
+    "Energy distances from the target: structure by the run's features, layout by the positions of objects in images "
+    "with equal counts, looks by EfficientNet's features; sizes by the medians of boxes. The verdict is that of the "
+    f"worst part. {FLOOR}"
 )
 
 
@@ -168,9 +168,9 @@ def rows(x: StructureStatistics) -> list[tuple[str, ...]]:
     out += [
         ("detectable total variation of one feature", detectable, ""),
         ("p-value, all images", f"{x.p_value:.3f}", ""),
-        ("real like no generated", *_uncovered(x.real_uncovered)),
-        ("real like no generated or prior", *_uncovered(x.real_out_of_support)),
-        ("generated like no real", *_uncovered(x.generated_uncovered)),
+        ("real images like no generated one", *_uncovered(x.real_uncovered)),
+        ("real images like no generated or prior one", *_uncovered(x.real_out_of_support)),
+        ("generated images like no real one", *_uncovered(x.generated_uncovered)),
         ("collapsed clusters", shares, "0"),
         (f"real images with a domain shift, by {looks}", percent(x.domain_shift_share), "50.0 %"),
         ("effective sample size / N", f"{x.ess_fraction:.2f}", f"{x.ess_fraction_floor:.2f}"),
@@ -191,7 +191,7 @@ def _sentences(found: FitDiagnostics) -> list[str]:
 
 def _energy(found: EnergyTest, unit: float | None = None) -> tuple[str, str]:
     unit = unit or found.floor or 1.0
-    return f"{found.distance / unit:.2f} floors", f"{found.low / unit:.2f} to {found.high / unit:.2f}"
+    return f"{found.distance / unit:.2f} noise floors", f"{found.low / unit:.2f} to {found.high / unit:.2f}"
 
 
 def _uncovered(found: UncoveredShare) -> tuple[str, str]:

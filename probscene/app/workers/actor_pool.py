@@ -158,7 +158,8 @@ class ActorPool:
             nodes_left = f"{len(nodes)} with fewer" if nodes else "none left"
             raise MachineError(
                 f"expected a node with {self.threads} cores for an actor in the cluster at {self.address}, "
-                f"got {nodes_left}. Start nodes, or ask for fewer --threads; the same command goes on where it stopped."
+                f"got {nodes_left}. Start nodes, or ask for fewer --threads; the same command "
+                "continues where it stopped."
             )
         for rank in range(max(slots.values())):
             for node, number in slots.items():
@@ -222,7 +223,7 @@ class ActorPool:
         if number >= MAX_ACTOR_DEATHS and task != "versions":
             raise MachineError(
                 f"expected an actor to do its task, got {number} actors that died with the same one, most often for "
-                "lack of memory. Run the same command again: it goes on where it stopped; nodes with fewer CPUs "
+                "lack of memory. Run the same command again: it continues where it stopped; nodes with fewer CPUs "
                 "(ray start --num-cpus) run fewer actors."
             )
 

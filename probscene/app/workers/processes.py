@@ -121,7 +121,7 @@ def _ended(code: int, begun: bool) -> ProbsceneError:
             f"expected a worker process to start, got one that ended with code {code} while it imported the script; "
             f"what it printed stands above. Where the script has no main guard, {remedy}"
         )
-    again = "Run the same command again: it goes on where it stopped"
+    again = "Run the same command again: it continues where it stopped"
     if code >= 0:
         return MachineError(f"A worker process ended with code {code}; what it printed stands above. {again}.")
     return MachineError(

@@ -178,7 +178,7 @@ def test_little_is_said_to_be_little(tmp_path):
     photographs(tmp_path, number=1, each=3, names=("disc",))
     found = made(tmp_path)
     assert any("disc: 3 objects are all" in note for note in found.notes)
-    assert any("One photograph" in note for note in found.notes)
+    assert any("Only one photograph" in note for note in found.notes)
     rendered_prior(found.path, 4)
 
 

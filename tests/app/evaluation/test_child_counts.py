@@ -155,7 +155,7 @@ def test_the_command_shows_what_depends_on_context(call, plates, found, tmp_path
 
 def test_a_model_without_nesting_shows_nothing_new(call, fitted, target):
     shown = call("evaluate", fitted, "--target", target.images, "--labels", target.labels, "--num", 100, "--scenes", 0)
-    lines = [line for line in shown.out.splitlines() if not line.startswith("Warning: ")]
+    lines = [line for line in shown.out.splitlines() if not line.startswith(("Warning: ", "Next: "))]
     titles = [line.strip() for line in lines if line and line[0].isalpha()]
     assert [title.split(",")[0] for title in titles] == [
         "Distance to the truth", "TV: total variation", "Distance to what the feature network reads *",

@@ -174,7 +174,7 @@ def test_sites_that_could_not_be_read_are_named(fitted):
         (run.path / "parameters.json").unlink()
     assert "Sites that keep the prior: dot.x, as it cannot be read in renders." in printed(found)
     said = found.components.parts["layout"].remedy
-    assert "dot.off (0.120, floor 0.020)" in said and "Not learnt: dot.x" in said
+    assert "dot.off (0.120, noise floor 0.020)" in said and "Not learnt: dot.x" in said
 
 
 @pytest.mark.parametrize("method", [LIKELIHOOD, TILTING, META_SIM])
@@ -185,7 +185,7 @@ def test_the_remedy_names_settings_that_the_fit_reads_and_their_values(method, l
     chosen = preset("quick").set(f"parameters={method}")
     run = SimpleNamespace(parameters={"method": method, "kept": "learnt", "sites": [site]}, config=chosen)
     figures = SimpleNamespace(ratio=None, high=None)
-    said = component_remedy(run, "looks", Grade.NO_BETTER, figures, "More photographs would tell.")
+    said = component_remedy(run, "looks", Grade.NO_BETTER, figures, "More photographs would decide it.")
     named = re.findall(r"--set ([\w.]+)=(\d+)", said)
     assert said.count("--set") == len(named) and learnt <= bool(named)
     assert all(int(value) == 2 * chosen.flat()[path] for path, value in named)
@@ -254,7 +254,7 @@ def site(learnt, because="", skill=0.9, prior=None):
         (site(False, "scenes come no nearer", prior=0.03), "learnt", False),  # the target has the prior's
         (site(False, "scenes come no nearer", prior=0.3), "learnt", True),
         (site(False, "scenes come no nearer", 0.3, prior=0.03), "learnt", True),  # read with too little skill to say so
-        (site(False, "how near images look does not depend on it", None), "learnt", True),
+        (site(False, "the similarity of images does not depend on it", None), "learnt", True),
     ],
 )
 def test_a_site_is_in_doubt_where_it_keeps_a_prior_that_may_not_be_the_targets(of, kept, doubtful):

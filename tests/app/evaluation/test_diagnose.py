@@ -154,8 +154,8 @@ def test_labels_disagree_where_the_network_counts_wrongly():
     assert right.close and right.agrees(Verdict.GOOD) and not right.agrees(Verdict.UNDERFIT)
     assert not wrong.close and wrong.agrees(Verdict.UNDERFIT) and not wrong.agrees(Verdict.GOOD)
     said = wrong.sentence(Verdict.GOOD)
-    assert "Wrongly read in the images: a, b. Label ten images" in said and "train" not in said
-    assert "it is the features" in right.sentence(Verdict.UNDERFIT)
+    assert "Counted wrongly in the images: a, b. Label ten images" in said and "train" not in said
+    assert "only the features of the images differ" in right.sentence(Verdict.UNDERFIT)
     assert wrong.worst != "number of objects"  # that is always six
 
 
@@ -210,10 +210,10 @@ def test_a_fit_ends_with_its_verdict_which_is_that_of_every_command_on_its_image
     words = [word for word in words if word != "--no-verdict"]
     done = call("fit", discs.file, "--target", drawn.target.path, "--out", tmp_path / "run", *words)
     assert done.code == 0, done.err
-    assert re.match(r"Verdict: [\w ]+\.\n", done.out) and "\nLearnt." in done.out
+    assert re.match(r"Verdict: [\w ]+\.\n", done.out) and "\nNext: " in done.out
     for part in ("structure", "layout", "looks"):
         assert re.search(rf"│ {part} +│", done.out)
-    said = done.out[: done.out.index("\nLearnt.")]
+    said = done.out[: done.out.index("\nNext: ")]
     assert "Judged by the 200 images that it was fitted to, 60 scenes of the fit" in said
     evaluated = call("evaluate", tmp_path / "run", "--target", drawn.target.path, "--num", 100)
     shown = call("report", tmp_path / "run", "--num", 100, "--out", tmp_path / "r.html")

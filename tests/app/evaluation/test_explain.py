@@ -38,12 +38,12 @@ def test_a_reason_has_the_figures_that_decided(verdict):
     assert found.verdict is verdict
     said, x = structure_reason(found), found.statistics
     figure = {
-        Verdict.GOOD: f"total variation of {x.difference.detectable:.2f} in any one feature would be seen",
-        Verdict.NOT_FITTED: "can be told apart, most by all features together (total variation ",
+        Verdict.GOOD: f"total variation above {x.difference.detectable:.2f} in any one feature would have been",
+        Verdict.NOT_FITTED: "differ significantly, most in all features together (total variation ",
         Verdict.UNDERFIT: f"(total variation {x.difference.total_variation:.2f}).",
         Verdict.MODE_COLLAPSE: f"{x.modes.collapsed.sum()} of {len(x.modes.real)} clusters",
         Verdict.OUT_OF_SUPPORT: f"{100 * x.real_out_of_support.share:.1f} % of the real images are like no generated",
-        Verdict.DOMAIN_SHIFT: f"{100 * x.domain_shift_share:.1f} % of the real images are by their features farther",
+        Verdict.DOMAIN_SHIFT: f"{100 * x.domain_shift_share:.1f} % of the real images have features that are farther",
     }
     assert figure[verdict] in said and said.endswith(".")
     assert ("half as far apart" in said) is (verdict is Verdict.OUT_OF_SUPPORT)
@@ -59,4 +59,4 @@ def test_a_domain_shift_by_patches_is_mentioned_from_a_fifth_of_the_images_on():
         real = np.concatenate([far[:count], near[count:]])
         found = structure_verdict(*CASES[Verdict.NOT_FITTED], patches=(real, scenes))
         assert found.verdict is verdict
-        assert structure_reason(found).count("% of the real images show what is unlike") == mentioned
+        assert structure_reason(found).count("% of the real images show something that no scene shows") == mentioned

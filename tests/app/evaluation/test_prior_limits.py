@@ -91,7 +91,7 @@ def test_lists_beyond_the_prior_within_pretraining_are_named():
     more = StructurePrior(BLOOD, Reds=counts(0, 0, 1, 1), Whites=counts(1, 1), Platelets=counts(3, 3, 3, *[0.25] * 4))
     (found,) = saturated_lists(blood(pretraining=more), learnt(Platelets=counts(0, 0, 1, 1, 1)), None)
     assert found.beyond_prior and (found.longest, found.length) == (2, 4)
-    assert "longer than 2, the prior's longest" in str(found)
+    assert "longer than the prior's maximum, 2" in str(found)
     assert saturation_warnings([found]) == [f"Note: {found}"]
     other = replace(found, name="Reds", beyond_prior=False)
     first, second = saturation_warnings([found, other, found])
@@ -134,12 +134,12 @@ def test_unreachable_images_are_named_with_what_would_allow_them():
         ("red", FEWER): (2, (4,)), ("wbc", MORE): (2, (5,)), ("wbc", FEWER): (1, (2,)), ("platelet", MORE): (2, (2, 3)),
     }  # fmt: skip
     assert str(found["platelet", MORE]).startswith(
-        "2 of 6 images show more than 2 platelet, the most that the model can have (2.png, 3.png). To allow it: "
+        "2 of 6 images show more than 2 platelet, the model's maximum (2.png, 3.png). To allow that: "
         "Platelets=counts(...) up to 9, such as Platelets=counts(*[1] * 10)"
     )
     assert "Reds=counts(...) from 1 up to 3, such as Reds=counts(*[0] * 1, *[1] * 3)" in str(found["red", FEWER])
     assert "Whites=counts(...) up to 2" in str(found["wbc", MORE])
-    assert "grammar a way to do without it, such as ε beside 'Whites -> wbc" in str(found["wbc", FEWER])
+    assert "let the grammar leave it out, such as by ε beside 'Whites -> wbc" in str(found["wbc", FEWER])
     assert json.dumps([x.record() for x in found.values()])
 
 
@@ -213,9 +213,9 @@ def test_an_evaluation_says_both(fitted, target, discs):
     assert len(rows) == over and found.unreachable_counts[0].names[0].endswith(".png")
     record = json.loads(json.dumps(found.record()))["walls"]
     assert [x["sentence"] for x in record["images"]] == [str(x) for x in found.unreachable_counts]
-    assert f"{over} images have numbers of objects" in found.prior_warning and len(found.warnings) == len(
-        found.unreachable_counts
-    ) + len(found.saturated_lists)
+    assert f"{over} images have counts that the model cannot generate" in found.prior_warning and len(
+        found.warnings
+    ) == len(found.unreachable_counts) + len(found.saturated_lists)
 
 
 LIT = '''
@@ -251,7 +251,7 @@ def test_a_finished_fit_warns_and_evaluate_repeats_it(call, discs, target, tmp_p
     assert RunFolder(out, before).guide.support is None  # a run of an earlier version stays as it was
     judged = call("evaluate", out, "--target", target.images, "--num", 500, "--json", tmp_path / "found.json")
     assert judged.code == 0, judged.err
-    assert said[0] in judged.out and "Mind the prior: lists pile up at their longest (Discs)" in judged.out
+    assert said[0] in judged.out and "The prior is too narrow: lists reach their maximum length (Discs)" in judged.out
     assert json.loads((tmp_path / "found.json").read_text())["walls"]["lists"][0]["name"] == "Discs"
     page = call("report", out, "--num", 200, "--scenes", 40)
     assert page.code == 0 and "Warning: Discs: " in (out / "report.html").read_text(encoding="utf-8")

@@ -32,7 +32,7 @@ def fitted(tmp_path_factory, call, discs, target) -> Path:
         it_is_kept(patch)
         done = call("fit", discs.file, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
     assert done.code == 0, done.err
-    assert "Sites that are learnt: x, y." in " ".join(done.err.split())
+    assert "Learnt sites: x, y." in " ".join(done.err.split())
     return out
 
 

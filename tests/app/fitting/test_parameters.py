@@ -195,7 +195,7 @@ def test_features_that_do_not_read_parameters_say_so(call, discs, target, tmp_pa
     short = ("--features", "presence", "--set", "features.images=40", "--set", "features.epochs=1")
     done = call("fit", discs.file, *words, *short)
     assert done.code == 0, done.err
-    assert "keeps the prior: presence features are not read for it yet" in " ".join(done.err.split())
+    assert "keep the prior: presence features do not read them" in " ".join(done.err.split())
     assert RunFolder.at(tmp_path / "run").parameters == {}
 
 

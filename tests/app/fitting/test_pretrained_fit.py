@@ -166,7 +166,7 @@ def counting(call, discs, target, tmp_path_factory):
 
 def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(counting, call, target, tmp_path):
     run, said = counting
-    assert "Looking at images" in said and "Readings" in said and "epochs" in said
+    assert "Image features" in said and "Readings" in said and "epochs" in said
     net, images = own_net(run), ImageFolder(target.images, run.model.canvas, run.model.channels)
     seen = net.embed_real(torch.stack([images.load(i) for i in range(9)]))
     assert net.names == run.model.classes

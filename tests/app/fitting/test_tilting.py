@@ -47,7 +47,7 @@ def fitted(tmp_path_factory, call, lit, discs, target) -> Path:
         it_is_kept(patch)
         done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
     assert done.code == 0, done.err
-    assert "Sites that are learnt: light. Keeping the prior: x, y." in " ".join(done.err.split())
+    assert "Learnt sites: light. Sites that keep the prior: x, y." in " ".join(done.err.split())
     return out
 
 
@@ -108,10 +108,10 @@ def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tm
     done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
     assert done.code == 0, done.err
     said = " ".join(done.err.split())
-    assert "No site can be moved, so where things stand and how they look keeps the prior." in said
+    assert "No site can be moved, so position and appearance keep the prior." in said
     run = RunFolder.at(out)
     assert run.parameters["kept"] == "prior" and run.guide.with_parameters is None
-    assert run.parameters["sites"][2]["because"] == "how near images look does not depend on it"
+    assert run.parameters["sites"][2]["because"] == "the similarity of images does not depend on it"
 
 
 def test_it_is_the_way_for_photographs():

@@ -228,7 +228,7 @@ def test_a_run_proposes_by_what_it_reads(call, discs, fitted, target, tmp_path):
     words = [target.images, "--number", 6, "--labels", few]
     done = call("label", fitted, *words, "--out", tmp_path / "one")
     assert done.code == 0, done.err
-    assert "Count in 6 pictures" in done.out and "sheet.html" in done.out
+    assert "Count the objects of 6 images" in done.out and "sheet.html" in done.out
     rows = table(tmp_path / "one" / "counts.csv")
     assert rows[1:3] == table(few)[1:] and len(rows) == 9
     assert not {"000000.png", "000001.png"} & {row[0] for row in rows[3:]}

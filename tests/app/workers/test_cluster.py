@@ -192,7 +192,7 @@ def test_the_last_node_is_lost(simulated, nodes):
         while simulated.nodes:
             simulated.kill()
 
-    with pytest.raises(MachineError, match="expected a node with 1 cores .*, got .*goes on where it stopped"):
+    with pytest.raises(MachineError, match="expected a node with 1 cores .*, got .*continues where it stopped"):
         nodes.actor_pool(doubling, (0.1,)).run(range(1000), done)
 
 

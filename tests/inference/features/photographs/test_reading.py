@@ -189,7 +189,7 @@ def test_labels_that_bear_out_what_is_read_without_them_change_nothing():
     read = made(COUNTS[:10], COUNTS + rng.normal(0, 0.5, len(COUNTS)), ramp=0.05)
     free, found = without_labels(read, 0), with_labels(read, 0, torch.from_numpy(COUNTS[:10]))
     assert free.readable and found.by == "labels" and (found.rules, found.scope) == (free.rules, free.scope)
-    assert "10 labels bear it out" in found.because and 0 < found.error < 1
+    assert "10 labels confirm it" in found.because and 0 < found.error < 1
 
 
 def test_the_labels_histogram_is_learnt_where_nothing_reads_them():
@@ -213,7 +213,7 @@ def test_no_reading_that_errs_more_than_the_labels_histogram_is_learnt(noise, ap
     found = with_labels(made(COUNTS[:10], COUNTS + off, apart), 0, labels)
     error, histogram = float(np.abs(off[:10]).mean()), float(histogram_scores(COUNTS[:10]).mean())
     assert found.readable and (found.by == "histogram") is (error > histogram)
-    assert ("bear it out" in found.because) is (found.by == "labels" and apart < 1)
+    assert ("confirm it" in found.because) is (found.by == "labels" and apart < 1)
     assert ("histogram of 10 labels is learnt" in found.because) is (found.by == "histogram")
 
 
@@ -256,7 +256,7 @@ def test_labels_that_do_not_go_with_what_is_seen_are_not_used():
     """Half of the objects, and not those of the fuller images: not all are labelled."""
     labels = torch.from_numpy(np.random.default_rng(3).permutation(COUNTS[:12]) / 2).round()
     found = with_labels(made(COUNTS[:12], 3 * COUNTS + 4), 0, labels)
-    assert found.readable and found.by == "agreement" and "do not go with" in found.because
+    assert found.readable and found.by == "agreement" and "do not correlate with" in found.because
     assert found.mean == pytest.approx(3 * COUNTS.mean() + 4, rel=1e-3)
 
 
