@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from probscene.app.api import demo as module
-from probscene.app.api.demo import demo
+from probscene.app.api.demo import DemoSize, demo
 from probscene.app.evaluation import source_features
 from probscene.app.fitting import pipeline as fit
 from probscene.app.fitting.pipeline import Execution
@@ -46,7 +46,7 @@ def test_the_whole_path_and_again(discs, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(source_features, "NUM_IMAGES", 40)
 
     def go():
-        demo(out, 0, str(discs.file), SHORT, images=40, num=5, execution=ONE_THREAD)
+        demo(out, 0, DemoSize(str(discs.file), SHORT, 40, 5, 60), ONE_THREAD)
 
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -82,8 +82,8 @@ def test_a_folder_of_another_seed_and_a_model_without_a_target(discs, tmp_path):
     module.generate_scenes(module.load_model(str(discs.file)).target(0), module.load_model(str(discs.file)).prior, 40,
                            tmp_path / "demo" / "target", 0, "images")  # fmt: skip
     with pytest.raises(DataError, match="seed 0.*seed 1"):
-        demo(tmp_path / "demo", 1, str(discs.file), SHORT, images=40, num=5, execution=ONE_THREAD)
+        demo(tmp_path / "demo", 1, DemoSize(str(discs.file), SHORT, 40, 5, 60), ONE_THREAD)
     plates = Path(__file__).with_name("plates.py")
     with pytest.raises(ModelError, match="has none"):
-        demo(tmp_path / "other", 0, str(plates), SHORT)
+        demo(tmp_path / "other", 0, DemoSize(str(plates), SHORT, 40, 5, 60))
     assert not (tmp_path / "other").exists()

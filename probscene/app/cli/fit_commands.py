@@ -1,5 +1,6 @@
 """``probscene fit``, ``demo`` and ``version``."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -126,15 +127,27 @@ def fit(
 @command()
 def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("demo"),
+    full: Annotated[bool, typer.Option("--full", help="Up to ten digits, longer; a quarter of an hour.")] = False,
     seed: Seed = 0,
     cache: Cache = None,
     no_cache: NoCache = False,
 ) -> str:
-    """Run the whole method on handwritten digits; about a quarter of an hour on two cores."""
-    from ..api.demo import demo
+    """Run the whole method on handwritten digits, in two minutes."""
+    print(f"Learning from digits in {'a quarter of an hour' if full else 'two minutes'}. All that is made is in {out}.")
+    sys.stdout.flush()
+    from ..api.demo import FULL, TWO_MINUTES, demo
     from ..fitting.pipeline import Execution
 
-    demo(out, checked_seed(seed), execution=Execution(cache=False if no_cache else cache or True))
+    # One thread: what is trained is so small that two gain little, and lose much where another process has a core.
+    execution = Execution(threads=1, cache=False if no_cache else cache or True)
+    demo(out, checked_seed(seed), size := FULL if full else TWO_MINUTES, execution)
+    print("\nTry:")
+    for words in (
+        ("generate", out / "run", "--num", 2000, "--out", "digits"),
+        ("fit", size.model, "--target", out / "target" / "images", "--preset", "quick", "--out", "runs/longer"),
+        ("preview", "driving", "--out", "streets.png"),
+    ):
+        print(f"  {command_line(*words)}")
     return command_line("begin", "PHOTOS", "--labels", "LABELS", "--out", "DIR")
 
 

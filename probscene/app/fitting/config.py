@@ -673,8 +673,7 @@ def _record(value: Any) -> Any:
 
 
 _FORMER_SETTINGS = {
-    (ParameterSchedule, name)
-    for name in ("energy_steps", "energy_scenes", "weighted_scenes", "energy_rate", "sure")
+    (ParameterSchedule, name) for name in ("energy_steps", "energy_scenes", "weighted_scenes", "energy_rate", "sure")
 }  # of runs of format 4 from before there was one estimator
 
 

@@ -36,9 +36,7 @@ def test_a_change_that_is_sure_and_small_is_not_told():
 
 def test_the_sentence_names_them_and_says_what_to_do():
     assert _said({}) == ""
-    assert "car (from 1.66 to 2.01 a scene)" in _said({"car": (1.66, 2.01)}) and "Label ten" in _said(
-        {"a": (1, 2)}
-    )
+    assert "car (from 1.66 to 2.01 a scene)" in _said({"car": (1.66, 2.01)}) and "Label ten" in _said({"a": (1, 2)})
 
 
 @pytest.mark.parametrize("seed", range(8))
