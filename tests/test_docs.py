@@ -35,6 +35,27 @@ FEWER = {
         '"structure.num_scenes": 100': '"structure.num_scenes": 20',
         "fit.generate(200,": "fit.generate(20,",
     },
+    "own_generator.md": {
+        '400, "hidden"': '60, "hidden"',
+        '"features.schedule.steps": 300': '"features.schedule.steps": 16, "features.width": "4,8,8"',
+        '"structure.batches": 20, "structure.num_scenes": 100': '"structure.batches": 2, "structure.num_scenes": 20',
+        '"parameters=none", small': '"parameters=none", "pretrain.derivations=100", small',
+        "fit.generate(200,": "fit.generate(20,",
+        "evaluate(": "evaluate(num=100, ",
+    },
+    "first_fit.md": {
+        '400, "hidden"': '60, "hidden"',
+        '"features.schedule.steps": 300': '"features.schedule.steps": 8, "features.width": "4,8,8"',
+        '"structure.batches": 20, "structure.num_scenes": 100': '"structure.batches": 1, "structure.num_scenes": 20',
+        '"parameters=none", "struct': '"parameters=none", "pretrain.derivations=100", "struct',
+        "num=500, scenes=100": "num=40, scenes=40",
+        "fit.generate(100,": "fit.generate(10,",
+    },
+    "streets.md": {
+        "for model in streets.values()": 'for model in [streets["rural"]]',
+        'streets["city"]': 'streets["rural"]',
+        "model.prior, 500": "model.prior, 50",
+    },
     "pyro.md": {
         "num_samples=500": "num_samples=50",
         "num_samples=40, warmup_steps=40": "num_samples=8, warmup_steps=8",
