@@ -36,6 +36,7 @@ class PretrainedCountFeatures(Features):
     name = COUNT_ON_PRETRAINED
     pretrained = True
     takes_labels = True
+    resolution = 0.5  # of a count: renders' are whole numbers, photographs' are not
 
     @property
     def images(self) -> int:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import DataError, ProbsceneError
-from probscene.inference.features.base import EmbedsLabels, Examples, FeatureNet, needs_images
+from probscene.inference.features.base import EmbedsLabels, Examples, FeatureNet, needs_images, objects_counted
 from probscene.inference.statistics.energy import MIN_IMAGES
 from probscene.inference.statistics.verdict import StructureVerdict, structure_verdict
 from probscene.policy import Policy
@@ -145,11 +145,14 @@ def diagnose(
     rendered = np.concatenate([sources[name].patches for name in (LEARNT, PRIOR)])
     mask = feature_mask(net)
     mask = torch.ones(real.shape[1], dtype=torch.bool) if mask is None else mask
+    generated, in_target, before = (
+        objects_counted(net, features)[:, mask].numpy() for features in (scenes[0], real, scenes[1])
+    )
     try:
         structure = structure_verdict(
-            scenes[0][:, mask].numpy(),
-            real[:, mask].numpy(),
-            scenes[1][:, mask].numpy(),
+            generated,
+            in_target,
+            before,
             tuple(name for name, kept in zip(net.names, mask.tolist(), strict=True) if kept),
             resolution=run.features.resolution,
             patches=None if run.readings else (sources[TARGET].patches, rendered),

@@ -8,12 +8,13 @@ import safetensors.torch
 import torch
 from torchvision.models import inception_v3
 
+from probscene.app.evaluation import diagnose
 from probscene.app.evaluation.explain import structure_remedy
 from probscene.app.fitting.presets import QUICK, preset
 from probscene.app.fitting.run import RunFolder
 from probscene.app.fitting.scene_features import own_net
 from probscene.dataset import ImageFolder
-from probscene.errors import RunError
+from probscene.errors import DataError, RunError
 from probscene.inference.divergence import SELF_SHARE
 from probscene.inference.features.base import embed_all
 from probscene.inference.features.photographs import readability
@@ -189,6 +190,21 @@ def test_counts_on_pretrained_maps_are_fitted_and_go_on_to_the_same_result(count
     assert found["readings"] == run.readings["classes"] and found["outcome"]["kept"] in ("learnt", "prior")
     assert "Read: " in done.out
     assert call("report", run.path, "--num", 50, "--scenes", 0, "--out", tmp_path / "r.html").code == 0
+
+
+def test_a_verdict_compares_counts_to_half_an_object(counting, call, target, monkeypatch):
+    """Renders are counted from their labels, in whole numbers, and photographs are not: 2.96 is 3."""
+    seen = []
+
+    def compared(generated, real, prior, *_, resolution, **__):
+        seen.append((generated, prior, resolution))
+        raise DataError("seen")
+
+    monkeypatch.setattr(diagnose, "structure_verdict", compared)
+    assert call("evaluate", counting[0].path, "--target", target.images, "--num", 50, "--scenes", 40).code == 0
+    ((generated, prior, resolution),) = seen
+    assert resolution == 0.5 and generated.max() > 1
+    assert all(abs(counts - counts.round()).max() < 1e-4 for counts in (generated, prior))
 
 
 def test_labels_choose_how_classes_are_read(counting, call, discs, target, tmp_path):
