@@ -5,7 +5,7 @@
 
 PHOTOGRAPHS is a folder of images of 640 x 480 pixels in which a red cell is about 100 across. Colours and sizes were
 taken from looking at them; how many cells the prior has is a guess. The tutorial
-``docs/tutorials/photographs_to_detector.md`` goes on from here.
+``docs/tutorials/photographs_by_hand.md`` goes on from here.
 """
 
 import argparse
