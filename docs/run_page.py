@@ -18,11 +18,12 @@ import io
 import json
 import os
 import re
-import shutil
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 FENCE = re.compile(
     r"^```python(?: (?P<file>\S+))?\n(?P<code>.*?)^```\n(?:\n```text\n(?P<shown>.*?)^```\n)?", re.M | re.S
@@ -127,7 +128,8 @@ def main() -> int:
         pictures = [Path(name) for name in re.findall(r"pictures/([\w-]+\.png)\)", before) if Path(name).is_file()]
         if not args.check:
             for picture in pictures:
-                shutil.copy(picture, Path(__file__).parent / "pictures" / picture)
+                # Of 64 colours, so that the repository stays small.
+                Image.open(picture).convert("RGB").quantize(64).save(Path(__file__).parent / "pictures" / picture)
             path.write_text(after, encoding="utf-8")
             if path.with_suffix(".ipynb").exists():
                 write_notebook(path)

@@ -51,6 +51,18 @@ FEWER = {
         "num=500, scenes=100": "num=40, scenes=40",
         "fit.generate(100,": "fit.generate(10,",
     },
+    "photographs_to_detector.md": {
+        "range(200)}": "range(42)}",
+        "in range(20)}": "in range(8)}",
+        "drawn/100.png": "drawn/010.png",
+        '"features.schedule.steps": 300': '"features.schedule.steps": 8, "features.width": "4,8,8"',
+        '"structure.batches": 20': '"pretrain.derivations": 100, "structure.batches": 1',
+        '"structure.num_scenes": 100': '"structure.num_scenes": 20',
+        "evaluate(": "evaluate(num=100, ",
+        "generate=200, budget=ps.TrainingBudget(iterations=120)": (
+            "generate=8, size=(64, 96), budget=ps.TrainingBudget(iterations=2)"
+        ),
+    },
     "streets.md": {
         "for model in streets.values()": 'for model in [streets["rural"]]',
         'streets["city"]': 'streets["rural"]',
