@@ -54,6 +54,7 @@ FEWER = {
     "photographs_to_detector.md": {
         "range(200)}": "range(42)}",
         "in range(20)}": "in range(8)}",
+        'ps.predict(detector, "photos"': 'ps.predict(detector, "photos/010.png"',
         "drawn/100.png": "drawn/010.png",
         '"features.schedule.steps": 300': '"features.schedule.steps": 8, "features.width": "4,8,8"',
         '"structure.batches": 20': '"pretrain.derivations": 100, "structure.batches": 1',
