@@ -4,8 +4,7 @@
     probscene fit examples/blood_smear.py --target PHOTOGRAPHS --out runs/blood
 
 PHOTOGRAPHS is a folder of images of 640 x 480 pixels in which a red cell is about 100 across. Colours and sizes were
-taken from looking at them; how many cells the prior has is a guess. The tutorial
-``docs/tutorials/photographs_by_hand.md`` goes on from here.
+taken from looking at them; how many cells the prior has is a guess. See ``docs/tutorials/photographs_by_hand.md``.
 """
 
 import argparse
