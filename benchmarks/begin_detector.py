@@ -9,9 +9,10 @@ each draw a model is begun, and scenes of its prior are generated. A trial then 
     alone         the labelled photographs alone
     begun         the scenes alone
     then          the scenes, then the photographs
+    mixed         both in turn, half of the images shown each
 
-Printed are the average precisions at an overlap of 0.5 of each draw, and the mean over draws of what ``then`` and
-``begun`` have more than ``alone``, with a 95 % interval of Student's t over the draws, which share the held-out
+Printed are the average precisions at an overlap of 0.5 of each draw, and the mean over draws of what the others
+have more than ``alone``, with a 95 % interval of Student's t over the draws, which share the held-out
 photographs. Photographs are near duplicates where their pixels, at 32 x 32, correlate by more than 0.95.
 """
 
@@ -82,7 +83,7 @@ def measured(args: argparse.Namespace, draw: int, pool: list[str], test: Path) -
     names = sorted(np.random.default_rng([args.seed, 1, draw]).choice(pool, args.labelled, replace=False).tolist())
     made = begun_set(args, names, out, draw)
     (out / "labelled.txt").write_text("\n".join(names) + "\n")
-    sets = {"alone": "real", "begun": str(made), "then": "begun,real"}
+    sets = {"alone": "real", "begun": str(made), "then": "begun,real", "mixed": "begun+real"}
     options = TrialOptions(real=f"{args.photographs}@{out / 'labelled.txt'}", numbers=[], seeds=1, seed=draw)
     found = trial(Path(f"{args.photographs}@{test}"), out / "trial", sets, options, workers=args.workers).record()
     return {
@@ -112,7 +113,7 @@ def main():
         each.append(measured(args, draw, pool, args.out / "test.txt"))
         print(draw, json.dumps(each[-1]), flush=True)
         write_json(args.out / "results.json", each)
-    for name in ("begun", "then"):
+    for name in ("begun", "then", "mixed"):
         more = 100 * np.array([rows[name]["mean"] - rows["alone"]["mean"] for rows in each])
         line = f"{name}: {more.mean():+.1f} points over the photographs alone"
         if len(more) > 1:

@@ -67,7 +67,7 @@ FEWER = {
     "streets.md": {
         "for model in streets.values()": 'for model in [streets["rural"]]',
         'streets["city"]': 'streets["rural"]',
-        "model.prior, 500": "model.prior, 50",
+        "model.prior, 500": "model.prior, 20",
     },
     "pyro.md": {
         "num_samples=500": "num_samples=50",

@@ -112,7 +112,7 @@ def test_a_spread_is_learnt_as_it_is_in_every_round(error, rounds, within):
 def test_a_dependence_that_is_narrower_than_the_error_is_learnt(sd):
     """Of sites of scenes, which are quick; ``benchmarks/estimator.py`` has those of nodes."""
     torch.manual_seed(0)
-    u = bounded(0.5, 0.16, 4000, 1)
+    u = bounded(0.5, 0.16, 2500, 1)
     u = torch.cat([u, (u + 0.02 * torch.randn(u.shape)).clamp(1e-3, 1 - 1e-3)], -1)
     net = ParameterNet(1, 0, 2, hidden=32)
     for number in range(2):
@@ -123,9 +123,9 @@ def test_a_dependence_that_is_narrower_than_the_error_is_learnt(sd):
 
 def test_siblings_share_what_they_share():
     torch.manual_seed(0)
-    u = (bounded(0.5, 0.2, 1000, 1, 1) + 0.01 * torch.randn(1000, 5, 1)).clamp(1e-3, 1 - 1e-3)
+    u = (bounded(0.5, 0.2, 600, 1, 1) + 0.01 * torch.randn(600, 5, 1)).clamp(1e-3, 1 - 1e-3)
     net = ParameterNet(1, 1, 0, hidden=32)
-    learn(net, read(u, torch.zeros(1000, 0), [0.1]), 300)
+    learn(net, read(u, torch.zeros(600, 0), [0.1]), 250)
     learnt = sample(net, 2000, 5)[0]
     assert correlation(learnt[:, 1:], learnt[:, :-1]) > 0.97
     assert 0.5 < float((learnt[:, 1:] - learnt[:, :-1]).std() / (u[:, 1:] - u[:, :-1]).std()) < 2
