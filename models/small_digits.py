@@ -24,7 +24,7 @@ GRAMMAR = Grammar("""
     Digit  -> 0 | 1 | 2 | 3 | 4
 """)
 CLASSES = tuple("01234")
-MOST = 5
+MAX_DIGITS = 5
 CANVAS = 96
 MAX_STEPS = 20
 SCALE = 0.6  # of a glyph of 28 pixels, so that five stand in a row
@@ -44,7 +44,7 @@ def draw(scene: SceneGraph, held_out: bool, x: Tensor, y: Tensor | int, angle: T
 def target(seed: int) -> SceneModel:
     """What a demo learns: numbers and digits by Dirichlet(1) draws of ``seed``, in an evenly spaced row."""
     rng = np.random.default_rng(seed)
-    number, share = rng.dirichlet(np.ones(MOST + 1)), rng.dirichlet(np.ones(len(CLASSES)))
+    number, share = rng.dirichlet(np.ones(MAX_DIGITS + 1)), rng.dirichlet(np.ones(len(CLASSES)))
     prior = StructurePrior(GRAMMAR, Digits=counts(*number), Digit=weights(*share))
 
     @scene_model(GRAMMAR, prior, canvas=(CANVAS, CANVAS), max_steps=MAX_STEPS, classes=CLASSES, channels=1)
@@ -56,7 +56,7 @@ def target(seed: int) -> SceneModel:
 
 
 @scene_model(
-    GRAMMAR, StructurePrior(GRAMMAR, Digits=counts(*[1] * (MOST + 1))), canvas=(CANVAS, CANVAS), max_steps=MAX_STEPS,
+    GRAMMAR, StructurePrior(GRAMMAR, Digits=counts(*[1] * (MAX_DIGITS + 1))), canvas=(CANVAS, CANVAS), max_steps=MAX_STEPS,
     classes=CLASSES, name="small_digits", channels=1, target=target,
 )  # fmt: skip
 def MODEL(scene: SceneGraph) -> Drawing:
