@@ -55,9 +55,12 @@ def target(seed: int) -> SceneModel:
     return small_digits_target
 
 
+PRIOR = StructurePrior(GRAMMAR, Digits=counts(*[1] * (MAX_DIGITS + 1)))
+
+
 @scene_model(
-    GRAMMAR, StructurePrior(GRAMMAR, Digits=counts(*[1] * (MAX_DIGITS + 1))), canvas=(CANVAS, CANVAS), max_steps=MAX_STEPS,
-    classes=CLASSES, name="small_digits", channels=1, target=target,
+    GRAMMAR, PRIOR, canvas=(CANVAS, CANVAS), max_steps=MAX_STEPS, classes=CLASSES, name="small_digits", channels=1,
+    target=target,
 )  # fmt: skip
 def MODEL(scene: SceneGraph) -> Drawing:
     """The prior: place and rotation are uniform."""
