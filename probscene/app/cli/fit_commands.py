@@ -135,8 +135,11 @@ def demo(
     """Run the whole method on handwritten digits, in two minutes."""
     print(f"Learning from digits in {'a quarter of an hour' if full else 'two minutes'}. All that is made is in {out}.")
     sys.stdout.flush()
-    from ..api.demo import FULL, TWO_MINUTES, demo
-    from ..fitting.pipeline import Execution
+    from rich.console import Console
+
+    with Console(stderr=True).status("Importing PyTorch"):  # which takes seconds
+        from ..api.demo import FULL, TWO_MINUTES, demo
+        from ..fitting.pipeline import Execution
 
     # One thread: what is trained is so small that two gain little, and lose much where another process has a core.
     execution = Execution(threads=1, cache=False if no_cache else cache or True)
