@@ -25,6 +25,7 @@ GRAMMAR = Grammar("""
 """)
 CLASSES = tuple("01234")
 MAX_DIGITS = 5
+PRIOR = StructurePrior(GRAMMAR, Digits=counts(*[1] * (MAX_DIGITS + 1)))
 CANVAS = 96
 MAX_STEPS = 20
 SCALE = 0.6  # of a glyph of 28 pixels, so that five stand in a row
@@ -53,9 +54,6 @@ def target(seed: int) -> SceneModel:
         return draw(scene, True, x, CANVAS // 2)
 
     return small_digits_target
-
-
-PRIOR = StructurePrior(GRAMMAR, Digits=counts(*[1] * (MAX_DIGITS + 1)))
 
 
 @scene_model(

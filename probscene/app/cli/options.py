@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that 'probscene fit' wrote.")]
-Model = Annotated[str, typer.Argument(metavar="MODEL", help="multi_mnist, aerial2d, driving, or a .py file.")]
+Model = Annotated[str, typer.Argument(metavar="MODEL", help="Built-in model, such as driving, or .py file.")]
 Seed = Annotated[int, typer.Option(metavar="N", help="Random seed.")]
 Assets = Annotated[
     Path | None,
