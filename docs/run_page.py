@@ -6,8 +6,7 @@
 
 A fence that opens with ``python`` is run; ``python NAME.py`` is written to that file instead. A ``text`` fence that
 follows it holds what it printed. A picture of the page, ``docs/pictures/NAME.png``, is the ``NAME.png`` that the code
-wrote, if it wrote one. Fences of other languages, ``py`` among them, are only shown. A notebook beside the page is
-written with it.
+wrote, if it wrote one. Fences of other languages are only shown. A notebook beside the page is written with it.
 """
 
 import argparse

@@ -4,6 +4,7 @@ import ast
 import inspect
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -130,6 +131,23 @@ def test_every_option_of_a_command_is_listed(name):
 def test_the_public_api_is_listed_whole():
     tables = re.findall(r"^\|.*\|$", text("reference/api/public.md"), re.MULTILINE)
     assert set(re.findall(r"`(\w+)`", " ".join(tables))) == set(probscene.__all__)
+
+
+SHOWN = re.compile(r'^(?:srun |[ ]{4,}(?:.*--wrap ")?)probscene +(\w+ (?:[^"\n]|"[^"\n]*")*)', re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: page.stem)
+def test_commands_that_pages_show_have_these_options(page):
+    shown = re.sub(r"\\\n\s*", "", page.read_text(encoding="utf-8"))
+    for line in SHOWN.findall(shown):
+        name, *words = shlex.split(line, comments=True)
+        command = COMMANDS[name]
+        command.make_parser(typer.Context(command)).parse_args(words)  # an option that is not there is an error
+
+
+def test_no_python_is_only_shown():
+    for page in PAGES:
+        assert set(re.findall(r"^```(py\w*)", page.read_text(encoding="utf-8"), re.MULTILINE)) <= {"python"}, page
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

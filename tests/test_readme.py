@@ -21,8 +21,7 @@ TINY |= {"pretrain.epochs": 1}
 
 def test_python_runs(tmp_path, monkeypatch, capsys):
     """With a fit that learns next to nothing, from images that the model has drawn."""
-    generate_scenes(MODEL, MODEL.prior, 60, tmp_path / "drawn", format="images")
-    (tmp_path / "drawn" / "images").rename(tmp_path / "photos")
+    generate_scenes(MODEL, MODEL.prior, 60, tmp_path, format="images")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PROBSCENE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("probscene.app.evaluation.source_features.NUM_IMAGES", 40)
