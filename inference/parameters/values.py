@@ -22,7 +22,7 @@ class Values(NamedTuple):
         nodes, nodes_sd: ``(L, M, S)`` u and its standard deviation.
         scene, scene_sd: ``(L, G)``.
         turns: ``(S + G,)`` bool, those read on a circle.
-        weight: ``(L, M)`` how much each node counts; all count 1 where None.
+        weight: ``(L, M)`` how much each node counts, or ``(L, M, S)`` in each site; all count 1 where None.
         outliers: ``(S + G,)`` the share of a site's readings that say nothing of u; none where None.
     """
 
@@ -62,7 +62,9 @@ def log_density(net: ParameterNet, values: Values) -> Tensor:
         at = given.subset.gather(values.nodes[..., s : s + 1]).squeeze(-1).nan_to_num(0.5)
         found = net.subset_mixture(given, values.nodes, s).log_prob(at)
         found = given.subset.scatter(found.unsqueeze(-1)).squeeze(-1)
-        parts.append((found if values.weight is None else values.weight * found).sum(1))
+        if values.weight is not None:
+            found = found * (values.weight if values.weight.ndim == 2 else values.weight[..., s])
+        parts.append(found.sum(1))
     for g in range(net.scene_sites):
         u = values.scene[:, g]
         found = net.scene_mixture(graph, values.scene, g).log_prob(u.nan_to_num(0.5)[:, None]).squeeze(1)

@@ -72,6 +72,10 @@ class MetaSimLearning(TrainingLoop):
         self.optimiser = torch.optim.Adam(self.guide.net.parameters(), lr=schedule.rate)
         super().__init__(self.guide.net, {"adam": self.optimiser}, schedule.steps, seed)
 
+    def why_not(self, site: Site) -> str:
+        """Why a site is not learnt."""
+        return site.keeps
+
     def step(self) -> float:
         """See ``TrainingLoop``."""
         guide = self.guide

@@ -14,11 +14,14 @@ as well [6]. Distances to the target that no parameter changes, as photographs a
 scenes and weigh nothing.
 
 Several sorts of features each have a w, in units of the gradient's norm; along their sum none of the distances grows,
-as in multiple-gradient descent [4].
+as in multiple-gradient descent [4]. What is seen of labelled objects is one of them, if there are any.
 
-Only sites of the whole scene are moved, such as light and camera: were places left to whole images, objects would stand
-where photographs are dark. A site keeps its prior until w has depended on it beyond chance. Axis letters: N scenes, M
-nodes, G sites of scenes, L images, D features.
+Whole images move sites of the whole scene alone, such as light and camera: were places left to them, objects would
+stand where photographs are dark. A site keeps its prior until w has depended on it beyond chance. Nor do they move a
+site that sizes or places of objects go by. Such sites, and those of nodes, are moved by labelled objects (``objects``),
+if there are any: each site is tilted by exp(-eta h), with h the part of the objects' w that it explains, less what
+could be chance; nothing is left to tilt where renders and labels agree. Axis letters: N scenes, M nodes, S sites of
+nodes, G sites of scenes, C classes, L images, D features.
 
 References:
     [1] Székely and Rizzo, *Energy statistics: a class of statistics based on distances*, 2013.
@@ -33,6 +36,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy.optimize import root_scalar
 from scipy.spatial.distance import cdist
 from scipy.stats import chi2, false_discovery_control
@@ -42,6 +46,7 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.sampling import seed_everything
 
+from ...features.base import class_table
 from ...statistics.energy import Features
 from ...training import AdamTraining, Callback, TrainingLoop, batch_seed, of_prefix
 from ..guide import ParameterGuide
@@ -49,12 +54,26 @@ from ..net import ParameterNet
 from ..sites import U_EPS, Site, find_sites
 from ..supervised_renders import Label, SupervisedRenders, concatenate
 from ..values import Values, images_per_step, log_density
+from .objects import (
+    ASPECTS,
+    Objects,
+    Witness,
+    concatenate_objects,
+    object_basis,
+    object_witness,
+    objects_of,
+    scene_witness,
+    slope_of,
+)
 from .schedule import TiltingSchedule
 
 RENDERS_PER_CALL = 100  # scenes that are drawn and rendered together
 MAX_SCENES = 200  # of a step of the guide
 FALSE_DISCOVERY_RATE = 0.05  # of the sites that are moved, at most, say nothing of images in the mean [5]
 MAX_ETA = 1e3  # eta, in standard deviations of w
+OBJECT_ETA = 2.0  # eta of objects, at most: a step of about the distance that is left
+OBJECT_P_VALUE = 0.05  # of "labelled objects do not say which way", below which a site is moved by them
+BOX_P_VALUE = 1e-3  # of "no box depends on the site", below which it is one that boxes go by
 MIN_UNIT = 0.1  # share of w's standard deviation
 MIN_SD = 1e-5  # standard deviation of a number that tells scenes apart
 EXACT_SD = 1e-6  # standard deviation of u that is known
@@ -72,13 +91,17 @@ class TiltingLearning(TrainingLoop):
         real: the target's features ``(L, D)`` by each.
         schedule: how long.
         seed: of everything random.
+        objects: of the target, those that are labelled.
 
     Attributes:
         unit, total, done: see ``Training``.
         sites: of the model.
-        open_to: sites of scenes that can be moved.
-        dependence: ``(G, 2)`` how much w has depended on each, and by how many degrees of freedom, until it was moved.
-        chosen: ``(G,)`` bool, which are moved.
+        open_to: those that can be moved; of nodes only if there are labelled objects.
+        dependence: ``(G, 2)`` how much w has depended on each site of scenes, and by how many degrees of freedom, until
+            it was moved.
+        boxes_depend: ``(G,)`` bool, those that boxes of objects go by; whole images do not move these.
+        chosen: ``(G,)`` bool, sites of scenes that are moved.
+        chosen_of: ``(S, C)`` bool, sites of nodes that are moved, of each class.
         guide: what is learnt, of all of them; None where there are none.
     """
 
@@ -95,23 +118,50 @@ class TiltingLearning(TrainingLoop):
         real: tuple[Tensor, ...],
         schedule: TiltingSchedule,
         seed: int = 0,
+        objects: Objects | None = None,
     ):
         self.model, self.structure, self.looks, self.schedule = model, structure, looks, schedule
-        self.real = [features.double().numpy() for features in real]
+        self.real, self.objects = [features.double().numpy() for features in real], objects
         seed_everything(batch_seed(seed, 0))
         self.sites = find_sites(model)
-        self.open_to = tuple(site for site in self.sites if site.of_scene and not site.keeps)
-        self.renders = SupervisedRenders(model, label, (), self.open_to)
+        self.open_to = tuple(s for s in self.sites if not s.keeps and (s.of_scene or objects is not None))
+        self.node_sites = tuple(site for site in self.open_to if not site.of_scene)
+        self.scene_sites = tuple(site for site in self.open_to if site.of_scene)
+        self.renders = SupervisedRenders(model, label, self.node_sites, self.scene_sites)
         self.guide = ParameterGuide(model, self.open_to, structure) if self.open_to else None
-        self.dependence = torch.zeros(len(self.open_to), 2)
-        self.chosen = torch.zeros(len(self.open_to), dtype=torch.bool)
+        S, G = len(self.node_sites), len(self.scene_sites)
+        self.dependence, self.boxes_depend = torch.zeros(G, 2), torch.zeros(G, dtype=torch.bool)
+        self.chosen = torch.zeros(G, dtype=torch.bool)
+        self.chosen_of = torch.zeros(S, len(model.classes), dtype=torch.bool)
         net = nn.Module() if self.guide is None else self.guide.net
         super().__init__(net, {}, schedule.rounds if self.open_to else 0, seed)
 
     @property
     def learnt(self) -> tuple[Site, ...]:
         """The sites that are chosen, in the order of the program."""
-        return tuple(site for site, chosen in zip(self.open_to, self.chosen.tolist(), strict=True) if chosen)
+        each = zip(
+            (*self.node_sites, *self.scene_sites), [*self.chosen_of.any(1).tolist(), *self.chosen.tolist()], strict=True
+        )
+        chosen = {site for site, is_chosen in each if is_chosen}
+        return tuple(site for site in self.open_to if site in chosen)
+
+    @property
+    def by_images(self) -> tuple[Site, ...]:
+        """Those of them that whole images have moved."""
+        moved = (self.chosen & ~self.boxes_depend).tolist()
+        return tuple(site for site, is_moved in zip(self.scene_sites, moved, strict=True) if is_moved)
+
+    def why_not(self, site: Site) -> str:
+        """Why a site is not learnt."""
+        if site not in self.open_to:
+            return site.keeps or "it is of single objects, and none is labelled with a box"
+        if not site.of_scene:
+            return "labelled objects do not depend on it"
+        if not self.boxes_depend[self.scene_sites.index(site)]:
+            return "the similarity of images does not depend on it"
+        if self.objects is None:
+            return "sizes or places of objects go by it, and none is labelled with a box"
+        return "sizes or places of objects go by it, and labelled ones do not say which way"
 
     def run(self, callback: Callback | None = None) -> None:
         """See ``Training``."""
@@ -121,13 +171,15 @@ class TiltingLearning(TrainingLoop):
     def state(self) -> dict[str, Tensor]:
         """See ``Training``."""
         own = {"done": torch.tensor(self.done), "chosen": self.chosen, "dependence": self.dependence}
+        own |= {"boxes_depend": self.boxes_depend, "chosen_of": self.chosen_of}
         net = {f"guide.{key}": value for key, value in self.module.state_dict().items()}
         return {key: value.clone() for key, value in (own | net).items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """See ``Training``."""
         self.done, self.chosen = int(tensors["done"]), tensors["chosen"].clone()
-        self.dependence = tensors["dependence"].clone()
+        self.dependence, self.boxes_depend = tensors["dependence"].clone(), tensors["boxes_depend"].clone()
+        self.chosen_of = tensors["chosen_of"].clone()
         self.module.load_state_dict(of_prefix(tensors, "guide."))
 
     def step(self) -> float:
@@ -135,58 +187,153 @@ class TiltingLearning(TrainingLoop):
         target's spread."""
         guide = self.guide
         assert guide is not None
-        features, values = self._drawn(guide, self.schedule.scenes if self.done else self.schedule.first)
-        each = [witness(own, real) for own, real in zip(features, self.real, strict=True)]
+        features, values, own = self._drawn(guide, self.schedule.scenes if self.done else self.schedule.first)
+        each = [witness(own_features, real) for own_features, real in zip(features, self.real, strict=True)]
         freed = [without_structure(values.kind, w) for w, _ in each]
-        w = normalised_sum(values.scene, freed)
-        self.dependence += dependence(values.scene, w).where(~self.chosen.unsqueeze(1), 0.0)
-        p = chi2.sf(self.dependence[:, 0].numpy(), self.dependence[:, 1].numpy().clip(min=1))
-        self.chosen |= torch.from_numpy(false_discovery_control(p) < FALSE_DISCOVERY_RATE)
+        if not self.done:
+            self.boxes_depend = boxes_depend(values.scene, own)
+        of_objects = None if self.objects is None else object_witness(own, self.objects)
+        if of_objects is not None:
+            freed.append(without_structure(values.kind, scene_witness(of_objects, own.images)))
+        self._choose_by_images(values.scene, freed)
+        slopes = {} if of_objects is None else self._slopes(values, own, of_objects)
         self._set_prior_sites()
-        if self.chosen.any():
-            of = values.scene[:, self.chosen]
-            v, sure = explained_part(of, normalised_sum(of, freed))
-            weight = tilted_weights(v, 1 - sure * (1 - self.schedule.ess_fraction))
+        if self.learnt:
+            weight = self._weights(values, freed, slopes)
             seed = batch_seed(self.seed, 2, self.done)
-            _WeightedLikelihood(guide.net, values, weight, self.chosen, self.schedule, seed).run()
+            _WeightedLikelihood(guide.net, values, *weight, self._chosen_columns, self.schedule, seed).run()
         return sum(apart for _, apart in each)
+
+    def _choose_by_images(self, u: Tensor, freed: list[Features]) -> None:
+        """Add the sites of scenes that w is known to depend on."""
+        free = ~self.boxes_depend
+        if not free.any():
+            return
+        depends = dependence(u[:, free], normalised_sum(u[:, free], freed))
+        self.dependence[free] += depends.where(~self.chosen[free].unsqueeze(1), 0.0)
+        found = self.dependence[free].numpy()
+        p = chi2.sf(found[:, 0], found[:, 1].clip(min=1))
+        self.chosen[free] |= torch.from_numpy(false_discovery_control(p) < FALSE_DISCOVERY_RATE)
+
+    def _slopes(self, values: Values, own: Objects, w: Witness) -> dict[tuple[int, ...], Features]:
+        """The slope of w of each site that objects move, by its number for sites of scenes, by number and class for
+        those of nodes. Which these are is decided in the first round."""
+        found = {}
+        for g in self.boxes_depend.nonzero().flatten().tolist():
+            found[(g,)] = slope_of(w, values.scene[w.scene, g].numpy())
+        for s in range(len(self.node_sites)):
+            u = values.nodes[w.scene, own.node[w.rows], s].numpy()
+            for c in np.unique(w.label).tolist():
+                found[(s, c)] = slope_of(w, np.where(w.label == c, u, np.nan))
+        if not self.done:
+            for key, one in found.items():
+                (self.chosen if len(key) == 1 else self.chosen_of)[key] = one.p < OBJECT_P_VALUE
+        chosen = [key for key in found if (self.chosen if len(key) == 1 else self.chosen_of)[key]]
+        return {key: found[key].sure * found[key].slope for key in chosen}
+
+    def _weights(
+        self, values: Values, freed: list[Features], slopes: dict[tuple[int, ...], Features]
+    ) -> tuple[Tensor, Tensor]:
+        """Of the values of sites of nodes ``(N, M, S)`` and of scenes ``(N, G)``, 1 in the mean of each."""
+        nodes, scene, least = torch.ones_like(values.nodes), torch.ones_like(values.scene), self.schedule.ess_fraction
+        by_images = self.chosen & ~self.boxes_depend
+        if by_images.any():
+            of = values.scene[:, by_images]
+            v, sure = explained_part(of, normalised_sum(of, freed))
+            weight = tilted_weights(v, 1 - sure * (1 - least)) * len(v)
+            scene[:, by_images] = torch.from_numpy(weight).float()[:, None]
+        label = class_table(self.model.grammar.kinds, self.model.classes)[values.kind]
+        for key, slope in slopes.items():
+            if len(key) == 1:
+                u, part = values.scene[:, key[0]], scene[:, key[0]]
+                there = ~u.isnan()
+            else:
+                s, c = key
+                u, part = values.nodes[..., s], nodes[..., s]
+                there = (label == c) & ~u.isnan()
+            h = object_basis(u[there].double().numpy()) @ slope
+            part[there] = torch.from_numpy(step_weights(h, least) * len(h)).float()
+        return nodes, scene
+
+    @property
+    def _chosen_columns(self) -> Tensor:
+        return torch.cat([self.chosen_of.any(1), self.chosen])
 
     def _set_prior_sites(self) -> None:
         if self.guide is not None:
             self.guide.prior_sites = frozenset(site.name for site in self.open_to if site not in self.learnt)
 
     @torch.no_grad()
-    def _drawn(self, guide: ParameterGuide, num: int) -> tuple[list[Features], Values]:
-        """Features ``(N, D)`` of the guide's renders by each look, and their scenes' values of all sites."""
-        model, features, parts = guide.with_parameters(self.model), [], []
+    def _drawn(self, guide: ParameterGuide, num: int) -> tuple[list[Features], Values, Objects]:
+        """Features ``(N, D)`` of the guide's renders by each look, their scenes' values of all sites, and their
+        objects."""
+        model, features, parts, objects = guide.with_parameters(self.model), [], [], []
         for first in range(0, num, RENDERS_PER_CALL):
             some = self.renders.draw(min(RENDERS_PER_CALL, num - first), self.structure, model)
             features.append([look(some.drawn.image) for look in self.looks])
+            objects.append(objects_of(some.drawn))
             parts.append(some._replace(drawn=some.drawn._replace(image=some.drawn.image[..., :0])))  # to save memory
-        of, turns = concatenate(parts), torch.zeros(len(self.chosen), dtype=torch.bool)
-        scene, none = of.scene_u.clamp(U_EPS, 1 - U_EPS), of.u
-        values = Values(of.kind, of.parent, none, none, scene, torch.full_like(scene, EXACT_SD), turns)
-        return [torch.cat(part).double().numpy() for part in zip(*features, strict=True)], values
+        of, turns = concatenate(parts), torch.zeros(len(self.open_to), dtype=torch.bool)
+        scene, nodes = (u.clamp(U_EPS, 1 - U_EPS) for u in (of.scene_u, of.u))
+        known = (torch.full_like(u, EXACT_SD) for u in (nodes, scene))
+        values = Values(of.kind, of.parent, nodes, next(known), scene, next(known), turns)
+        found = [torch.cat(part).double().numpy() for part in zip(*features, strict=True)]
+        return found, values, concatenate_objects(objects)
 
 
 class _WeightedLikelihood(AdamTraining):
-    """Maximum likelihood of values that are known, of scenes in proportion to their weight ``(N,)``; of the chosen
-    sites."""
+    """Maximum likelihood of values that are known.
+
+    Args:
+        nodes, scene: how much each counts, ``(N, M, S)`` and ``(N, G)``.
+        chosen: ``(S + G,)`` bool, the sites that are learnt.
+    """
 
     subject = "the parameters"
 
     def __init__(
-        self, net: ParameterNet, values: Values, weight: Features, chosen: Tensor, schedule: TiltingSchedule, seed: int
+        self,
+        net: ParameterNet,
+        values: Values,
+        nodes: Tensor,
+        scene: Tensor,
+        chosen: Tensor,
+        schedule: TiltingSchedule,
+        seed: int,
     ):
         adam = torch.optim.Adam(net.parameters(), lr=schedule.rate)
         super().__init__(net, adam, schedule.steps, seed, max_grad_norm=10.0)
-        self.net, self.values, self.weight, self.chosen = net, values, torch.from_numpy(weight), chosen
+        self.net, self.values, self.scene, self.chosen = net, values._replace(weight=nodes), scene, chosen
         self.images = images_per_step(net, values, MAX_SCENES)
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
-        rows = torch.multinomial(self.weight, self.images, replacement=True)
-        return -log_density(self.net, self.values.select(rows))[:, self.chosen].sum(1).mean()
+        rows = torch.randint(len(self.scene), (self.images,))
+        weight = F.pad(self.scene[rows], (self.net.node_sites, 0), value=1.0)
+        return -(weight * log_density(self.net, self.values.select(rows)))[:, self.chosen].sum(1).mean()
+
+
+def boxes_depend(u: Tensor, objects: Objects) -> Tensor:
+    """``(G,)`` bool, whether sizes or places of a scene's objects depend on the u of its sites ``(N, G)``, beyond
+    chance."""
+    columns = range(ASPECTS["size"].start, ASPECTS["place"].stop)
+    seen, number = objects.seen[:, columns].copy(), np.bincount(objects.image, minlength=objects.images)
+    for c in np.unique(objects.label):
+        seen[objects.label == c] -= seen[objects.label == c].mean(0)
+    found = torch.zeros(u.shape[1], dtype=torch.bool)
+    for one in seen.T:
+        mean = np.bincount(objects.image, one, objects.images)[number > 0] / number[number > 0]
+        depends = dependence(u[torch.from_numpy(number > 0)], mean).numpy()
+        found |= torch.from_numpy(chi2.sf(depends[:, 0], depends[:, 1].clip(min=1)) < BOX_P_VALUE / len(seen.T))
+    return found
+
+
+def step_weights(h: Features, ess_fraction: float) -> Features:
+    """Weights ``(n,)`` in proportion to exp(-eta h), eta ``OBJECT_ETA``, or as large as leaves an effective share of
+    them."""
+    weight = np.exp(-OBJECT_ETA * (h - h.min()))
+    weight /= weight.sum()
+    return tilted_weights(h, ess_fraction) if 1 / np.square(weight).sum() < ess_fraction * len(h) else weight
 
 
 def witness(own: Features, real: Features) -> tuple[Features, float]:

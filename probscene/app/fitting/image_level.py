@@ -1,17 +1,23 @@
-"""Ways of learning parameters by images as wholes, of which nothing is read. Axis letters: L images, C H W."""
+"""Ways of learning parameters without a reader: by images as wholes, and by labelled objects. Axis letters: L images, K
+labelled ones, M boxes of one, C H W."""
 
 from typing import Any
 
+import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
+from probscene.dataset import Images
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import TiltingLearning
+from probscene.inference.parameters.tilting.objects import Objects, measure
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.training import batch_seed
 
+from ..labels.partial_labels import PartialLabels
 from .rendered_features import RenderedFeatures
 from .run import RunFolder
 
@@ -35,27 +41,48 @@ def meta_sim_learning(
 
 
 def tilting_learning(
-    run: RunFolder, observer: RenderedFeatures, guide: Guide, images: Tensor, schedule: TiltingSchedule
+    run: RunFolder,
+    observer: RenderedFeatures,
+    guide: Guide,
+    images: Tensor,
+    schedule: TiltingSchedule,
+    objects: Objects | None,
 ) -> TiltingLearning:
-    """The training that tilts, by the same features and what can plainly be said; arguments as of
-    ``meta_sim_learning``."""
+    """The training that tilts, by the same features and by image statistics; other arguments as of
+    ``meta_sim_learning``.
+
+    Args:
+        objects: of the target, see ``labelled_objects``.
+    """
     from probscene.inference.features.pretrained import EfficientNetLite
 
     seed = batch_seed(run.record["seed"], 5)
     looks = EfficientNetLite(schedule.feature_size).embed, image_statistics
     real = tuple(look(images) for look in looks)
-    return TiltingLearning(run.model, guide, observer.labelled, looks, real, schedule, seed)
+    return TiltingLearning(run.model, guide, observer.labelled, looks, real, schedule, seed, objects)
 
 
-def sites_record(learning: ImageLevelTraining) -> list[dict[str, Any]]:
-    """For JSON, as of ``parameters``; nothing is read, so no site has a skill."""
+def labelled_objects(run: RunFolder, labels: PartialLabels | None, images: Images) -> Objects | None:
+    """The objects of the target that are labelled with boxes; None where there are none."""
+    if labels is None or labels.boxes is None or not any(len(boxes) for boxes in labels.boxes):
+        return None
+    number = torch.tensor([run.model.classes.index(name) for name in labels.classes])
+    label = [number[boxes[:, 0].long()] for boxes in labels.boxes]
+    pictures = torch.stack([images.load(row) for row in labels.rows.tolist()])
+    boxes = pad_sequence([boxes[:, 1:] for boxes in labels.boxes], batch_first=True)
+    return measure(pictures, boxes, pad_sequence(label, batch_first=True, padding_value=-1))
+
+
+def sites_record(learning: ImageLevelTraining, discarded: dict[str, str]) -> list[dict[str, Any]]:
+    """For JSON, as of ``parameters``; nothing is read, so no site has a skill.
+
+    Args:
+        discarded: of what was learnt, by name of the site, why.
+    """
     sites = []
     for site in learning.sites:
-        because, is_learnt = site.keeps, site in learning.learnt
-        if not because and not is_learnt:
-            because = (
-                "the similarity of images does not depend on it" if site.of_scene else "it is not of the whole scene"
-            )
+        is_learnt = site in learning.learnt and site.name not in discarded
+        because = "" if is_learnt else discarded.get(site.name) or learning.why_not(site)
         about = {"name": site.name, "kinds": site.kinds, "learnt": is_learnt}
         about |= {"fitted": site in learning.guide.sites if learning.guide is not None else False}
         sites.append(about | {"skill": None, "because": because})

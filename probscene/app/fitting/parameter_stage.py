@@ -24,9 +24,10 @@ from probscene.inference.training import Training, batch_seed
 from probscene.sampling import seed_everything
 from probscene.scenarios import JointGrammar
 
+from ..labels.partial_labels import PartialLabels
 from ..progress import Progress
 from .config import LIKELIHOOD
-from .image_level import ImageLevelTraining, meta_sim_learning, sites_record, tilting_learning
+from .image_level import ImageLevelTraining, labelled_objects, meta_sim_learning, sites_record, tilting_learning
 from .learnt_parameters import NAME, prefixed, with_parameters
 from .plugins import inner
 from .rendered_features import RenderedFeatures
@@ -45,6 +46,7 @@ def learn_parameters(
     net: FeatureNet,
     guide: Guide,
     images: Callable[[], Images],
+    labels: PartialLabels | None,
     progress: Progress,
     say: Callable[[str], None],
 ) -> None:
@@ -54,6 +56,7 @@ def learn_parameters(
         net: what structure was learnt by.
         guide: of the structures; its scenes are rendered.
         images: opens the target.
+        labels: of some of its images.
         say: is told which sites were learnt.
 
     Raises:
@@ -89,7 +92,8 @@ def learn_parameters(
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
         else:
             assert isinstance(schedule, TiltingSchedule)
-            learning = tilting_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
+            objects = labelled_objects(run, labels, target)
+            learning = tilting_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule, objects)
         keep = Checkpointer(run, NAME, learning)
 
         def each(training: Training, line: dict[str, float]) -> None:
@@ -124,7 +128,8 @@ def _record(
     """For JSON, see ``select_sites``."""
     method = {"method": run.config.parameter_method}
     if not isinstance(learning, ParameterLearning):
-        return method | {"sites": sites_record(learning), **select_sites(run, guide, learning, held).distances}
+        selected = select_sites(run, guide, learning, held)
+        return method | {"sites": sites_record(learning, selected.because), **selected.distances}
     assert learning.calibrated.skill is not None
     shares = learning.calibrated.skill.explained.tolist()
     skill = dict(zip((*learning.node_sites, *learning.scene_sites), shares, strict=True))

@@ -22,6 +22,7 @@ from probscene.inference.parameters.tilting.learning import (
     without_structure,
     witness,
 )
+from probscene.inference.parameters.tilting.objects import objects_of
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.statistics.energy import energy_distance
 from probscene.renderers.sprites import SpriteRenderer
@@ -213,3 +214,34 @@ def test_it_goes_on_to_the_same_bits(learning):
 
 def _labels(render, classes, scenes):
     return examples(render(scenes.drawing), classes)
+
+
+class Sized(Messenger):
+    """Balls of the largest third of the prior's sizes."""
+
+    def _pyro_sample(self, msg):
+        if msg["name"] == "ball.size" and msg["value"] is None:
+            msg["value"] = 3.3 + 0.7 * torch.rand(msg["fn"].batch_shape)
+
+
+def from_objects(trays, handlers, images):
+    """Learning that knows the objects of some images, and of whole images nothing."""
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    seed_everything(5)
+    drawn = label(sample(with_handlers(trays, *handlers), trays.prior, images))
+    schedule = TiltingSchedule(rounds=6, first=300, scenes=150, steps=40, rate=0.02)
+    real = (torch.rand(40, 1),)
+    return TiltingLearning(
+        trays, trays.prior, label, (lambda x: torch.rand(len(x), 1),), real, schedule, 0, objects_of(drawn)
+    )
+
+
+def test_labelled_objects_move_the_sites_that_they_go_by(trays):
+    learning = from_objects(trays, [Sized()], 15)
+    learning.run()
+    assert "ball.size" in [site.name for site in learning.learnt]
+    seed_everything(0)
+    scenes = sample(learning.guide.with_parameters(trays), trays.prior, 300)
+    size = scenes.parameters["ball.size"][scenes.site_mask["ball.size"]]
+    print([site.name for site in learning.learnt], size.mean(), size.std())
+    assert 3.4 < float(size.mean()) < 3.9 and float(size.std()) < 0.45
