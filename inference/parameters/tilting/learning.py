@@ -55,13 +55,18 @@ from ..sites import U_EPS, Site, find_sites
 from ..supervised_renders import Label, SupervisedRenders, concatenate
 from ..values import Values, images_per_step, log_density
 from .objects import (
-    ASPECTS,
+    BOX,
+    MIN_SD,
     Objects,
     Witness,
+    aspect_of,
+    basis,
     concatenate_objects,
+    dependence,
     object_basis,
     object_witness,
     objects_of,
+    scene_means,
     scene_witness,
     slope_of,
 )
@@ -73,9 +78,7 @@ FALSE_DISCOVERY_RATE = 0.05  # of the sites that are moved, at most, say nothing
 MAX_ETA = 1e3  # eta, in standard deviations of w
 OBJECT_ETA = 2.0  # eta of objects, at most: a step of about the distance that is left
 OBJECT_P_VALUE = 0.05  # of "labelled objects do not say which way", below which a site is moved by them
-BOX_P_VALUE = 1e-3  # of "no box depends on the site", below which it is one that boxes go by
 MIN_UNIT = 0.1  # share of w's standard deviation
-MIN_SD = 1e-5  # standard deviation of a number that tells scenes apart
 EXACT_SD = 1e-6  # standard deviation of u that is known
 Look = Callable[[Tensor], Tensor]
 
@@ -99,7 +102,9 @@ class TiltingLearning(TrainingLoop):
         open_to: those that can be moved; of nodes only if there are labelled objects.
         dependence: ``(G, 2)`` how much w has depended on each site of scenes, and by how many degrees of freedom, until
             it was moved.
-        boxes_depend: ``(G,)`` bool, those that boxes of objects go by; whole images do not move these.
+        aspects: ``(G,)`` int64 of sites of scenes, the aspect of objects' boxes that goes by it most, -1 for none;
+            whole images do not move those that have one.
+        aspects_of: ``(S, C)`` int64 of sites of nodes, the aspect of objects of each class.
         chosen: ``(G,)`` bool, sites of scenes that are moved.
         chosen_of: ``(S, C)`` bool, sites of nodes that are moved, of each class.
         guide: what is learnt, of all of them; None where there are none.
@@ -130,9 +135,10 @@ class TiltingLearning(TrainingLoop):
         self.renders = SupervisedRenders(model, label, self.node_sites, self.scene_sites)
         self.guide = ParameterGuide(model, self.open_to, structure) if self.open_to else None
         S, G = len(self.node_sites), len(self.scene_sites)
-        self.dependence, self.boxes_depend = torch.zeros(G, 2), torch.zeros(G, dtype=torch.bool)
-        self.chosen = torch.zeros(G, dtype=torch.bool)
-        self.chosen_of = torch.zeros(S, len(model.classes), dtype=torch.bool)
+        C = len(model.classes)
+        self.dependence, self.chosen = torch.zeros(G, 2), torch.zeros(G, dtype=torch.bool)
+        self.chosen_of = torch.zeros(S, C, dtype=torch.bool)
+        self.aspects, self.aspects_of = torch.full((G,), -1), torch.full((S, C), -1)
         net = nn.Module() if self.guide is None else self.guide.net
         super().__init__(net, {}, schedule.rounds if self.open_to else 0, seed)
 
@@ -148,7 +154,7 @@ class TiltingLearning(TrainingLoop):
     @property
     def by_images(self) -> tuple[Site, ...]:
         """Those of them that whole images have moved."""
-        moved = (self.chosen & ~self.boxes_depend).tolist()
+        moved = (self.chosen & (self.aspects < 0)).tolist()
         return tuple(site for site, is_moved in zip(self.scene_sites, moved, strict=True) if is_moved)
 
     def why_not(self, site: Site) -> str:
@@ -157,7 +163,7 @@ class TiltingLearning(TrainingLoop):
             return site.keeps or "it is of single objects, and none is labelled with a box"
         if not site.of_scene:
             return "labelled objects do not depend on it"
-        if not self.boxes_depend[self.scene_sites.index(site)]:
+        if self.aspects[self.scene_sites.index(site)] < 0:
             return "the similarity of images does not depend on it"
         if self.objects is None:
             return "sizes or places of objects go by it, and none is labelled with a box"
@@ -171,15 +177,15 @@ class TiltingLearning(TrainingLoop):
     def state(self) -> dict[str, Tensor]:
         """See ``Training``."""
         own = {"done": torch.tensor(self.done), "chosen": self.chosen, "dependence": self.dependence}
-        own |= {"boxes_depend": self.boxes_depend, "chosen_of": self.chosen_of}
+        own |= {"chosen_of": self.chosen_of, "aspects": self.aspects, "aspects_of": self.aspects_of}
         net = {f"guide.{key}": value for key, value in self.module.state_dict().items()}
         return {key: value.clone() for key, value in (own | net).items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """See ``Training``."""
         self.done, self.chosen = int(tensors["done"]), tensors["chosen"].clone()
-        self.dependence, self.boxes_depend = tensors["dependence"].clone(), tensors["boxes_depend"].clone()
-        self.chosen_of = tensors["chosen_of"].clone()
+        self.dependence, self.chosen_of = tensors["dependence"].clone(), tensors["chosen_of"].clone()
+        self.aspects, self.aspects_of = tensors["aspects"].clone(), tensors["aspects_of"].clone()
         self.module.load_state_dict(of_prefix(tensors, "guide."))
 
     def step(self) -> float:
@@ -191,7 +197,7 @@ class TiltingLearning(TrainingLoop):
         each = [witness(own_features, real) for own_features, real in zip(features, self.real, strict=True)]
         freed = [without_structure(values.kind, w) for w, _ in each]
         if not self.done:
-            self.boxes_depend = boxes_depend(values.scene, own)
+            self._find_aspects(values, own)
         of_objects = None if self.objects is None else object_witness(own, self.objects)
         if of_objects is not None:
             freed.append(without_structure(values.kind, scene_witness(of_objects, own.images)))
@@ -204,9 +210,20 @@ class TiltingLearning(TrainingLoop):
             _WeightedLikelihood(guide.net, values, *weight, self._chosen_columns, self.schedule, seed).run()
         return sum(apart for _, apart in each)
 
+    def _find_aspects(self, values: Values, own: Objects) -> None:
+        """By what each site can be judged."""
+        scenes, mean = scene_means(own)
+        for g in range(len(self.scene_sites)):
+            self.aspects[g] = aspect_of(mean, values.scene[scenes, g], BOX)
+        for c in np.unique(own.label).tolist():
+            of = own.label == c
+            for s in range(len(self.node_sites)):
+                u = values.nodes[own.image[of], own.node[of], s]
+                self.aspects_of[s, c] = -1 if u.isnan().any() else aspect_of(own.seen[of], u)
+
     def _choose_by_images(self, u: Tensor, freed: list[Features]) -> None:
         """Add the sites of scenes that w is known to depend on."""
-        free = ~self.boxes_depend
+        free = self.aspects < 0
         if not free.any():
             return
         depends = dependence(u[:, free], normalised_sum(u[:, free], freed))
@@ -219,12 +236,11 @@ class TiltingLearning(TrainingLoop):
         """The slope of w of each site that objects move, by its number for sites of scenes, by number and class for
         those of nodes. Which these are is decided in the first round."""
         found = {}
-        for g in self.boxes_depend.nonzero().flatten().tolist():
-            found[(g,)] = slope_of(w, values.scene[w.scene, g].numpy())
-        for s in range(len(self.node_sites)):
+        for g in (self.aspects >= 0).nonzero().flatten().tolist():
+            found[(g,)] = slope_of(w, values.scene[w.scene, g].numpy(), int(self.aspects[g]))
+        for s, c in (self.aspects_of >= 0).nonzero().tolist():
             u = values.nodes[w.scene, own.node[w.rows], s].numpy()
-            for c in np.unique(w.label).tolist():
-                found[(s, c)] = slope_of(w, np.where(w.label == c, u, np.nan))
+            found[(s, c)] = slope_of(w, np.where(w.label == c, u, np.nan), int(self.aspects_of[s, c]))
         if not self.done:
             for key, one in found.items():
                 (self.chosen if len(key) == 1 else self.chosen_of)[key] = one.p < OBJECT_P_VALUE
@@ -236,7 +252,7 @@ class TiltingLearning(TrainingLoop):
     ) -> tuple[Tensor, Tensor]:
         """Of the values of sites of nodes ``(N, M, S)`` and of scenes ``(N, G)``, 1 in the mean of each."""
         nodes, scene, least = torch.ones_like(values.nodes), torch.ones_like(values.scene), self.schedule.ess_fraction
-        by_images = self.chosen & ~self.boxes_depend
+        by_images = self.chosen & (self.aspects < 0)
         if by_images.any():
             of = values.scene[:, by_images]
             v, sure = explained_part(of, normalised_sum(of, freed))
@@ -313,21 +329,6 @@ class _WeightedLikelihood(AdamTraining):
         return -(weight * log_density(self.net, self.values.select(rows)))[:, self.chosen].sum(1).mean()
 
 
-def boxes_depend(u: Tensor, objects: Objects) -> Tensor:
-    """``(G,)`` bool, whether sizes or places of a scene's objects depend on the u of its sites ``(N, G)``, beyond
-    chance."""
-    columns = range(ASPECTS["size"].start, ASPECTS["place"].stop)
-    seen, number = objects.seen[:, columns].copy(), np.bincount(objects.image, minlength=objects.images)
-    for c in np.unique(objects.label):
-        seen[objects.label == c] -= seen[objects.label == c].mean(0)
-    found = torch.zeros(u.shape[1], dtype=torch.bool)
-    for one in seen.T:
-        mean = np.bincount(objects.image, one, objects.images)[number > 0] / number[number > 0]
-        depends = dependence(u[torch.from_numpy(number > 0)], mean).numpy()
-        found |= torch.from_numpy(chi2.sf(depends[:, 0], depends[:, 1].clip(min=1)) < BOX_P_VALUE / len(seen.T))
-    return found
-
-
 def step_weights(h: Features, ess_fraction: float) -> Features:
     """Weights ``(n,)`` in proportion to exp(-eta h), eta ``OBJECT_ETA``, or as large as leaves an effective share of
     them."""
@@ -374,12 +375,6 @@ def explained_part(u: Tensor, w: Features) -> tuple[Features, float]:
     return v, max(0.0, 1 - float(rank * left / freedom / found)) ** 0.5 if found and freedom > 0 else 0.0
 
 
-def basis(u: Tensor) -> Features:
-    """``(N, 4)`` of a site's u ``(N,)``, by which anything may depend on it: smooth on a line or on a circle."""
-    x = torch.stack([u, u.square(), (2 * torch.pi * u).cos(), (2 * torch.pi * u).sin()], 1).double().numpy()
-    return x - x.mean(0)
-
-
 def tilted_weights(w: Features, ess_fraction: float) -> Features:
     """Weights ``(N,)`` in proportion to exp(-eta w), of which so many are effective as ``kept`` says, a share."""
     z = -(w - w.mean()) / max(float(w.std()), 1e-12)
@@ -394,15 +389,3 @@ def tilted_weights(w: Features, ess_fraction: float) -> Features:
     if ess_fraction >= 1:
         return weight(0.0)
     return weight(root_scalar(more, bracket=(0.0, MAX_ETA)).root if more(MAX_ETA) < 0 else MAX_ETA)
-
-
-def dependence(u: Tensor, w: Features) -> Tensor:
-    """``(G, 2)``: N times the share of w's variance that a linear regression on numbers of each site's u ``(N, G)``
-    explains, and the degrees of freedom; if w does not depend on the site, a draw of their chi-squared distribution."""
-    rows, y = [], w - w.mean()
-    for one in u.unbind(1):
-        left, singular, _ = np.linalg.svd(basis(one), full_matrices=False)
-        left = left[:, singular > MIN_SD * len(y) ** 0.5]
-        found, whole = np.square(left.T @ y).sum(), np.square(y).sum()
-        rows.append((len(y) * float(found / whole) if whole else 0.0, float(left.shape[1])))
-    return torch.tensor(rows).reshape(-1, 2)

@@ -1,15 +1,16 @@
 """What is seen of single objects, alike in labelled images and in renders, and how parameters change it.
 
-An object is measured in its box: size, place, and the light inside and around. The renders' objects o have, for each of
+An object is measured in its box: size, place, and the light inside and around. The renders' objects o have, in each of
 these aspects, an energy distance from the labelled ones r of their class; with others of the renders o', it changes
 with the probability of o by
 
     w(o) = E |o - r| - E |o - o'|
 
-in units of E |r - r'|; w is summed over the aspects. What a linear regression says of w by a site's u is the way the
+in units of E |r - r'|. A site is judged by the aspect that goes by it most (``aspect_of``): in the others models differ
+from photographs in ways that it cannot mend. What a linear regression says of w by the site's u is the way that the
 site has to go. How much of that is chance is known from both sides: labelled images differ, and so do scenes. The test
-of a site is Hotelling's T², its images and scenes taken as a whole each [1]. Axis letters: N scenes, M nodes, C H W, n
-objects of the renders, r labelled ones, K labelled images, D measurements, P of a site's basis.
+of a site is Hotelling's T², images and scenes taken as a whole each [1]. Axis letters: N scenes, M nodes, C H W, n
+objects of the renders, r labelled ones, K labelled images, D measurements, A aspects, P of a site's basis.
 
 References:
     [1] Hotelling, *The generalization of Student's ratio*, 1931; Liang and Zeger, *Longitudinal data analysis using
@@ -22,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.spatial.distance import cdist
+from scipy.stats import chi2
 from scipy.stats import f as fisher
 from torch import Tensor
 
@@ -30,12 +32,16 @@ from ...statistics.energy import Features
 from ..reader_training import MIN_VISIBLE
 
 ASPECTS = {"size": slice(0, 2), "place": slice(2, 4), "inside": slice(4, 8), "around": slice(8, 11)}
+BOX = ("size", "place")  # the first of them
+WIDTH = ASPECTS["around"].stop
 AROUND = 0.25  # of a box's width and height, on each side
 MIN_SIDE = 1.0  # pixels of a box
 MAX_OBJECTS = 3000  # of a class that others are compared with
 MIN_OBJECTS = 4  # labelled ones of a class
 MIN_SPREAD = 1e-6
 RIDGE = 1e-12
+ASPECT_P_VALUE = 1e-3  # of "nothing that is seen goes by the site", below which something does
+MIN_SD = 1e-5  # standard deviation of a number that tells scenes apart
 
 
 class Objects(NamedTuple):
@@ -62,8 +68,8 @@ class Witness(NamedTuple):
         rows: ``(n',)`` int64 which of the renders' objects they are.
         scene, label: ``(n',)`` int64 of each.
         weight: ``(n',)`` so that classes count as often as among the labelled objects; 1 in the mean.
-        w: ``(n',)``, 0 in the mean of each class.
-        each: ``(n', K)`` by how much w differs from that of each labelled image alone, so that these are 0 in all.
+        w: ``(A, n')``, 0 in the mean of each class.
+        each: ``(A, n', K)`` by how much w differs from that of each labelled image alone, so that these are 0 in all.
     """
 
     rows: np.ndarray
@@ -145,7 +151,8 @@ def object_witness(own: Objects, real: Objects) -> Witness | None:
     parts = [part for c in np.unique(real.label) if (part := _of_class(own, real, c)) is not None]
     if not parts:
         return None
-    rows, weight, w, each = (np.concatenate(some) for some in zip(*parts, strict=True))
+    rows, weight = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+    w, each = (np.concatenate([part[i] for part in parts], 1) for i in (2, 3))
     return Witness(rows, own.image[rows], own.label[rows], weight / weight.mean(), w, each)
 
 
@@ -153,14 +160,16 @@ def _of_class(own: Objects, real: Objects, c: int) -> tuple[np.ndarray, Features
     rows, labelled = np.flatnonzero(own.label == c), np.flatnonzero(real.label == c)[:MAX_OBJECTS]
     if min(len(rows), len(labelled)) < MIN_OBJECTS:
         return None
-    x, r, w, each = own.seen[rows], real.seen[labelled], np.zeros(len(rows)), np.zeros((len(rows), real.images))
-    for columns in ASPECTS.values():
+    x, r = own.seen[rows], real.seen[labelled]
+    w, each = np.zeros((len(ASPECTS), len(rows))), np.zeros((len(ASPECTS), len(rows), real.images))
+    for a, columns in enumerate(ASPECTS.values()):
         toward, within = cdist(x[:, columns], r[:, columns]), cdist(r[:, columns], r[:, columns])
         spread = max(within.sum() / (len(r) * (len(r) - 1)), MIN_SPREAD)
         mean = toward.mean(1)
-        w += (mean - _mean_distance(x[:, columns])) / spread
-        np.add.at(each.T, real.image[labelled], (toward - mean[:, None]).T / spread * real.images / len(r))
-    return rows, np.full(len(rows), len(labelled) / len(rows)), w - w.mean(), each - each.mean(0)
+        w[a] = (mean - _mean_distance(x[:, columns])) / spread
+        np.add.at(each[a].T, real.image[labelled], (toward - mean[:, None]).T / spread * real.images / len(r))
+    weight = np.full(len(rows), len(labelled) / len(rows))
+    return rows, weight, w - w.mean(1, keepdims=True), each - each.mean(1, keepdims=True)
 
 
 def _mean_distance(x: Features) -> Features:
@@ -172,8 +181,53 @@ def _mean_distance(x: Features) -> Features:
 
 
 def scene_witness(witness: Witness, scenes: int) -> Features:
-    """w of whole scenes ``(scenes,)``, by their objects."""
-    return np.bincount(witness.scene, witness.weight * witness.w, scenes)
+    """w of whole scenes ``(scenes,)``, by the light of their objects."""
+    return np.bincount(witness.scene, witness.weight * witness.w[len(BOX) :].sum(0), scenes)
+
+
+def aspect_of(seen: Features, u: Tensor, aspects: Sequence[str] = tuple(ASPECTS)) -> int:
+    """Which aspect of what is seen ``(n, D)`` goes by u ``(n,)`` most, by the largest share of variance that is
+    explained of one of its measurements; -1 where all could be chance.
+
+    Args:
+        aspects: that come into question, the first ones of all.
+    """
+    best, largest = -1, 0.0
+    for number, name in enumerate(aspects):
+        for one in seen[:, ASPECTS[name]].T:
+            (found, freedom), *_ = dependence(u[:, None], one).tolist()
+            if found > largest and chi2.sf(found, max(freedom, 1)) < ASPECT_P_VALUE / WIDTH:
+                best, largest = number, found
+    return best
+
+
+def scene_means(objects: Objects) -> tuple[np.ndarray, Features]:
+    """The numbers of the scenes ``(N',)`` that have objects, and what is seen of these in the mean ``(N', D)``, less
+    that of all of their class."""
+    seen, number = objects.seen.copy(), np.bincount(objects.image, minlength=objects.images)
+    for c in np.unique(objects.label):
+        seen[objects.label == c] -= seen[objects.label == c].mean(0)
+    mean = np.stack([np.bincount(objects.image, one, objects.images) for one in seen.T], 1)
+    scenes = np.flatnonzero(number)
+    return scenes, mean[scenes] / number[scenes, None]
+
+
+def dependence(u: Tensor, w: Features) -> Tensor:
+    """``(G, 2)``: N times the share of w's variance that a linear regression on numbers of each site's u ``(N, G)``
+    explains, and the degrees of freedom; if w does not depend on the site, a draw of their chi-squared distribution."""
+    rows, y = [], w - w.mean()
+    for one in u.unbind(1):
+        left, singular, _ = np.linalg.svd(basis(one), full_matrices=False)
+        left = left[:, singular > MIN_SD * len(y) ** 0.5]
+        found, whole = np.square(left.T @ y).sum(), np.square(y).sum()
+        rows.append((len(y) * float(found / whole) if whole else 0.0, float(left.shape[1])))
+    return torch.tensor(rows).reshape(-1, 2)
+
+
+def basis(u: Tensor) -> Features:
+    """``(N, 4)`` of a site's u ``(N,)``, by which anything may depend on it: smooth on a line or on a circle."""
+    x = torch.stack([u, u.square(), (2 * torch.pi * u).cos(), (2 * torch.pi * u).sin()], 1).double().numpy()
+    return x - x.mean(0)
 
 
 def object_basis(u: Features) -> Features:
@@ -181,10 +235,11 @@ def object_basis(u: Features) -> Features:
     return np.stack([u - 0.5, np.square(u - 0.5)], 1)
 
 
-def slope_of(witness: Witness, u: Features) -> Slope:
-    """Of a site that some of the objects have: u ``(n',)``, NaN for the others."""
+def slope_of(witness: Witness, u: Features, aspect: int) -> Slope:
+    """Of a site that some of the objects have: u ``(n',)``, NaN for the others; in one aspect."""
     has = ~np.isnan(u)
-    scene, label, weight, w, each = (part[has] for part in witness[1:])
+    scene, label, weight = (part[has] for part in witness[1:4])
+    w, each = witness.w[aspect, has], witness.each[aspect, has]
     none, K = Slope(1.0, 0.0, np.zeros(2)), int(np.abs(each).any(0).sum())
     if not has.any():
         return none

@@ -15,14 +15,12 @@ from probscene.inference.parameters.sites import with_handlers
 from probscene.inference.parameters.tilting.image_statistics import image_statistics
 from probscene.inference.parameters.tilting.learning import (
     TiltingLearning,
-    basis,
-    dependence,
     explained_part,
     tilted_weights,
     without_structure,
     witness,
 )
-from probscene.inference.parameters.tilting.objects import objects_of
+from probscene.inference.parameters.tilting.objects import basis, dependence, objects_of
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.statistics.energy import energy_distance
 from probscene.renderers.sprites import SpriteRenderer

@@ -7,13 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from probscene.inference.parameters.tilting.learning import boxes_depend, step_weights
+from probscene.inference.parameters.tilting.learning import step_weights
 from probscene.inference.parameters.tilting.objects import (
     ASPECTS,
+    BOX,
     Objects,
+    aspect_of,
     concatenate_objects,
     measure,
     object_witness,
+    scene_means,
     slope_of,
 )
 
@@ -65,13 +68,13 @@ def test_a_site_is_moved_toward_the_labelled_objects_and_others_are_not():
     own, u = drawn(rng, 400, lambda u: 2 * u)
     real, _ = drawn(rng, 12, lambda u: 2 * (0.6 + 0.4 * u))
     w = object_witness(own, real)
-    size = slope_of(w, u[w.rows])
+    size = slope_of(w, u[w.rows], 0)
     assert size.p < 1e-3 and size.sure > 0.5
     v = np.stack([u - 0.5, np.square(u - 0.5)], 1) @ size.slope
     assert v[u > 0.8].mean() < v[u < 0.2].mean()  # larger ones are to become more frequent
     weight = step_weights(v, 0.3)
     assert weight.sum() == pytest.approx(1) and (weight * u).sum() > 0.55
-    assert slope_of(w, rng.uniform(size=len(w.rows))).p > 0.01
+    assert slope_of(w, rng.uniform(size=len(w.rows)), 0).p > 0.01
 
 
 @pytest.mark.parametrize("of_scene", [False, True])
@@ -87,7 +90,7 @@ def test_a_site_is_chosen_by_chance_as_often_as_the_test_says(of_scene):
         if of_scene:
             real.seen[:, 0] += np.repeat(rng.uniform(size=10), 4)
         w = object_witness(own, real)
-        found.append(slope_of(w, u[w.rows]).p)
+        found.append(slope_of(w, u[w.rows], 0).p)
     low = binomtest(int((np.array(found) < 0.05).sum()), 400).proportion_ci(1 - 1e-4).low
     assert low < 0.05
 
@@ -99,8 +102,8 @@ def test_where_too_few_are_labelled_nothing_is_said():
     assert object_witness(own, real) is None
     real, _ = drawn(rng, 2, lambda u: u, classes=1)
     w = object_witness(own, real)
-    assert slope_of(w, u[w.rows]).p == 1 and slope_of(w, np.full(len(w.rows), np.nan)).p == 1
-    assert slope_of(w, np.full(len(w.rows), 0.5)).p == 1
+    assert slope_of(w, u[w.rows], 0).p == 1 and slope_of(w, np.full(len(w.rows), np.nan), 0).p == 1
+    assert slope_of(w, np.full(len(w.rows), 0.5), 0).p == 1
 
 
 @given(seeds, st.integers(1, 4))
@@ -123,7 +126,12 @@ def test_boxes_go_by_a_site_only_if_their_size_or_place_does():
     own.seen[:, 1] += 0.3 * per_object[:, 0] * np.where(own.label == 0, 1, 1.2)
     own.seen[:, 3] += 0.5 * np.cos(6 * per_object[:, 1])
     own.seen[:, 5] += 5 * per_object[:, 2]  # light
-    assert boxes_depend(u, own).tolist() == [True, True, False, False]
+    scenes, mean = scene_means(own)
+    names = list(ASPECTS)
+    for g, (of_box, of_all) in enumerate([("size", "size"), ("place", "place"), (None, "inside"), (None, None)]):
+        for aspects, expected in ((BOX, of_box), (names, of_all)):
+            found = aspect_of(mean, u[scenes, g], aspects)
+            assert (names[found] if found >= 0 else None) == expected
 
 
 @given(seeds, st.integers(2, 200), st.floats(0, 30), st.floats(0.2, 0.8))
