@@ -1,5 +1,6 @@
 """Errors of the counts that a run reads in each labelled image, as papers on counting report them: the mean absolute
-error, and Pearson's correlation. Axis letters: L images, C classes, R resamples.
+error, and Pearson's correlation; and what labels and readings say of the mean count of all images. Axis letters: L
+labelled images, U others, C classes, R resamples.
 """
 
 from typing import NamedTuple
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probscene.inference.statistics.count_metrics import Interval, bootstrap_interval, resamples
+from probscene.inference.statistics.prediction_powered import prediction_powered_mean
 
 from .structure_counts import Counts
 
@@ -19,19 +21,25 @@ class CountErrors(NamedTuple):
         images: L.
         mean_absolute: error, objects an image.
         correlation: -1 to 1; None where the labels or the readings are the same in all images.
+        mean: objects an image in labelled and other images together, with a 90 % interval that holds if the labelled
+            ones were drawn at random, see ``prediction_powered_mean``; None where they are too few.
     """
 
     images: int
     mean_absolute: Interval
     correlation: Interval | None
+    mean: Interval | None
 
 
-def count_errors(read: NDArray[np.float64], labelled: Counts, seed: int = 0) -> CountErrors:
+def count_errors(
+    read: NDArray[np.float64], labelled: Counts, others: NDArray[np.float64] | None = None, seed: int = 0
+) -> CountErrors:
     """The errors of one class's counts, with 95 % bootstrap intervals over images.
 
     Args:
         read: ``(L,)``, not rounded.
         labelled: ``(L,)``.
+        others: ``(U,)`` read in images without labels.
     """
     one, other = np.asarray(read, np.float64), labelled.astype(np.float64)
     weight = resamples(len(one), seed=seed).astype(np.float64) / len(one)
@@ -41,7 +49,9 @@ def count_errors(read: NDArray[np.float64], labelled: Counts, seed: int = 0) -> 
     correlation = None if np.isnan(whole[0]) else bootstrap_interval(float(whole[0]), drawn, minimum=-1.0)
     if correlation is not None:
         correlation = Interval(*(min(end, 1.0) for end in correlation))
-    return CountErrors(len(one), bootstrap_interval(float(error.mean()), weight @ error, minimum=0.0), correlation)
+    absolute = bootstrap_interval(float(error.mean()), weight @ error, minimum=0.0)
+    mean = prediction_powered_mean(other, one, [] if others is None else others)
+    return CountErrors(len(one), absolute, correlation, mean)
 
 
 def _correlation(one: NDArray[np.float64], other: NDArray[np.float64], weight: NDArray[np.float64]):

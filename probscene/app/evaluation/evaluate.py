@@ -349,11 +349,13 @@ def _errors(
     errors = dict.fromkeys(classes, None)
     if counts is None or (truth.rows is None and len(counts) != len(labelled)):
         return errors
-    found = counts.double().numpy()[slice(None) if truth.rows is None else truth.rows]
-    known = [name for name in classes if name in names and name not in run.unread]
-    return errors | {
-        name: count_errors(found[:, names.index(name)], labelled[:, classes.index(name)]) for name in known
-    }
+    rows = np.arange(len(counts)) if truth.rows is None else np.asarray(truth.rows)
+    for name in classes:
+        if name in names and name not in run.unread:
+            read_in = counts[:, names.index(name)].double().numpy()
+            others = np.delete(read_in, rows)
+            errors[name] = count_errors(read_in[rows], labelled[:, classes.index(name)], others)
+    return errors
 
 
 def renders_read(

@@ -15,7 +15,7 @@ from ..evaluation.compare import Comparison, Row
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.image_distances import caveat
 from ..evaluation.likelihood import Likelihood
-from ..evaluation.sources import ESTIMATE, READ, SAMPLED_SOURCES, START, Source
+from ..evaluation.sources import ESTIMATE, LEARNT, READ, SAMPLED_SOURCES, START, Source
 from ..evaluation.structure_counts import ALL, GROUPS, PARENTS, group_label
 
 if TYPE_CHECKING:
@@ -210,10 +210,16 @@ def errors(evaluation: Evaluation) -> list[Table]:
     """With labels, the errors of the counts read in each image."""
     if not evaluation.errors:
         return []
-    table = _table("Counts read in each labelled image", "class", ["mean absolute error", "correlation", "images"])
+    heads = ["mean absolute error", "correlation", "labelled images", "mean of all images, 90 %", "mean of the fit"]
+    table = _table("Counts read in each labelled image", "class", heads)
     for name, found in evaluation.errors.items():
-        cells = ("-", "-", "-") if found is None else (*(_figure(x, 2) for x in found[1:]), str(found.images))
-        table.add_row(name, *cells)
+        cells = ["-"] * 4
+        if found is not None:
+            figures, mean = [_figure(x, 2) for x in (found.mean_absolute, found.correlation)], found.mean
+            interval = "-" if mean is None else f"{mean.value:.2f} ({mean.low:.2f} to {mean.high:.2f})"
+            cells = [*figures, str(found.images), interval]
+        learnt = evaluation.sources[LEARNT].counts[:, evaluation.classes.index(name)]
+        table.add_row(name, *cells, f"{learnt.mean():.2f}")
     return [table]
 
 
