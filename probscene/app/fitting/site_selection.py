@@ -110,14 +110,14 @@ def _select_moved(run: RunFolder, guide: Guide, learning: TiltingLearning, held:
     if by_images and test.distance >= test.baseline_distance:
         why = f"energy distance {test.distance:.2f}, without it {test.baseline_distance:.2f}"
         because = dict.fromkeys(by_images, f"learnt scenes come no nearer to held-out images by it ({why})")
-    elif by_images and learning.objects is not None and _objects_farther(drawn, learning.objects):
+    elif by_images and learning.objects is not None and objects_farther(drawn, learning.objects):
         because = dict.fromkeys(by_images, "objects get farther from the labelled ones by it")
     learnt.prior_sites = own | because.keys()
     distances = {"kept": "learnt" if len(because) < len(learning.learnt) else "prior"}
     return SiteSelection(distances | {"learnt": test.distance, "prior": test.baseline_distance}, because, {})
 
 
-def _objects_farther(drawn: dict[str, list[Examples]], real: Objects) -> bool:
+def objects_farther(drawn: dict[str, list[Examples]], real: Objects) -> bool:
     """Whether objects of a class are significantly farther from the labelled ones in learnt renders than in others."""
     learnt, other = (concatenate_objects([objects_of(some) for some in drawn[name]]) for name in ("learnt", "prior"))
     for c in np.unique(real.label):

@@ -2,16 +2,24 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
-from probscene.app.fitting import site_selection
+from probscene.app.fitting import parameter_stage, site_selection
 from probscene.app.fitting import store as storage
+from probscene.app.fitting.image_level import labelled_objects
 from probscene.app.fitting.presets import preset
+from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.app.fitting.run import RunFolder
+from probscene.app.labels.partial_labels import PartialLabels
+from probscene.app.loading import load_model
+from probscene.dataset import ImageFolder
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.tilting import learning
+from probscene.inference.parameters.tilting.objects import objects_of
 from probscene.inference.statistics.energy import BootstrapTest
 from probscene.sampling import sample, seed_everything
 
@@ -35,7 +43,7 @@ def lit(tmp_path_factory, discs) -> Path:
 
 
 def it_is_kept(patch):
-    patch.setattr(site_selection, "bootstrap_test", lambda *_: BootstrapTest(0.0, 1.0, 0.0))
+    patch.setattr(site_selection, "bootstrap_test", lambda *_, **__: BootstrapTest(0.0, 1.0, 0.0))
     patch.setattr(learning, "FALSE_DISCOVERY_RATE", 1.1)  # of so few scenes, whatever they say
 
 
@@ -112,6 +120,74 @@ def test_where_images_say_nothing_the_prior_is_kept(call, lit, discs, target, tm
     run = RunFolder.at(out)
     assert run.parameters["kept"] == "prior" and run.guide.with_parameters is None
     assert run.parameters["sites"][2]["because"] == "the similarity of images does not depend on it"
+
+
+@pytest.fixture(scope="module")
+def to_the_right(lit):
+    """Labelled objects of the model, which stand in the right half of their images."""
+    model = load_model(str(lit))
+    seed_everything(7)
+    drawn = RenderedFeatures(model, 1).draw(60)
+    right = drawn.centre[..., 0] > 34
+    return objects_of(drawn._replace(label=drawn.label.where(right, -1)))
+
+
+def test_labelled_objects_move_sites_of_objects(to_the_right, call, lit, discs, target, tmp_path, monkeypatch):
+    it_is_kept(monkeypatch)
+    monkeypatch.setattr(parameter_stage, "labelled_objects", lambda *_: to_the_right)
+    out = tmp_path / "run"
+    settings = ("--set", "parameters.first=200", "--set", "parameters.scenes=100", "--set", "parameters.steps=40")
+    words = (*discs.without("parameters"), *LEARN, *settings, "--set", "parameters.rate=0.02")
+    done = call("fit", lit, "--target", target.images, "--out", out, *words)
+    assert done.code == 0, done.err
+    run = RunFolder.at(out)
+    sites = {site["name"]: site for site in run.parameters["sites"]}
+    assert sites["x"]["learnt"] and not sites["y"]["learnt"]
+    assert sites["y"]["because"] == "labelled objects do not depend on it"
+    seed_everything(0)
+    scenes = sample(run.model, run.guide, 200)
+    assert 36 < float(scenes.parameters["x"][scenes.site_mask["x"]].mean())  # 32 in the prior, 45 in the labels
+
+
+def test_what_takes_objects_away_from_the_labelled_ones_is_discarded(
+    to_the_right, call, lit, discs, target, tmp_path, monkeypatch
+):
+    it_is_kept(monkeypatch)
+    monkeypatch.setattr(parameter_stage, "labelled_objects", lambda *_: to_the_right)
+    monkeypatch.setattr(site_selection, "objects_farther", lambda *_: True)
+    out = tmp_path / "run"
+    done = call("fit", lit, "--target", target.images, "--out", out, *discs.without("parameters"), *LEARN)
+    assert done.code == 0, done.err
+    light = RunFolder.at(out).parameters["sites"][2]
+    assert light["fitted"] and not light["learnt"]
+    assert light["because"] == "objects get farther from the labelled ones by it"
+
+
+def test_objects_are_farther_where_their_light_is_other_and_not_where_it_is_the_same(lit):
+    render, parts = RenderedFeatures(load_model(str(lit)), 1), []
+    for seed, share in ((0, 1.0), (1, 0.4), (2, 1.0)):
+        seed_everything(seed)
+        drawn = render.draw(60)
+        parts.append(drawn._replace(image=(share * drawn.image).byte()))
+    same, dark, other = parts
+    real = objects_of(same)
+    assert site_selection.objects_farther({"learnt": [dark], "prior": [other]}, real)
+    assert not site_selection.objects_farther({"learnt": [other], "prior": [dark]}, real)
+
+
+def test_labelled_objects_are_those_of_the_boxes(lit, target):
+    """Measured in the target's images, as the model's classes."""
+    run = SimpleNamespace(model=load_model(str(lit)))
+    images = ImageFolder(target.images, (64, 64), 3)
+    boxes = (torch.tensor([[0, 4.0, 6.0, 20.0, 18.0]]), torch.zeros(0, 5), torch.tensor([[0, 30.0, 31.0, 40.0, 50.0]]))
+    labels = PartialLabels(torch.tensor([1, 4, 7]), torch.zeros(3, 1), ("blue",), boxes, ())
+    found = labelled_objects(run, labels, images)
+    assert found.image.tolist() == [0, 2] and found.label.tolist() == [1, 1] and found.images == 3
+    assert found.seen[0, :2] == pytest.approx(np.log([16, 14])) and found.seen[1, :2] == pytest.approx(np.log([10, 19]))
+    inside = images.load(7)[:, 31:50, 30:40].double().mean((1, 2)) / 255
+    assert found.seen[1, 4:7] == pytest.approx(inside.numpy())
+    assert labelled_objects(run, labels._replace(boxes=None), images) is None
+    assert labelled_objects(run, None, images) is None
 
 
 def test_it_is_the_way_for_photographs():
