@@ -4,9 +4,9 @@
 
 A network is trained to count on renders of ``small_digits``. Each target has numbers and digits of its own, and a look
 that no render has: darker, blurred and noisy. Some images are labelled. For each target are printed the true mean
-number of each digit in an endless target, what the network reads in the mean, and the 90 % interval by labels and readings
-together (``prediction_powered_mean``); at the end, how many of the intervals hold the truth, and how wide they are
-beside those of the labels alone.
+number of each digit in an endless target, what the network reads in the mean, and the 90 % interval by labels and
+readings together (``prediction_powered_mean``); at the end, how many of the intervals hold the truth, and how wide they
+are beside those of the labels alone.
 """
 
 import argparse
