@@ -7,6 +7,7 @@ features, C H W.
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -68,6 +69,19 @@ class EmbedsReal(Protocol):
 
     def embed_real(self, images: Tensor) -> Tensor:
         """``FeatureNet.embed`` of target images."""
+        ...
+
+
+@runtime_checkable
+class EmbedsTarget(Protocol):
+    """A ``FeatureNet`` that knows the features of the target's images, and of no others."""
+
+    def embed_target(self, fingerprint: str) -> Tensor:
+        """Features ``(L, D)`` of the images with this fingerprint.
+
+        Raises:
+            DataError: they are not the target's.
+        """
         ...
 
 
@@ -139,11 +153,40 @@ class Labelled(NamedTuple):
         images: ``(K, C, H, W)`` uint8.
         counts: ``(K, classes)`` int64 objects.
         classes: the names of those that are labelled, in the model's order.
+        rows: ``(K,)`` int64, which of the target's images they are.
+        boxes: of each image ``(n, 5)``: the number of the class in ``classes``, then x0, y0, x1, y1 in pixels of the
+            canvas; None where only counts are known.
     """
 
     images: Tensor
     counts: Tensor
     classes: tuple[str, ...]
+    rows: Tensor
+    boxes: tuple[Tensor, ...] | None
+
+
+class Detections(NamedTuple):
+    """What a detector found in the target's images.
+
+    Attributes:
+        image, label: ``(n,)`` int64 the number of the image of each, and its class in the model's order.
+        box: ``(n, 4)`` x0, y0, x1, y1 in pixels of the canvas.
+        score: ``(n,)``.
+        images: L.
+        classes: numbers of those that the detector knows.
+    """
+
+    image: np.ndarray
+    label: np.ndarray
+    box: np.ndarray
+    score: np.ndarray
+    images: int
+    classes: tuple[int, ...]
+
+    def counts(self, c: int, min_score: float) -> np.ndarray:
+        """``(L,)`` of a class, from a score on."""
+        kept = (self.label == c) & (self.score >= min_score)
+        return np.bincount(self.image[kept], minlength=self.images)
 
 
 class Photographs(Protocol):
@@ -151,9 +194,11 @@ class Photographs(Protocol):
 
     Attributes:
         fingerprint: of the images, SHA-256 hexadecimal.
+        detections: that somebody's detector made in them; None where there are none.
     """
 
     fingerprint: str
+    detections: Detections | None
 
     @property
     def labelled(self) -> Labelled | None:
@@ -175,6 +220,7 @@ class Features(Protocol):
         pretrained: whether the network has learnt from photographs; a verdict then does not advise to take such a one.
         images: how many renders its training draws, at most, for a forecast of how long a fit takes.
         takes_labels: whether ``adapt`` makes use of ``Photographs.labelled``; with others ``fit --labels`` is an error.
+        takes_readings: whether it needs ``Photographs.detections``; with others ``fit --readings`` is an error.
     """
 
     name: str
@@ -182,6 +228,7 @@ class Features(Protocol):
     pretrained: bool = False
     images: int = 0
     takes_labels: bool = False
+    takes_readings: bool = False
 
     def build(self, model: SceneModel) -> FeatureNet:
         """The network, untrained or pretrained; the random numbers it takes are the run's. Called once a fit, and again

@@ -6,8 +6,7 @@ were drawn at random from all. Where these show hardly any object, Student's t s
 a Poisson distribution by the labels alone [2]. Axis letters: K labelled images, U others.
 
 References:
-    [1] Angelopoulos, Duchi and Zrnic, *PPI++: efficient prediction-powered inference*, 2023: with their lambda, the
-        weight of the readings, at which the interval is narrowest.
+    [1] Angelopoulos, Duchi, Zrnic, *PPI++: efficient prediction-powered inference*, 2023; with the best lambda.
     [2] Garwood, *Fiducial limits for the Poisson distribution*, Biometrika 1936.
 """
 

@@ -25,11 +25,14 @@ class TargetImages:
         skip_bad: leave out files that do not decode.
         value_range: the values of images of 16 bits that are read as black and white, such as ``(0, 4095)``; where
             None, what is found in the images, see ``ImageFolder``. A run keeps it.
+        readings: detections in all of the images, with scores, as COCO's ``.json``: any detector's, by which a fit
+            counts in the place of a network that is trained on renders.
     """
 
     source: Target
     skip_bad: bool | None = None
     value_range: Sequence[float] | None = None
+    readings: Path | str | None = None
 
 
 def open_images(

@@ -237,9 +237,9 @@ class TiltingLearning(TrainingLoop):
         those of nodes. Which these are is decided in the first round."""
         found = {}
         for g in (self.aspects >= 0).nonzero().flatten().tolist():
-            found[(g,)] = slope_of(w, values.scene[w.scene, g].numpy(), int(self.aspects[g]))
+            found[(g,)] = slope_of(w, values.scene[w.owner, g].numpy(), int(self.aspects[g]))
         for s, c in (self.aspects_of >= 0).nonzero().tolist():
-            u = values.nodes[w.scene, own.node[w.rows], s].numpy()
+            u = values.nodes[w.owner, own.node[w.rows], s].numpy()
             found[(s, c)] = slope_of(w, np.where(w.label == c, u, np.nan), int(self.aspects_of[s, c]))
         if not self.done:
             for key, one in found.items():

@@ -6,15 +6,16 @@ with the probability of o by
 
     w(o) = E |o - r| - E |o - o'|
 
-in units of E |r - r'|. A site is judged by the aspect that goes by it most (``aspect_of``): in the others models differ
-from photographs in ways that it cannot mend. What a linear regression says of w by the site's u is the way that the
-site has to go. How much of that is chance is known from both sides: labelled images differ, and so do scenes. The test
-of a site is Hotelling's T², images and scenes taken as a whole each [1]. Axis letters: N scenes, M nodes, C H W, n
-objects of the renders, r labelled ones, K labelled images, D measurements, A aspects, P of a site's basis.
+in units of the mean distance of two labelled ones. A site is judged by the aspect that goes by it most (``aspect_of``):
+in the others models differ from photographs in ways that it cannot mend. What a linear regression says of w by the
+site's u is the way that the site has to go. How much of that is chance is known from both sides: labelled images
+differ, and so do scenes. The test of a site is Hotelling's T² [1], images and scenes taken as a whole each [2]. Axis
+letters: N scenes, M nodes, C H W, n objects of the renders, r labelled ones, K labelled images, D measurements, A
+aspects, P of a site's basis.
 
 References:
-    [1] Hotelling, *The generalization of Student's ratio*, 1931; Liang and Zeger, *Longitudinal data analysis using
-        generalized linear models*, 1986, for the clusters.
+    [1] Hotelling, *The generalization of Student's ratio*, 1931.
+    [2] Liang, Zeger, *Longitudinal data analysis using generalized linear models*, Biometrika 1986.
 """
 
 from collections.abc import Sequence
@@ -66,14 +67,15 @@ class Witness(NamedTuple):
 
     Attributes:
         rows: ``(n',)`` int64 which of the renders' objects they are.
-        scene, label: ``(n',)`` int64 of each.
+        owner: ``(n',)`` int64 the number of the scene of each.
+        label: ``(n',)`` int64 its class.
         weight: ``(n',)`` so that classes count as often as among the labelled objects; 1 in the mean.
         w: ``(A, n')``, 0 in the mean of each class.
         each: ``(A, n', K)`` by how much w differs from that of each labelled image alone, so that these are 0 in all.
     """
 
     rows: np.ndarray
-    scene: np.ndarray
+    owner: np.ndarray
     label: np.ndarray
     weight: Features
     w: Features
@@ -151,8 +153,8 @@ def object_witness(own: Objects, real: Objects) -> Witness | None:
     parts = [part for c in np.unique(real.label) if (part := _of_class(own, real, c)) is not None]
     if not parts:
         return None
-    rows, weight = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-    w, each = (np.concatenate([part[i] for part in parts], 1) for i in (2, 3))
+    rows, weight = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+    w, each = np.concatenate([part[2] for part in parts], 1), np.concatenate([part[3] for part in parts], 1)
     return Witness(rows, own.image[rows], own.label[rows], weight / weight.mean(), w, each)
 
 
@@ -182,7 +184,8 @@ def _mean_distance(x: Features) -> Features:
 
 def scene_witness(witness: Witness, scenes: int) -> Features:
     """w of whole scenes ``(scenes,)``, by the light of their objects."""
-    return np.bincount(witness.scene, witness.weight * witness.w[len(BOX) :].sum(0), scenes)
+    light = np.asarray(witness.weight * witness.w[len(BOX) :].sum(0), np.float64)
+    return np.bincount(witness.owner, light, scenes).astype(np.float64)
 
 
 def aspect_of(seen: Features, u: Tensor, aspects: Sequence[str] = tuple(ASPECTS)) -> int:
@@ -238,7 +241,7 @@ def object_basis(u: Features) -> Features:
 def slope_of(witness: Witness, u: Features, aspect: int) -> Slope:
     """Of a site that some of the objects have: u ``(n',)``, NaN for the others; in one aspect."""
     has = ~np.isnan(u)
-    scene, label, weight = (part[has] for part in witness[1:4])
+    scene, label, weight = witness.owner[has], witness.label[has], witness.weight[has]
     w, each = witness.w[aspect, has], witness.each[aspect, has]
     none, K = Slope(1.0, 0.0, np.zeros(2)), int(np.abs(each).any(0).sum())
     if not has.any():

@@ -46,7 +46,7 @@ def fit(
             folder of assets.
         target: a folder of images, a list of files or of Pillow images, an array
             ``(L, H, W)`` or ``(L, H, W, 1 or 3)``, or a torch dataset of images, see ``ImageFolder`` and
-            ``ImageArray``; ``TargetImages`` says how they are read.
+            ``ImageArray``; ``TargetImages`` says how they are read, and what a detector of yours found in them.
         config: how to learn: a ``FitConfig``, or the name of a preset: ``"quick"``, ``"default"``, ``"street"``,
             ``"paper"``, ``"paper-aerial"`` or ``"paper-driving"``; ``"default"`` where None.
         out: the folder of the run; a temporary one where None, which ``Run.save`` copies.
@@ -54,7 +54,7 @@ def fit(
         labels: of a few of the images, for features that take them: a ``counts.csv``, COCO's ``.json``, KITTI's folder
             ``label_2`` or YOLO's ``labels``.
         resume: go on with the run in ``out`` where there is one; arguments that are given have to be those that it was
-            begun with. Model, target and labels may lie elsewhere by now, if they are the same bytes.
+            begun with. Model, target, labels and readings may lie elsewhere by now, if they are the same bytes.
         execution: threads, cluster, cache and progress.
 
     Raises:

@@ -31,6 +31,10 @@ def fit(
         Path | None,
         typer.Option(metavar="PATH", help="A few labels: counts.csv, COCO .json, KITTI label_2 or YOLO labels."),
     ] = None,
+    readings: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Detections in all images, with scores: COCO .json."),
+    ] = None,
     learn: Annotated[
         str | None,
         typer.Option(metavar="WHAT", help="structure, or structure,parameters (position and appearance)."),
@@ -110,7 +114,7 @@ def fit(
     if model is None and scenarios is not None:
         raise ProbsceneError("expected MODEL with --scenarios, got none; a run knows its own.")
     source = None if model is None else with_scenarios(model, scenarios)
-    images = TargetImages(target, skip_bad, range_given(value_range))
+    images = TargetImages(target, skip_bad, range_given(value_range), readings)
     request = fit_request(ModelFile(source, assets), images, config, seed, labels, threads)
     execution = Execution(threads, cluster, False if no_cache else cache or True)
     try:

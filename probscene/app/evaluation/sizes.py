@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from probscene.dataset import Images
 from probscene.errors import DataError
+from probscene.inference.features.base import Detections
 from probscene.inference.statistics.residual import RESAMPLES, Grade, worst_grade
 from probscene.policy import Policy
 
@@ -23,6 +24,7 @@ from ..chunks import CHUNK, draw_chunk
 from ..datasets.coco import labelled
 from ..fitting.run import RunFolder
 from ..labels.boxes import Boxes
+from ..labels.detections import read_detections
 from ..labels.partial_labels import read_partial_labels
 from ..loading import renderer_for
 from .components import UNSURE, VerdictComponent, VerdictComponents
@@ -81,18 +83,32 @@ class Sizes(NamedTuple):
 
 
 def given_boxes(run: RunFolder, target: Images) -> Boxes | None:
-    """The boxes that the run was given with its labels; None where these were none, or are gone by now.
+    """The boxes that the run was given with its labels, else with its readings; None where these were none, or are gone
+    by now.
 
     Args:
         target: the images that it was fitted to.
     """
-    if "labels" not in run.record:
-        return None
     try:
-        labels = read_partial_labels(run.record["labels"]["path"], run.model, target)
+        if "labels" in run.record:
+            labels = read_partial_labels(run.record["labels"]["path"], run.model, target)
+            if labels.boxes is not None:
+                return Boxes(labels.rows.tolist(), labels.boxes, labels.classes)
+        if "readings" in run.record:
+            return _found_boxes(run, read_detections(run.record["readings"]["path"], run.model, target).found)
     except DataError:
-        return None
-    return None if labels.boxes is None else Boxes(labels.rows.tolist(), labels.boxes, labels.classes)
+        pass
+    return None
+
+
+def _found_boxes(run: RunFolder, found: Detections) -> Boxes:
+    """Of the classes that detections count, from the score on from which they do."""
+    of_class = [run.readings["classes"][name] for name in run.model.classes]
+    least = np.array([record["min_score"] if record["readable"] else np.inf for record in of_class])
+    kept = found.score >= least[found.label]
+    box = torch.from_numpy(np.column_stack([found.label, found.box])).float()
+    each = tuple(box[kept & (found.image == row)] for row in range(found.images))
+    return Boxes(list(range(found.images)), each, run.model.classes)
 
 
 def sizes(run: RunFolder, boxes: Boxes, callback: Callable[[int], None], seed: int = 0) -> dict[str, Sizes]:

@@ -10,6 +10,8 @@ from probscene.dataset import Images
 from probscene.decoding import checked_range
 from probscene.errors import DataError, ModelError, ProbsceneError, RunError
 from probscene.inference.features.base import Features
+from probscene.inference.features.detections.calibration import calibrate
+from probscene.inference.features.detections.net import DETECTIONS
 from probscene.inference.training import batch_seed
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
@@ -18,6 +20,7 @@ from probscene.threads import default_threads
 from ..checking.generator_check import cost
 from ..checking.model_check import QUICK, check_model
 from ..files import write_json
+from ..labels.detections import read_detections
 from ..labels.partial_labels import PartialLabels, labels_record, read_partial_labels
 from ..loading import drawn_with, folder_digest, lasting_reference, load_model, split_reference
 from ..modules import file_digest, module_digests
@@ -66,6 +69,11 @@ class FitRequest:
     threads: int | None = None
 
     @property
+    def readings(self) -> Path | None:
+        """The file of detections in the images, where one is named."""
+        return None if self.target is None or self.target.readings is None else Path(self.target.readings)
+
+    @property
     def assets(self) -> Path | None:
         """The folder that the model is drawn with, where one is named."""
         return self.model.assets if isinstance(self.model, ModelFile) else None
@@ -110,6 +118,8 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
     loaded = checked_model(model)
     images = open_images(target.source, loaded, bool(target.skip_bad), show, target.value_range)
     check_target(images)
+    if request.readings is not None:
+        config = _with_readings(config)
     config = _chosen(config, loaded, images, request.labels is not None, show)
     if note := cost(loaded, config.images):
         show.say(note)
@@ -128,18 +138,26 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
         files |= {prefixed for file in files for prefixed in neighbours(file).values()}
         record["parts"] = {str(file): file_digest(file) for file in sorted(files)}
     # Built before the folder is, so that a wrong one leaves none behind.
-    run, labels = make(out, record, loaded, plugins), None
+    run, labels, detections = make(out, record, loaded, plugins), None, None
+    if request.readings is None and run.features.takes_readings:
+        raise ProbsceneError(f"expected --readings FILE for features {run.features.name!r}, got none.")
+    if request.readings is not None:
+        record["readings"] = labels_record(request.readings)
+        detections, notes = read_detections(request.readings, loaded, images)
+        say_notes(notes, show)
     if request.labels is not None:
         record["labels"] = labels_record(request.labels)
         check_takes_labels(run.features)
         labels = read_partial_labels(request.labels, loaded, images)
         say_notes(labels.notes, show)
+    if detections is not None:
+        calibrate(detections, loaded.classes, labels)
     seed_everything(batch_seed(record["seed"], 0))
     net = run.build_network()
     if "guide" in config.words():
         run.new_guide()
     source = model.reference if isinstance(model, ModelFile) and model.reference else loaded
-    return Begun(make.create(out, source, record, request.assets, loaded, plugins), images, labels, net)
+    return Begun(make.create(out, source, record, request.assets, loaded, plugins), images, labels, detections, net)
 
 
 def resume(request: FitRequest, out: Path, show: Display, make: type[RunFolder] = RunFolder) -> Begun:
@@ -180,7 +198,9 @@ def resume(request: FitRequest, out: Path, show: Display, make: type[RunFolder] 
             )
         images = open_target(run, show)
         say_notes(images.notes, show)
-    return Begun(run, images, _same_labels(run, images))
+    detections = _same_file(run, "readings")
+    found = None if detections is None else read_detections(detections, run.model, images).found
+    return Begun(run, images, _same_labels(run, images), found)
 
 
 def _asked(request: FitRequest, run: RunFolder) -> dict[str, Any]:
@@ -190,6 +210,7 @@ def _asked(request: FitRequest, run: RunFolder) -> dict[str, Any]:
         "model": _lasting_model(model),
         "assets_folder": None if request.assets is None else os.path.abspath(request.assets),
         "labels": None if request.labels is None else str(Path(request.labels).resolve()),
+        "readings": None if request.readings is None else str(Path(request.readings).resolve()),
         "seed": request.seed,
         "threads": request.threads,
     }
@@ -212,8 +233,19 @@ def _lasting_model(model: SceneModel | ModelFile | None) -> str | None:
 
 
 def _begun_with(run: RunFolder) -> dict[str, Any]:
-    record = {**run.record, "labels": run.record.get("labels", {}).get("path")}
+    record = {**run.record, **{key: run.record.get(key, {}).get("path") for key in ("labels", "readings")}}
     return record | {"target": record["target"] or "images in memory"} | run.config.flat()
+
+
+def _with_readings(config: FitConfig) -> FitConfig:
+    """The configuration of a fit to which detections are given."""
+    if isinstance(config.features, Auto):
+        return config.with_features(DETECTIONS)._set_again()
+    if config.make_features().takes_readings:
+        return config
+    raise ProbsceneError(
+        f"expected no other features with --readings, got --features {config.make_features().name}; leave one out."
+    )
 
 
 def _chosen(config: FitConfig, model: SceneModel, images: Images, labelled: bool, show: Display) -> FitConfig:
@@ -264,10 +296,9 @@ def _relocate(run: RunFolder, request: FitRequest, show: Display) -> Images | No
     if assets is not None and folder_digest(os.path.abspath(assets)) == record.get("assets_sha256"):
         record["assets_folder"] = os.path.abspath(assets)
         record["assets"] = drawn_with(run.model)
-    if request.labels is not None and "labels" in record:
-        labels = labels_record(request.labels)
-        if labels["sha256"] == record["labels"]["sha256"]:
-            record["labels"] = labels
+    for key, path in (("labels", request.labels), ("readings", request.readings)):
+        if path is not None and key in record and (found := labels_record(path))["sha256"] == record[key]["sha256"]:
+            record[key] = found
     source = None if request.target is None else request.target.source
     place = None if source is None else lasting_target(source)
     if source is None or place is None or place == record["target"] or "target_sha256" not in record:
@@ -280,13 +311,19 @@ def _relocate(run: RunFolder, request: FitRequest, show: Display) -> Images | No
 
 def _same_labels(run: RunFolder, images: Images) -> PartialLabels | None:
     """The labels that a run was begun with."""
-    kept = run.record.get("labels")
+    path = _same_file(run, "labels")
+    return None if path is None else read_partial_labels(path, run.model, images)
+
+
+def _same_file(run: RunFolder, key: str) -> Path | None:
+    """The file of labels or readings that a run was begun with."""
+    kept = run.record.get(key)
     if kept is None:
         return None
     path = Path(kept["path"])
     if labels_record(path) != kept:
         raise RunError(
-            f"expected the labels in {path} as they were when the run in {run.path} was begun, got others; put them "
+            f"expected the {key} in {path} as they were when the run in {run.path} was begun, got others; put them "
             "back, or begin a new run."
         )
-    return read_partial_labels(path, run.model, images)
+    return path

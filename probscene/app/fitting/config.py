@@ -15,6 +15,7 @@ from probscene.inference.divergence import MMD, Divergence, JensenShannon, KDELo
 from probscene.inference.features.base import Features
 from probscene.inference.features.counting.batches import CountSchedule
 from probscene.inference.features.counting.training import CountFeatures
+from probscene.inference.features.detections.net import DETECTIONS, DetectionFeatures
 from probscene.inference.features.names import PRETRAINED, network_name
 from probscene.inference.features.photographs.choices import COUNT_ON_PRETRAINED, PretrainedCountFeatures
 from probscene.inference.features.presence import PRESENCE, PRESENCE_COUNTS, PresenceFeatures
@@ -151,7 +152,7 @@ Parameters = ParameterSchedule | TiltingSchedule | MetaSimSchedule
 METHODS: dict[str, type] = {LIKELIHOOD: ParameterSchedule, TILTING: TiltingSchedule, META_SIM: MetaSimSchedule}
 _GUIDES = {made.kind: made for made in (LSTMConfig, PCFGConfig, GrammarVAEConfig)}
 _CHOICES: dict[str, tuple[type, ...]] = {
-    "features": (Auto, CountFeatures, PretrainedCountFeatures, PresenceFeatures, ProjectedFeatures),
+    "features": (Auto, CountFeatures, PretrainedCountFeatures, PresenceFeatures, ProjectedFeatures, DetectionFeatures),
     "divergence": (KDELogRatio, JensenShannon, MMD),
     "guide": tuple(_GUIDES.values()),
     "parameters": tuple(METHODS.values()),
@@ -523,6 +524,8 @@ def _features(word: str, config: FitConfig) -> Features | Auto:
         return config.features if isinstance(config.features, CountFeatures) else CountFeatures()
     if word == COUNT_ON_PRETRAINED:
         return PretrainedCountFeatures()
+    if word == DETECTIONS:
+        return DetectionFeatures()
     if word in (PRESENCE, PRESENCE_COUNTS):
         before = config.features if isinstance(config.features, PresenceFeatures) else PresenceFeatures()
         return replace(before, counts=word == PRESENCE_COUNTS)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from probscene.dataset import ImageFolder, Images
 from probscene.errors import DataError, ProbsceneError, RunError
-from probscene.inference.features.base import FeatureNet, embed_all
+from probscene.inference.features.base import Detections, EmbedsTarget, FeatureNet, embed_all
 from probscene.inference.statistics.energy import MIN_IMAGES, check_features
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
@@ -52,12 +52,14 @@ class Begun(NamedTuple):
         run: its folder.
         images: of the target; None where the fit is finished, or where they are opened when they are asked for.
         labels: of some of the images.
+        detections: of the images, by somebody's detector.
         net: its feature network, untrained, where it was built already.
     """
 
     run: RunFolder
     images: Images | None = None
     labels: PartialLabels | None = None
+    detections: Detections | None = None
     net: FeatureNet | None = None
 
 
@@ -142,7 +144,7 @@ class _Network:
 
     def __init__(self, begun: Begun, observer: RenderedFeatures, show: Display, target: Callable[[], Images]):
         self.run, self.observer, self.progress, self.say, self.target = begun.run, observer, show, show.say, target
-        self.photographs = cache(lambda: PartlyLabelledImages(target(), begun.labels))
+        self.photographs = cache(lambda: PartlyLabelledImages(target(), begun.labels, begun.detections))
         seed_everything(batch_seed(self.run.record["seed"], 0))
         self.net = self.run.build_network() if begun.net is None else begun.net
 
@@ -234,9 +236,12 @@ def _real_features(run: RunFolder, net: FeatureNet, progress: Progress, target: 
         progress("target", done, views * len(images), "")
 
     check_target(images)
-    features, *others = (
-        embed_all(net, images.batches(RENDERED_AT_ONCE, view), each, real=True) for view in range(views)
-    )
+    if isinstance(net, EmbedsTarget):
+        features, others = net.embed_target(images.fingerprint), []
+    else:
+        features, *others = (
+            embed_all(net, images.batches(RENDERED_AT_ONCE, view), each, real=True) for view in range(views)
+        )
     which = feature_mask(net)
     if which is None or which.any():
         check_features(features)

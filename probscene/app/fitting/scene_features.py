@@ -12,7 +12,7 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import RunError
-from probscene.inference.features.base import FeatureNet, embed_all
+from probscene.inference.features.base import EmbedsTarget, FeatureNet, embed_all
 from probscene.inference.features.names import PRETRAINED, network_name
 from probscene.inference.statistics.domain_shift import support_outliers
 from probscene.model import SceneModel
@@ -21,7 +21,7 @@ from probscene.threads import threads
 
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..loading import renderer_for
-from .rendered_features import RENDERED_AT_ONCE
+from .rendered_features import RENDERED_AT_ONCE, RenderedFeatures
 from .run import RunFolder
 
 RENDERS, ASKED = 320, 48  # renders, and images of the target, at most, by which ``domain_shift`` judges
@@ -100,7 +100,19 @@ def features_of(
         ProbsceneError: a feature is not finite.
     """
     with threads(run.record["threads"]):
+        if isinstance(net, EmbedsTarget):
+            return _embed_labels(run, policy, num, net, seed, each)
         return embed_all(net, images_of(run.model, policy, num, seed), each)
+
+
+def _embed_labels(run: RunFolder, policy: Policy, num: int, net: FeatureNet, seed: int, each: Each | None) -> Tensor:
+    """Of the same scenes, by their labels."""
+    observe, parts = RenderedFeatures(run.model, run.record["threads"]).observe(net), []
+    for chunk, first in enumerate(range(0, num, CHUNK)):
+        parts.append(observe(draw_chunk(run.model, policy, seed, chunk))[: num - first])
+        if each is not None:
+            each(len(parts[-1]))
+    return torch.cat(parts)
 
 
 def features_in(run: RunFolder, images: Images, net: FeatureNet, each: Each | None = None) -> Tensor:
@@ -109,6 +121,8 @@ def features_in(run: RunFolder, images: Images, net: FeatureNet, each: Each | No
     Raises:
         ProbsceneError: a feature is not finite.
     """
+    if isinstance(net, EmbedsTarget):
+        return net.embed_target(images.fingerprint)
     with threads(run.record["threads"]):
         return embed_all(net, images.batches(RENDERED_AT_ONCE), each, real=True)
 

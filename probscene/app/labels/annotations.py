@@ -23,6 +23,7 @@ class Annotation(NamedTuple):
         occluded: KITTI's level of what is hidden, 0 to 3.
         crowd: it stands for an unknown number of objects.
         where: it is in its file, for messages.
+        score: of a detection; None of a label.
         mask: ``mask()``, its pixels ``(H, W)`` bool; None where only its box is known.
     """
 
@@ -35,6 +36,7 @@ class Annotation(NamedTuple):
     occluded: float = 0.0
     crowd: bool = False
     where: str = ""
+    score: float | None = None
     mask: Callable[[], NDArray[np.bool_]] | None = None
 
 

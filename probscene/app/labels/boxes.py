@@ -33,12 +33,14 @@ class Boxes(NamedTuple):
             of the canvas, clipped to it.
         classes: the C that are labelled, in the model's order.
         notes: what a person should know, one sentence each.
+        scores: of detections, of each image ``(n,)`` float32; None of labels.
     """
 
     rows: list[int]
     boxes: tuple[Tensor, ...]
     classes: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    scores: tuple[Tensor, ...] | None = None
 
     @property
     def counts(self) -> NDArray[np.int64]:
@@ -115,9 +117,9 @@ def on_canvas(
     Raises:
         DataError: a box entirely beside its image.
     """
-    small, cut, boxes = 0, 0, []
+    small, cut, boxes, scores = 0, 0, [], []
     for row, each in found.items():
-        kept = []
+        kept, own = [], []
         for box in each:
             at = place_on_canvas(box, target, row, end)
             if at is None:
@@ -126,12 +128,16 @@ def on_canvas(
                 small += 1
             else:
                 kept.append([classes.index(box.name), *at])
+                own.append(box.score)
+        scores.append(own)
         boxes.append(torch.tensor(kept, dtype=torch.float32).reshape(-1, 5))
     if cut:
         notes += (f"{cut} objects that lie where images are cut are not counted.",)
     if small:
         notes += (f"{small} objects of less than {min_height:g} pixels' height are not counted.",)
-    return Boxes(list(found), tuple(boxes), classes, notes)
+    of_detections = bool(found) and all(score is not None for own in scores for score in own)
+    scored = tuple(torch.tensor(own, dtype=torch.float32) for own in scores) if of_detections else None
+    return Boxes(list(found), tuple(boxes), classes, notes, scored)
 
 
 def place_on_canvas(

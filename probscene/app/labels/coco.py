@@ -62,12 +62,30 @@ def _whole(path: Path) -> dict[str, list[Any]]:
         whole = json.loads(text_of(path))
     except (ValueError, RecursionError) as error:
         raise DataError(f"expected COCO's JSON in {path}, got something else ({error}).") from error
+    if isinstance(whole, list) and whole:
+        return _of_results(path, whole)
     missing = [key for key in LISTS if not isinstance(whole, dict) or not isinstance(whole.get(key), list)]
     if missing:
         raise DataError(
             f"expected COCO's JSON with lists of {', '.join(LISTS)} in {path}, got none of {', '.join(missing)}."
         )
     return whole
+
+
+def _of_results(path: Path, results: list[Any]) -> dict[str, list[Any]]:
+    """COCO's results, a list of detections, whose images and categories are called by their names."""
+    found: dict[str, list[Any]] = {"annotations": results}
+    for key, of, named in (("images", "image_id", "file_name"), ("categories", "category_id", "name")):
+        names = [entry.get(of) if isinstance(entry, dict) else None for entry in results]
+        if not all(isinstance(name, str) for name in names):
+            raise DataError(
+                f"expected lists of images and categories beside the detections in {path}, or the names of files and "
+                f"classes as image_id and category_id, got a list with {of} "
+                f"{json.dumps(next(name for name in names if not isinstance(name, str)))}; write "
+                '{"images": [...], "categories": [...], "annotations": [the detections]}.'
+            )
+        found[key] = [{"id": name, named: name} for name in dict.fromkeys(names)]
+    return found
 
 
 def _by_id(path: Path, key: str, entries: list[Any], named: str) -> dict[str, str]:
@@ -124,7 +142,11 @@ def _annotation(name: str, where: str, entry: dict[str, Any], size: Size) -> Ann
     x, y, width, height = box
     crowd = number_of(entry.get("iscrowd")) > 0 or entry.get("iscrowd") is True
     mask = partial(_mask, shape, size, where) if (shape := entry.get("segmentation")) else None
-    return Annotation(name, x, y, x + width, y + height, crowd=crowd, where=where, mask=mask)
+    score = entry.get("score")
+    if score is not None and not 0 <= number_of(score) <= 1:
+        raise DataError(f"expected a score from 0 to 1 {where}, got {json.dumps(score)}; fix or delete it.")
+    score = None if score is None else number_of(score)
+    return Annotation(name, x, y, x + width, y + height, crowd=crowd, where=where, score=score, mask=mask)
 
 
 def _mask(segmentation: Any, size: Size, where: str) -> NDArray[np.bool_]:

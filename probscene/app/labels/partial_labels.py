@@ -13,7 +13,7 @@ from torch import Tensor
 
 from probscene.dataset import Images
 from probscene.errors import DataError
-from probscene.inference.features.base import Labelled
+from probscene.inference.features.base import Detections, Labelled
 from probscene.model import SceneModel
 
 from .boxes import read_boxes
@@ -85,10 +85,15 @@ def read_partial_labels(
 
 
 class PartlyLabelledImages:
-    """A target's images of which some are labelled: what a feature network looks at before it is used."""
+    """A target's images of which some are labelled: what a feature network looks at before it is used.
 
-    def __init__(self, images: Images, labels: PartialLabels | None):
+    Args:
+        detections: in all of them, by somebody's detector.
+    """
+
+    def __init__(self, images: Images, labels: PartialLabels | None, detections: Detections | None = None):
         self.images, self.labels, self.fingerprint = images, labels, images.fingerprint
+        self.detections = detections
 
     def subset(self, max_images: int) -> Tensor:
         """At most so many of them, evenly spread, ``(L, C, H, W)`` uint8."""
@@ -100,7 +105,7 @@ class PartlyLabelledImages:
         if self.labels is None:
             return None
         pictures = torch.stack([self.images.load(row) for row in self.labels.rows.tolist()])
-        return Labelled(pictures, self.labels.counts, self.labels.classes)
+        return Labelled(pictures, *self.labels[1:3], self.labels.rows, self.labels.boxes)
 
 
 def labels_record(path: Path) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""Features that are the counts of another detector."""
