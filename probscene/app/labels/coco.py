@@ -59,7 +59,7 @@ def read_coco(path: Path) -> Annotated:
 
 def _whole(path: Path) -> dict[str, list[Any]]:
     try:
-        whole = json.loads(text_of(path))
+        whole: Any = json.loads(text_of(path))
     except (ValueError, RecursionError) as error:
         raise DataError(f"expected COCO's JSON in {path}, got something else ({error}).") from error
     if isinstance(whole, list) and whole:
