@@ -59,12 +59,13 @@ def read_coco(path: Path) -> Annotated:
 
 def _whole(path: Path) -> dict[str, list[Any]]:
     try:
-        whole: Any = json.loads(text_of(path))
+        read = json.loads(text_of(path))
     except (ValueError, RecursionError) as error:
         raise DataError(f"expected COCO's JSON in {path}, got something else ({error}).") from error
-    if isinstance(whole, list) and whole:
-        return _of_results(path, whole)
-    missing = [key for key in LISTS if not isinstance(whole, dict) or not isinstance(whole.get(key), list)]
+    if isinstance(read, list) and read:
+        return _of_results(path, read)
+    whole: dict[str, Any] = read if isinstance(read, dict) else {}
+    missing = [key for key in LISTS if not isinstance(whole.get(key), list)]
     if missing:
         raise DataError(
             f"expected COCO's JSON with lists of {', '.join(LISTS)} in {path}, got none of {', '.join(missing)}."
