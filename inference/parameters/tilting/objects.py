@@ -196,7 +196,7 @@ def aspect_of(seen: Features, u: Tensor, aspects: Sequence[str] = tuple(ASPECTS)
         aspects: that come into question, the first ones of all.
     """
     best, largest = -1, 0.0
-    for number, name in enumerate(aspects):
+    for number, name in enumerate(aspects if len(seen) else ()):
         for one in seen[:, ASPECTS[name]].T:
             (found, freedom), *_ = dependence(u[:, None], one).tolist()
             if found > largest and chi2.sf(found, max(freedom, 1)) < ASPECT_P_VALUE / WIDTH:

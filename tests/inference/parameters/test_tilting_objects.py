@@ -118,6 +118,14 @@ def test_several_sets_of_images_are_one(seed, number):
         first += part.images
 
 
+def test_scenes_without_objects_say_nothing_of_a_site():
+    none = measure(torch.zeros(3, 3, 8, 8, dtype=torch.uint8), torch.zeros(3, 2, 4), torch.full((3, 2), -1))
+    scenes, mean = scene_means(none)
+    assert not len(scenes) and aspect_of(mean, torch.rand(3)[scenes]) == -1
+    real, _ = drawn(np.random.default_rng(0), 10, lambda u: u)
+    assert object_witness(none, real) is None
+
+
 def test_boxes_go_by_a_site_only_if_their_size_or_place_does():
     rng = np.random.default_rng(0)
     own, _ = drawn(rng, 1000, lambda u: u)
