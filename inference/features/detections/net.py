@@ -11,7 +11,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from scipy.stats import poisson
 from torch import Tensor, nn
 
 from probscene.errors import DataError, ProbsceneError
@@ -141,8 +140,7 @@ class DetectionNet(nn.Module):
         chance = _hashed(torch.cat([drawn.centre, drawn.size], -1))
         found = (there & (chance.unsqueeze(-1) < self.recall)).sum(1).float()
         of_image = _hashed(drawn.centre.sum(1).repeat(1, 2))
-        more = torch.from_numpy(poisson.ppf(_spread(of_image, len(c)).numpy(), self.false_finds.numpy())).float()
-        return self._with_total(found + more.clamp(min=0))
+        return self._with_total(found + poisson_quantile(_spread(of_image, len(c)), self.false_finds.double()))
 
     def _with_total(self, counts: Tensor) -> Tensor:
         read = counts * self.read
@@ -151,6 +149,14 @@ class DetectionNet(nn.Module):
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         self.counts = torch.zeros_like(state_dict[f"{prefix}counts"])  # L is the target's
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def poisson_quantile(v: Tensor, mean: Tensor) -> Tensor:
+    """``(N, C)`` the least numbers that a Poisson variable of ``mean (C,)`` exceeds with a probability of at most
+    1 - ``v (N, C)``. (SciPy's statistics take a third of a second to import.)"""
+    k = torch.arange(int(4 * mean.max()) + 20, dtype=torch.float64)
+    cdf = torch.special.gammaincc(k + 1, mean.unsqueeze(-1).clamp(min=1e-12))  # (C, K)
+    return (cdf < v.unsqueeze(-1)).sum(-1).float()
 
 
 def _hashed(numbers: Tensor) -> Tensor:

@@ -7,12 +7,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest
+from scipy.stats import binomtest, poisson
 
 from probscene.errors import DataError, ProbsceneError
 from probscene.inference.features.base import Detections, Examples
 from probscene.inference.features.detections.calibration import calibrate, iou, matched, shift_of
-from probscene.inference.features.detections.net import DetectionFeatures, DetectionNet
+from probscene.inference.features.detections.net import DetectionFeatures, DetectionNet, poisson_quantile
 
 NAMES = ("cat", "dog")
 seeds = st.integers(0, 2**31)
@@ -104,6 +104,13 @@ def test_features_go_by_the_image_alone(seed):
     assert torch.equal(whole, net.embed_from_labels(drawn))
     one = Examples(*(part[7:8] for part in drawn))
     assert torch.equal(whole[7:8], net.embed_from_labels(one))
+
+
+@given(seeds, st.lists(st.sampled_from([0.0, 1e-3, 0.4, 3.0, 25.0]), min_size=1, max_size=3))
+def test_false_finds_are_poisson(seed, mean):
+    v = torch.from_numpy(np.random.default_rng(seed).uniform(1e-6, 1 - 1e-6, (30, len(mean))))
+    found = poisson_quantile(v, torch.tensor(mean, dtype=torch.float64))
+    assert (found.numpy() == np.where(np.array(mean) > 0, poisson.ppf(v.numpy(), mean), 0)).all()
 
 
 def test_objects_are_missed_as_often_as_is_said():
