@@ -131,7 +131,7 @@ def test_detections_at_random_are_refused(seed):
         calibrate(found, NAMES, labelled(image, label, box, ROWS))
 
 
-@pytest.mark.parametrize(("seed", "by"), enumerate([-40.0, -20.0, -9.0, 8.5, 13.0, 33.0]))
+@pytest.mark.parametrize(("seed", "by"), list(enumerate([-40.0, -20.0, -9.0, 8.5, 13.0, 33.0])))
 def test_a_shift_is_said_and_taken_out(seed, by):
     rng = np.random.default_rng(seed)
     image, label, box = scenes(rng, most=2)
