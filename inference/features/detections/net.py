@@ -43,10 +43,10 @@ class DetectionFeatures(Features):
         if found is None:
             raise ProbsceneError("expected detections for features 'detections', got none; give --readings FILE.")
         records, readings = {}, calibrate(found, own.classes, labelled)
+        own.counts = torch.zeros(found.images, len(own.classes))
         for c, (name, reading) in enumerate(zip(own.classes, readings, strict=True)):
             own.recall[c], own.false_finds[c], own.read[c] = reading.recall, reading.false_finds, reading.readable
             counts = found.counts(c, reading.min_score)
-            own.counts = own.counts if len(own.counts) else torch.zeros(found.images, len(own.classes))
             own.counts[:, c] = torch.from_numpy(counts).float()
             records[name] = {
                 **reading._asdict(),

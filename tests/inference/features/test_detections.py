@@ -75,7 +75,7 @@ def test_misses_and_false_finds_are_found_and_put_into_renders():
     for c, reading in enumerate(readings):
         assert reading.readable and 0.7 < reading.recall < 0.85
         net.recall[c], net.false_finds[c], net.read[c] = reading.recall, reading.false_finds, True
-    features = net.embed_from_labels(_drawn(image, label, box, 3000))
+    features = net.embed_from_labels(as_examples(image, label, box, 3000))
     for c, reading in enumerate(readings):
         counts = found.counts(c, reading.min_score)
         assert float(features[:, c].mean()) == pytest.approx(counts.mean(), rel=0.05)
@@ -83,7 +83,7 @@ def test_misses_and_false_finds_are_found_and_put_into_renders():
     assert torch.equal(features[:, 2], features[:, 0] + features[:, 1])
 
 
-def _drawn(image, label, box, images):
+def as_examples(image, label, box, images):
     number = np.bincount(image, minlength=images)
     place = np.arange(len(image)) - np.repeat(np.cumsum(number) - number, number)
     M = int(number.max())
@@ -98,7 +98,7 @@ def _drawn(image, label, box, images):
 @given(seeds)
 def test_features_go_by_the_image_alone(seed):
     rng = np.random.default_rng(seed)
-    drawn, net = _drawn(*scenes(rng, 20), 20), DetectionNet(NAMES)
+    drawn, net = as_examples(*scenes(rng, 20), 20), DetectionNet(NAMES)
     net.recall[:], net.false_finds[:], net.read[:] = 0.6, 0.4, True
     whole = net.embed_from_labels(drawn)
     assert torch.equal(whole, net.embed_from_labels(drawn))
@@ -117,7 +117,7 @@ def test_objects_are_missed_as_often_as_is_said():
     rng, net = np.random.default_rng(0), DetectionNet(NAMES)
     image, label, box = scenes(rng, 4000)
     net.recall[:], net.read[:] = 0.7, True
-    kept = int(net.embed_from_labels(_drawn(image, label, box, 4000))[:, 2].sum())
+    kept = int(net.embed_from_labels(as_examples(image, label, box, 4000))[:, 2].sum())
     low, high = binomtest(kept, len(image)).proportion_ci(1 - 1e-6)
     assert low < 0.7 < high
 

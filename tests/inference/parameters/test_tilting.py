@@ -214,7 +214,7 @@ def _labels(render, classes, scenes):
     return examples(render(scenes.drawing), classes)
 
 
-class Sized(Messenger):
+class LargeBalls(Messenger):
     """Balls of the largest third of the prior's sizes."""
 
     def _pyro_sample(self, msg):
@@ -235,7 +235,7 @@ def from_objects(trays, handlers, images):
 
 
 def test_labelled_objects_move_the_sites_that_they_go_by(trays):
-    learning = from_objects(trays, [Sized()], 15)
+    learning = from_objects(trays, [LargeBalls()], 15)
     learning.run()
     assert "ball.size" in [site.name for site in learning.learnt]
     seed_everything(0)

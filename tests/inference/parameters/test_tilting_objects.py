@@ -53,7 +53,7 @@ def test_an_object_is_measured_in_its_box(seed, channels):
         assert seen[ASPECTS["around"]] == pytest.approx(around, abs=1e-5)
 
 
-def drawn(rng, images, size, each=4, classes=2):
+def random_objects(rng, images, size, each=4, classes=2):
     """Objects of some images with log sizes of a normal distribution, and the u that these go by."""
     n = images * each
     u, seen = rng.uniform(size=n), rng.normal(size=(n, WIDTH))
@@ -65,8 +65,8 @@ def drawn(rng, images, size, each=4, classes=2):
 
 def test_a_site_is_moved_toward_the_labelled_objects_and_others_are_not():
     rng = np.random.default_rng(0)
-    own, u = drawn(rng, 400, lambda u: 2 * u)
-    real, _ = drawn(rng, 12, lambda u: 2 * (0.6 + 0.4 * u))
+    own, u = random_objects(rng, 400, lambda u: 2 * u)
+    real, _ = random_objects(rng, 12, lambda u: 2 * (0.6 + 0.4 * u))
     w = object_witness(own, real)
     size = slope_of(w, u[w.rows], 0)
     assert size.p < 1e-3 and size.sure > 0.5
@@ -82,11 +82,11 @@ def test_a_site_is_chosen_by_chance_as_often_as_the_test_says(of_scene):
     """Labelled objects of the renders' own distribution: of 400 tests of 5 % as many, within chance, or fewer."""
     rng, found = np.random.default_rng(1), []
     for _ in range(400):
-        own, u = drawn(rng, 100, lambda u: 2 * u)
+        own, u = random_objects(rng, 100, lambda u: 2 * u)
         if of_scene:
             u = np.repeat(rng.uniform(size=100), 4)
             own.seen[:, 0] += u
-        real, other = drawn(rng, 10, lambda u: 2 * u)
+        real, other = random_objects(rng, 10, lambda u: 2 * u)
         if of_scene:
             real.seen[:, 0] += np.repeat(rng.uniform(size=10), 4)
         w = object_witness(own, real)
@@ -97,10 +97,10 @@ def test_a_site_is_chosen_by_chance_as_often_as_the_test_says(of_scene):
 
 def test_where_too_few_are_labelled_nothing_is_said():
     rng = np.random.default_rng(0)
-    own, u = drawn(rng, 50, lambda u: u, classes=1)
-    real, _ = drawn(rng, 1, lambda u: u, each=3, classes=1)
+    own, u = random_objects(rng, 50, lambda u: u, classes=1)
+    real, _ = random_objects(rng, 1, lambda u: u, each=3, classes=1)
     assert object_witness(own, real) is None
-    real, _ = drawn(rng, 2, lambda u: u, classes=1)
+    real, _ = random_objects(rng, 2, lambda u: u, classes=1)
     w = object_witness(own, real)
     assert slope_of(w, u[w.rows], 0).p == 1 and slope_of(w, np.full(len(w.rows), np.nan), 0).p == 1
     assert slope_of(w, np.full(len(w.rows), 0.5), 0).p == 1
@@ -109,7 +109,7 @@ def test_where_too_few_are_labelled_nothing_is_said():
 @given(seeds, st.integers(1, 4))
 def test_several_sets_of_images_are_one(seed, number):
     rng = np.random.default_rng(seed)
-    parts = [drawn(rng, int(rng.integers(1, 4)), lambda u: u)[0] for _ in range(number)]
+    parts = [random_objects(rng, int(rng.integers(1, 4)), lambda u: u)[0] for _ in range(number)]
     whole, first = concatenate_objects(parts), 0
     assert whole.images == sum(part.images for part in parts)
     for part in parts:
@@ -122,13 +122,13 @@ def test_scenes_without_objects_say_nothing_of_a_site():
     none = measure(torch.zeros(3, 3, 8, 8, dtype=torch.uint8), torch.zeros(3, 2, 4), torch.full((3, 2), -1))
     scenes, mean = scene_means(none)
     assert not len(scenes) and aspect_of(mean, torch.rand(3)[scenes]) == -1
-    real, _ = drawn(np.random.default_rng(0), 10, lambda u: u)
+    real, _ = random_objects(np.random.default_rng(0), 10, lambda u: u)
     assert object_witness(none, real) is None
 
 
 def test_boxes_go_by_a_site_only_if_their_size_or_place_does():
     rng = np.random.default_rng(0)
-    own, _ = drawn(rng, 1000, lambda u: u)
+    own, _ = random_objects(rng, 1000, lambda u: u)
     u = torch.from_numpy(rng.uniform(size=(1000, 4)))
     per_object = u.numpy()[own.image]
     own.seen[:, 1] += 0.3 * per_object[:, 0] * np.where(own.label == 0, 1, 1.2)
