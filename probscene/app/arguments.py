@@ -1,6 +1,12 @@
 """Numbers that a person gives, checked; without what takes long to import."""
 
+from collections.abc import Mapping
+
 from probscene.errors import ProbsceneError
+
+BoxMargin = int | str | Mapping[str, int]
+"""Pixels by which boxes are wider on each side: of all classes, or by class, as ``"plate=2,mug=4"`` or a mapping; other
+classes' are not."""
 
 
 def checked_seed(seed: int) -> int:
@@ -76,3 +82,43 @@ def size_given(text: str | None) -> tuple[int, int] | None:
     if not (width.isdecimal() and height.isdecimal()):
         raise ProbsceneError(f"expected a size WIDTHxHEIGHT such as 256x192, got {text!r}.")
     return int(height), int(width)
+
+
+def checked_box_margin(margin: BoxMargin) -> int | dict[str, int]:
+    """A margin as a number, or by class.
+
+    Raises:
+        ProbsceneError: it is not a whole number of pixels, 0 or more; two of one class.
+    """
+    if isinstance(margin, str):
+        return _pixels(margin) if "=" not in margin else _margins_given(margin)
+    if isinstance(margin, Mapping):
+        return {name: _pixels(each) for name, each in margin.items()}
+    return _pixels(margin)
+
+
+def margin_text(margin: Mapping[str, int]) -> str:
+    """As ``--box-margin`` takes it."""
+    return ",".join(f"{name}={pixels}" for name, pixels in margin.items())
+
+
+def _margins_given(text: str) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for part in text.split(","):
+        name, _, pixels = (word.strip() for word in part.rpartition("="))
+        if not name or name in found:
+            raise ProbsceneError(
+                f"expected box_margin as pixels, or once for each class as in plate=2,mug=4, got {text!r}."
+            )
+        found[name] = _pixels(pixels)
+    return found
+
+
+def _pixels(pixels: int | str) -> int:
+    try:
+        number = float(pixels)
+    except ValueError:
+        number = -1.0
+    if not (number >= 0 and number % 1 == 0):
+        raise ProbsceneError(f"expected box_margin as a whole number of pixels, 0 or more, got {pixels}.")
+    return int(number)

@@ -49,7 +49,7 @@ def train(
         typer.Option(metavar="NAME,...", help="Classes to detect; the model's if not given.", rich_help_panel="Labels"),
     ] = None,
     min_visible: MinVisible = 0.2,
-    box_margin: BoxMargin = 0,
+    box_margin: BoxMargin = "0",
     detector: Detector = "efficientnet",
     size: Size = None,
     iterations: Iterations = None,

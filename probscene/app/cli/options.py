@@ -51,8 +51,12 @@ JudgedScenes = Annotated[
     typer.Option(metavar="N", help="Scenes to render for the verdict; 1000 if not given, 0 for no verdict."),
 ]
 BoxMargin = Annotated[
-    int,
-    typer.Option(min=0, metavar="PIXELS", help="Widen generated boxes on each side.", rich_help_panel="Labels"),
+    str,
+    typer.Option(
+        metavar="PIXELS",
+        help="Widen generated boxes on each side; by class: plate=2,mug=4.",
+        rich_help_panel="Labels",
+    ),
 ]
 MinVisible = Annotated[
     float,

@@ -37,7 +37,7 @@ def generate(
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(metavar="N", help="Processes; the bytes do not depend on it.")] = 1,
     min_visible: MinVisible = 0.0,
-    box_margin: BoxMargin = 0,
+    box_margin: BoxMargin = "0",
     amodal: Annotated[
         bool,
         typer.Option("--amodal", help="Add masks of whole objects (COCO, WebDataset).", rich_help_panel="Labels"),

@@ -59,7 +59,7 @@ def trial(
         str,
         typer.Option(
             metavar="NAME,...",
-            help="Policies of RUN; start is the initialisation.",
+            help="Of RUN: prior, start (the initialisation), structure or parameters (what was learnt of it), learnt.",
             rich_help_panel="Training sets",
         ),
     ] = "prior,start,learnt",
@@ -68,7 +68,7 @@ def trial(
         typer.Option(metavar="NAME,...", help="Classes to detect; all if not given.", rich_help_panel="Labels"),
     ] = None,
     min_visible: MinVisible = 0.2,
-    box_margin: BoxMargin = 0,
+    box_margin: BoxMargin = "0",
     detector: Detector = "efficientnet",
     size: Size = None,
     iterations: Iterations = None,

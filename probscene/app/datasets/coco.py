@@ -57,24 +57,39 @@ def check_min_visible(min_visible: float) -> None:
         raise ProbsceneError(f"expected min_visible from 0 to 1, got {min_visible}.")
 
 
-def check_box_margin(box_margin: int) -> None:
-    """See that a margin of boxes is one.
+def check_margin_classes(model: SceneModel, margin: int | dict[str, int]) -> None:
+    """See that a model has the classes that a margin names.
 
     Raises:
-        ProbsceneError: it is not a whole number of pixels, 0 or more.
+        ProbsceneError: it has not.
     """
-    if not (box_margin >= 0 and box_margin % 1 == 0):
-        raise ProbsceneError(f"expected box_margin as a whole number of pixels, 0 or more, got {box_margin}.")
+    unknown = [] if isinstance(margin, int) else sorted(margin.keys() - set(model.classes))
+    if unknown:
+        raise ProbsceneError(
+            f"expected box_margin of classes of model {model.name!r} ({', '.join(model.classes)}), got "
+            f"{', '.join(unknown)}."
+        )
 
 
-def with_margin(batch: RenderBatch, box_margin: int) -> RenderBatch:
-    """The batch with boxes of what is visible that are ``box_margin`` pixels wider on each side, as far as the image
-    goes: people box objects more loosely than a mask does. Whole silhouettes' boxes stay.
+def node_margins(model: SceneModel, batch: RenderBatch, margin: int | dict[str, int]) -> Tensor:
+    """``(N, M)`` int64 of each node."""
+    if isinstance(margin, int):
+        return torch.full_like(batch.kind, margin, dtype=torch.int64)
+    of_kind = torch.tensor([margin.get(kind, 0) for kind in model.grammar.kinds])
+    return of_kind[batch.kind.long().clamp(min=0)] * (batch.kind >= 0)
+
+
+def with_margin(model: SceneModel, batch: RenderBatch, margin: int | dict[str, int]) -> RenderBatch:
+    """The batch with boxes of what is visible that are wider on each side, as far as the image goes: people box objects
+    more loosely than a mask does. Whole silhouettes' boxes stay.
+
+    Args:
+        margin: see ``checked_box_margin``.
     """
-    if not box_margin:
+    if not margin:
         return batch
     height, width = batch.image.shape[2:]
-    wider = batch.box + torch.tensor([-1, -1, 1, 1]) * box_margin
+    wider = batch.box + torch.tensor([-1, -1, 1, 1]) * node_margins(model, batch, margin)[..., None]
     wider = torch.minimum(wider.clamp(min=0), torch.tensor([width, height, width, height]))
     return batch._replace(box=torch.where(batch.pixels[..., None] > 0, wider, batch.box))
 

@@ -26,6 +26,7 @@ from probscene.policy import Policy
 from probscene.request import Renderable
 from probscene.sampling import Scenes
 
+from ..arguments import BoxMargin, checked_box_margin
 from ..chunks import CHUNK, as_written, draw_chunk, png
 from ..fitting.run import RunFolder
 from ..loading import renderer_for
@@ -64,8 +65,8 @@ class DatasetOptions:
     Args:
         min_visible: objects of which a smaller fraction is visible have no label, in any format.
         flat: all images in one folder; of more than 10,000, a thousand share one otherwise. KITTI's folders are flat.
-        box_margin: pixels by which boxes of what is visible are wider than it on each side, within the image; masks and
-            boxes of whole silhouettes stay.
+        box_margin: pixels by which boxes of what is visible are wider than it on each side, within the image: a number,
+            or by class, as ``"plate=2,mug=4"`` or a mapping. Masks and boxes of whole silhouettes stay.
         amodal: COCO's annotations, and those of shards, have masks of whole objects, too, see ``coco``; each object
             that is not wholly visible is drawn once more, alone.
         values: names of the program's sites, such as ``"plate.x,mug.turn"``, whose values these annotations have as
@@ -79,20 +80,25 @@ class DatasetOptions:
 
     min_visible: float = 0.0
     flat: bool = False
-    box_margin: int = 0
+    box_margin: BoxMargin = 0
     amodal: bool = False
     values: str | Iterable[str] = ()
     shard: str | None = None
 
     def __post_init__(self):
         coco.check_min_visible(self.min_visible)
-        coco.check_box_margin(self.box_margin)
+        object.__setattr__(self, "box_margin", checked_box_margin(self.box_margin))
         object.__setattr__(self, "values", attributes.chosen(self.values))
         self.part()
 
     def part(self) -> Shard:
         """The shard to make, or the whole."""
         return WHOLE if self.shard is None else Shard.from_text(self.shard)
+
+    @property
+    def margin(self) -> int | dict[str, int]:
+        """What ``box_margin`` says."""
+        return checked_box_margin(self.box_margin)
 
     @property
     def sites(self) -> tuple[str, ...]:
@@ -102,7 +108,7 @@ class DatasetOptions:
     def record(self) -> dict[str, Any]:
         """What the dataset's settings name: those that are not the default."""
         names = ",".join(self.sites)
-        own = {"min_visible": float(self.min_visible), "box_margin": int(self.box_margin), "amodal": bool(self.amodal)}
+        own = {"min_visible": float(self.min_visible), "box_margin": self.margin, "amodal": bool(self.amodal)}
         return {key: value for key, value in {**own, "values": names}.items() if value != DEFAULT_SETTINGS[key]}
 
 
@@ -217,6 +223,7 @@ class Job:
                 f"expected coco or webdataset among the formats for {'amodal masks' if options.amodal else 'values'}, "
                 f"got {', '.join(formats)}; add one of them."
             )
+        coco.check_margin_classes(model, options.margin)
         if "kitti" in formats:
             kitti.check(model)
         self.model, self.policy, self.formats, self.options = model, policy, formats, options
@@ -249,7 +256,7 @@ class Job:
 
     def _check(self) -> None:
         """See that the model's scenes have what is asked for, before anything is written."""
-        boxes = "kitti" in self.formats and self.options.box_margin > 0
+        boxes = "kitti" in self.formats and bool(self.options.margin)
         posed = "yolo-pose" in self.formats
         if not ("depth" in self.formats or boxes or posed or self.options.amodal or self.options.sites):
             return
@@ -265,7 +272,7 @@ class Job:
         if "depth" in self.formats or boxes:
             first = self._renderer(scenes.drawing[:1])
             if boxes:
-                kitti.check_box_margin(self.model, first, self.options.box_margin)
+                kitti.check_box_margin(self.model, first, self.options.margin)
             if "depth" in self.formats:
                 depth.files(self.model, first)
 
@@ -283,7 +290,7 @@ class Job:
         first, size = chunk * CHUNK, self.folder.size(chunk)
         scenes = draw_chunk(self.model, self.policy, self.origin["seed"], chunk)
         drawing = scenes.drawing[:size]
-        batch = coco.with_margin(self._renderer(drawing), self.options.box_margin)
+        batch = coco.with_margin(self.model, self._renderer(drawing), self.options.margin)
         record: dict[str, Any] = {"annotations": [], "keypoints": {}}
         if self.formats != ("images",):
             record |= self._annotated(scenes, drawing, batch, first)
@@ -331,9 +338,7 @@ class Job:
         if "yolo-seg" in self.formats:
             lines["yolo-seg"] = yolo.polygons(self.model, batch, self.options.min_visible)
         if "yolo-obb" in self.formats:
-            lines["yolo-obb"] = yolo.oriented(
-                self.model, batch, drawing, self.options.min_visible, self.options.box_margin
-            )
+            lines["yolo-obb"] = yolo.oriented(self.model, batch, drawing, self.options.min_visible, self.options.margin)
         if "yolo-pose" in self.formats:
             number = _most(record["keypoints"])
             lines["yolo-pose"] = [yolo.label(self.model, of_image[i], number) for i in of_image]

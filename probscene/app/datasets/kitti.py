@@ -67,7 +67,7 @@ def check(model: SceneModel) -> None:
         )
 
 
-def check_box_margin(model: SceneModel, batch: RenderBatch, box_margin: int) -> None:
+def check_box_margin(model: SceneModel, batch: RenderBatch, box_margin: int | dict[str, int]) -> None:
     """See that boxes have no margin where KITTI's are of whole silhouettes.
 
     Raises:

@@ -32,11 +32,12 @@ from probscene.model import SceneModel
 from probscene.policy import Policy
 from probscene.request import Renderable
 
+from ..arguments import BoxMargin, checked_box_margin
 from ..chunks import CHUNK, as_written, draw_chunk
 from ..fitting.run import RunFolder, is_run
 from ..loading import lasting_reference, load_model, renderer_for, split_reference
 from . import amodal
-from .coco import check_box_margin, check_min_visible, labelled, with_margin
+from .coco import check_margin_classes, check_min_visible, labelled, with_margin
 from .depth import depth_of
 
 Sample = tuple[Tensor, dict[str, Any]]
@@ -65,7 +66,7 @@ class SceneDataset(IterableDataset):
         num: images of an epoch; None for no end.
         seed: of everything random.
         min_visible: objects of which a smaller fraction is visible are left out of the target.
-        box_margin: pixels by which ``boxes`` are wider on each side, see ``generate``.
+        box_margin: pixels by which ``boxes`` are wider on each side, see ``DatasetOptions``.
         batch_size: the loader's, where the order must not depend on the number of workers.
         policy: other structures, over the grammar of ``source``.
         amodal: targets also have ``amodal_masks`` ``(n, H, W)`` uint8, of the whole silhouettes within the image; each
@@ -88,7 +89,7 @@ class SceneDataset(IterableDataset):
         min_visible: float = 0.0,
         batch_size: int | None = None,
         policy: Policy | None = None,
-        box_margin: int = 0,
+        box_margin: BoxMargin = 0,
         amodal: bool = False,
     ):
         for name, number in (("images", num), ("images of a batch", batch_size)):
@@ -97,13 +98,14 @@ class SceneDataset(IterableDataset):
         if seed < 0:
             raise ProbsceneError(f"expected a seed of 0 or more, got {seed}.")
         check_min_visible(min_visible)
-        check_box_margin(box_margin)
         self.num, self.seed, self.batch_size = num, seed, batch_size
-        self.min_visible, self.box_margin, self.amodal = min_visible, box_margin, amodal
+        self.min_visible, self.amodal = min_visible, amodal
+        self.box_margin = checked_box_margin(box_margin)
         self._source = source if isinstance(source, SceneModel) else _resolved(source)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that persist see it change
         self._given, self._opened = policy, None
         self.classes = self.model.classes
+        check_margin_classes(self.model, self.box_margin)
 
     @property
     def model(self) -> SceneModel:
@@ -151,7 +153,7 @@ class SceneDataset(IterableDataset):
                 drawing = scenes.drawing[first:last]
                 if self.amodal:
                     amodal.drawable(model, drawing)  # before it is rendered
-                batch = with_margin(render(drawing), self.box_margin)
+                batch = with_margin(model, render(drawing), self.box_margin)
                 yield from self._samples(model, render, drawing, batch, (start + chunk) * CHUNK + first)
                 at += last - first
 

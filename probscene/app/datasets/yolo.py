@@ -34,7 +34,7 @@ from probscene.drawing import Drawing
 from probscene.model import SceneModel
 from probscene.request import Renderable
 
-from .coco import labelled
+from .coco import labelled, node_margins
 from .polygons import polygon
 from .provenance import stem
 
@@ -72,17 +72,25 @@ def polygons(model: SceneModel, batch: RenderBatch, min_visible: float = 0.0) ->
 
 
 def oriented(
-    model: SceneModel, batch: RenderBatch, drawing: Renderable, min_visible: float = 0.0, box_margin: int = 0
+    model: SceneModel,
+    batch: RenderBatch,
+    drawing: Renderable,
+    min_visible: float = 0.0,
+    box_margin: int | dict[str, int] = 0,
 ) -> list[str]:
     """The labels of rendered scenes with oriented boxes.
 
     Args:
         drawing: what was rendered.
         min_visible: see ``coco.labelled``.
-        box_margin: pixels by which boxes are wider on each side.
+        box_margin: pixels by which boxes are wider on each side, see ``checked_box_margin``.
     """
-    angle = _angles(drawing)
-    return _labels(model, batch, min_visible, lambda mask, i, node: around(mask, float(angle[i, node]), box_margin))
+    angle, margin = _angles(drawing), node_margins(model, batch, box_margin)
+
+    def corners(mask: np.ndarray, i: int, node: int) -> np.ndarray:
+        return around(mask, float(angle[i, node]), float(margin[i, node]))
+
+    return _labels(model, batch, min_visible, corners)
 
 
 def around(mask: np.ndarray, angle: float, margin: float = 0.0) -> np.ndarray:

@@ -25,7 +25,7 @@ from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.model import SceneModel
 from probscene.threads import threads
 
-from ..arguments import checked_seed, positive
+from ..arguments import BoxMargin, checked_box_margin, checked_seed, positive
 from ..chunks import chunk_randomness
 from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_whole
@@ -37,7 +37,8 @@ from ..progress import Progress, silent
 from ..trial.begun_photographs import check_not_cut_out, model_file
 from ..trial.detector import Recipe, build, fingerprint
 from ..trial.jobs import stages_of
-from ..trial.plan import check_apart, looser, split
+from ..trial.margins import looser
+from ..trial.plan import check_apart, split
 from ..trial.sets import Example, LabelledSet, digest_of
 from ..trial.training import Checkpoint, Checkpoints
 from ..trial.training import train as train_stages
@@ -63,7 +64,7 @@ class TrainOptions:
         budget: how it is trained; it knows no ``warm_start``.
         size: height and width at which images come, multiples of 32; about 192 and 256 where None.
         min_visible: objects of which a smaller fraction is visible have no label in generated images.
-        box_margin: pixels by which boxes are wider there on each side.
+        box_margin: pixels by which boxes are wider there on each side, see ``DatasetOptions``.
         seed: of the images, of which are held out, of the start and the order.
         value_range: of photographs of 16 bits, see ``ImageFolder``; the run's, else what is found, where None.
         onnx: write it as ONNX, too, see ``detectors.export``.
@@ -77,7 +78,7 @@ class TrainOptions:
     budget: TrainingBudget = TrainingBudget()
     size: tuple[int, int] | None = None
     min_visible: float = 0.2
-    box_margin: int = 0
+    box_margin: BoxMargin = 0
     seed: int = 0
     value_range: Sequence[float] | None = None
     onnx: bool = False
@@ -164,7 +165,7 @@ def train(
         "value_range": None if used is None else list(used),
         "generated": {
             **origin.record, "images": options.generate, "min_visible": options.min_visible,
-            "box_margin": options.box_margin,
+            "box_margin": checked_box_margin(options.box_margin),
         },
         "photographs_sha256": None if photographs is None else digest_of(photographs),
         "held_out_sha256": None if tested is None else digest_of(tested),
@@ -176,7 +177,8 @@ def train(
         made = read_labelled(out / GENERATED, names, show)
         if tested is not None:
             check_apart(GENERATED, made, tested)
-        if photographs is not None and (note := looser(photographs, made)):
+        margin = checked_box_margin(options.box_margin)
+        if photographs is not None and (note := looser(photographs, made, margin, used)):
             callback(note)
         job = _Job(out, settings, options, recipe, made, photographs, tested, size, used)
         write_json(out / RECORD, job.run(show))  # last: with it the detector is there

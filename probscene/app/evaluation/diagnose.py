@@ -167,7 +167,7 @@ def diagnose(
         counts = evaluation.sources
         label_agreement = agreement(counts["learnt"], counts["truth"], evaluation.classes, label_images(run))
     features = {LEARNT: scenes[0], PRIOR: scenes[1], TARGET: real}
-    box_sizes = {} if boxes is None else sizes(run, boxes, advance, seed)
+    box_sizes = {} if boxes is None else sizes(run, boxes, target, advance, seed)
     return FitDiagnostics(
         structure=structure,
         real_uncovered=real_uncovered,

@@ -22,6 +22,7 @@ from probscene.policy import Policy
 
 from ..chunks import CHUNK, draw_chunk
 from ..datasets.coco import labelled
+from ..fitting.box_margins import box_margins, without_margins
 from ..fitting.run import RunFolder
 from ..labels.boxes import Boxes
 from ..labels.detections import read_detections
@@ -62,6 +63,7 @@ class Sizes(NamedTuple):
         grade: None where the boxes are too few to say.
         worse: whether learnt sizes are significantly farther from those given than the prior's.
         boxes: that were given.
+        margin: pixels of room on each side of them, which are taken off.
     """
 
     given: tuple[float, float]
@@ -75,11 +77,13 @@ class Sizes(NamedTuple):
     grade: Grade | None
     worse: bool
     boxes: int
+    margin: float = 0.0
 
     def __str__(self) -> str:
         limits = " x ".join(f"{a:.1f} to {b:.1f}" for a, b in zip(self.low, self.high, strict=True))
         given, prior, learnt = map(_text, (self.given, self.prior, self.learnt))
-        return f"{given} pixels in the images ({limits}), {prior} in the prior, {learnt} learnt"
+        room = f", without the labels' margin of {self.margin:.1f}" if self.margin else ""
+        return f"{given} pixels in the images ({limits}{room}), {prior} in the prior, {learnt} learnt"
 
 
 def given_boxes(run: RunFolder, target: Images) -> Boxes | None:
@@ -93,7 +97,7 @@ def given_boxes(run: RunFolder, target: Images) -> Boxes | None:
         if "labels" in run.record:
             labels = read_partial_labels(run.record["labels"]["path"], run.model, target)
             if labels.boxes is not None:
-                return Boxes(labels.rows.tolist(), labels.boxes, labels.classes)
+                return labels.as_boxes
         if "readings" in run.record:
             return _found_boxes(run, read_detections(run.record["readings"]["path"], run.model, target).found)
     except DataError:
@@ -111,16 +115,22 @@ def _found_boxes(run: RunFolder, found: Detections) -> Boxes:
     return Boxes(list(range(found.images)), each, run.model.classes)
 
 
-def sizes(run: RunFolder, boxes: Boxes, callback: Callable[[int], None], seed: int = 0) -> dict[str, Sizes]:
+def sizes(
+    run: RunFolder, boxes: Boxes, target: Images, callback: Callable[[int], None], seed: int = 0
+) -> dict[str, Sizes]:
     """Of each class with ``MIN_BOXES`` boxes that were given, and in the scenes.
 
     Args:
+        boxes: of the target's images; the room that they leave around objects is taken off.
         callback: called with the number of scenes of each batch.
     """
+    margins = box_margins(run.model, boxes, target)
     prior, learnt = (_scene_boxes(run, policy, callback, seed) for policy in (run.model.prior, run.guide))
     return {
-        name: compare_sizes(given, prior[name], learnt[name], seed)
-        for name, given in _given_boxes(boxes).items()
+        name: compare_sizes(given, prior[name], learnt[name], seed)._replace(
+            margin=margins[name].pixels if name in margins else 0.0
+        )
+        for name, given in _given_boxes(without_margins(boxes, margins)).items()
         if min(len(boxes.size) for boxes in (given, prior[name], learnt[name])) >= MIN_BOXES
     }
 

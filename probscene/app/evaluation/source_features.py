@@ -5,7 +5,6 @@ Image number i of a source and a seed is the one that ``generate`` would write. 
 features of looks, h w cells.
 """
 
-import copy
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol
 
@@ -58,15 +57,8 @@ def policies(run: RunFolder) -> dict[str, Policy]:
     learnt, prior = run.guide, run.model.prior
     found = {LEARNT: learnt}
     if learnt.with_parameters is not None:
-        found[STRUCTURE] = without_parameters(learnt)
+        found[STRUCTURE] = run.policy("structure")
     return found | ({} if learnt is prior else {PRIOR: prior})
-
-
-def without_parameters(policy: Policy) -> Policy:
-    """The same policy of structures, whose scenes have the prior's parameters."""
-    alone = copy.copy(policy)
-    alone.with_parameters = None
-    return alone
 
 
 def embed_sources(

@@ -17,7 +17,7 @@ from probscene.inference.parameters.tilting.objects import Objects, measure
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.training import batch_seed
 
-from ..labels.partial_labels import PartialLabels
+from ..labels.boxes import Boxes
 from .rendered_features import RenderedFeatures
 from .run import RunFolder
 
@@ -62,15 +62,15 @@ def tilting_learning(
     return TiltingLearning(run.model, guide, observer.labelled, looks, real, schedule, seed, objects)
 
 
-def labelled_objects(run: RunFolder, labels: PartialLabels | None, images: Images) -> Objects | None:
+def labelled_objects(run: RunFolder, boxes: Boxes | None, images: Images) -> Objects | None:
     """The objects of the target that are labelled with boxes; None where there are none."""
-    if labels is None or labels.boxes is None or not any(len(boxes) for boxes in labels.boxes):
+    if boxes is None or not any(map(len, boxes.boxes)):
         return None
-    number = torch.tensor([run.model.classes.index(name) for name in labels.classes])
-    label = [number[boxes[:, 0].long()] for boxes in labels.boxes]
-    pictures = torch.stack([images.load(row) for row in labels.rows.tolist()])
-    boxes = pad_sequence([boxes[:, 1:] for boxes in labels.boxes], batch_first=True)
-    return measure(pictures, boxes, pad_sequence(label, batch_first=True, padding_value=-1))
+    number = torch.tensor([run.model.classes.index(name) for name in boxes.classes])
+    label = [number[found[:, 0].long()] for found in boxes.boxes]
+    pictures = torch.stack([images.load(row) for row in boxes.rows])
+    corners = pad_sequence([found[:, 1:] for found in boxes.boxes], batch_first=True)
+    return measure(pictures, corners, pad_sequence(label, batch_first=True, padding_value=-1))
 
 
 def sites_record(learning: ImageLevelTraining, discarded: dict[str, str]) -> list[dict[str, Any]]:

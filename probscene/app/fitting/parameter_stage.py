@@ -20,12 +20,14 @@ from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.reader_counts import counting_state
 from probscene.inference.parameters.schedule import ParameterSchedule
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
+from probscene.inference.statistics.box_margin import MarginEstimate
 from probscene.inference.training import Training, batch_seed
 from probscene.sampling import seed_everything
 from probscene.scenarios import JointGrammar
 
 from ..labels.partial_labels import PartialLabels
 from ..progress import Progress
+from .box_margins import box_margins, margins_said, without_margins
 from .config import LIKELIHOOD
 from .image_level import ImageLevelTraining, labelled_objects, meta_sim_learning, sites_record, tilting_learning
 from .learnt_parameters import NAME, prefixed, with_parameters
@@ -74,7 +76,7 @@ def learn_parameters(
         )
         say(f"Position and appearance keep the prior: {why}.")
         return
-    kept = run.read_tensors(NAME)
+    kept, margins = run.read_tensors(NAME), dict[str, MarginEstimate]()
     if kept is None:
         target = images()
         held = torch.arange(len(target)) % HELD == HELD - 1
@@ -92,7 +94,12 @@ def learn_parameters(
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
         else:
             assert isinstance(schedule, TiltingSchedule)
-            objects = labelled_objects(run, labels, target)
+            boxes = None if labels is None else labels.as_boxes
+            margins = {} if boxes is None else box_margins(run.model, boxes, target)
+            if boxes is not None and margins:
+                say(margins_said(margins))
+                boxes = without_margins(boxes, margins)
+            objects = labelled_objects(run, boxes, target)
             learning = tilting_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule, objects)
         keep = Checkpointer(run, NAME, learning)
 
@@ -105,7 +112,9 @@ def learn_parameters(
         if isinstance(learning, ParameterLearning) and isinstance(backbone, RenderBackbone):
             run.write_tensors(READER, counting_state(learning.calibrated.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
-        run.write_parameters(_record(run, guide, learning, _some(target, held, MAX_HELD_OUT)))
+        record = _record(run, guide, learning, _some(target, held, MAX_HELD_OUT))
+        found = {"box_margins": {name: margin._asdict() for name, margin in margins.items()}} if margins else {}
+        run.write_parameters(record | found)
         run.write_tensors(NAME, kept)
         (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
     say(_said(run.parameters))

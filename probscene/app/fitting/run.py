@@ -1,5 +1,6 @@
 """A run: its folder, and what it is made of: model, features, divergence, guide."""
 
+import copy
 import os
 import shutil
 from dataclasses import replace
@@ -35,6 +36,9 @@ from .store import FORMAT, Storage, check_free, load_state, read_record
 
 WHOLE_MODEL = "model"  # folder
 PRIOR_KEPT = "prior_kept"  # the only tensor of a guide that was given up
+GENERATED_SOURCES = ("prior", "start", "structure", "parameters", "learnt")
+"""What a run can generate: of the prior; of the initialisation; of learnt structures with the prior's parameters; of
+the prior's structures with learnt parameters; of both as they were learnt."""
 
 
 class RunFolder(Storage):
@@ -266,6 +270,30 @@ class RunFolder(Storage):
             raise RunError(f"expected a guide for model {self.model.name} in {self.path}, got another.") from error
         return with_parameters(self.model, self.config, self.parameters, guide.eval(), split_tensors(tensors)[1])
 
+    def policy(self, source: str) -> Policy:
+        """What draws the scenes of a source, of ``GENERATED_SOURCES``.
+
+        Raises:
+            RunError: see ``guide``.
+        """
+        if source == "prior":
+            return self.model.prior
+        if source == "start":
+            return self.model.pretraining_policy
+        structures = self.model.prior if source == "parameters" else self.guide
+        return _with_parameters_of(structures, None if source == "structure" else self.guide)
+
+    def generated_sources(self) -> tuple[str, ...]:
+        """Those of ``GENERATED_SOURCES`` that are no copy of another.
+
+        Raises:
+            RunError: see ``guide``.
+        """
+        same = {"start"} if self.model.pretraining is None else set[str]()
+        if self.guide.with_parameters is None:
+            same |= {"structure", "parameters"}
+        return tuple(name for name in GENERATED_SOURCES if name not in same)
+
     def check_finished(self) -> None:
         """See that there is a learnt guide.
 
@@ -294,6 +322,13 @@ class RunFolder(Storage):
                 f"expected the {what} file {file} as it was when {self.path} was fitted, got a missing or changed "
                 f"file. {kept or 'Put it back, or fit again.'}"
             )
+
+
+def _with_parameters_of(policy: Policy, other: Policy | None) -> Policy:
+    """The same policy of structures, whose scenes have another's parameters; the prior's where None."""
+    found = copy.copy(policy)
+    found.with_parameters = None if other is None else other.with_parameters
+    return found
 
 
 def _is_ours(part: Any) -> bool:

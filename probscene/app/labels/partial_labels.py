@@ -16,7 +16,7 @@ from probscene.errors import DataError
 from probscene.inference.features.base import Detections, Labelled
 from probscene.model import SceneModel
 
-from .boxes import read_boxes
+from .boxes import Boxes, read_boxes
 from .counts import read_table
 from .reading import has_boxes, label_files
 
@@ -40,6 +40,11 @@ class PartialLabels(NamedTuple):
     classes: tuple[str, ...]
     boxes: tuple[Tensor, ...] | None
     notes: tuple[str, ...]
+
+    @property
+    def as_boxes(self) -> Boxes | None:
+        """The boxes, where they are known."""
+        return None if self.boxes is None else Boxes(self.rows.tolist(), self.boxes, self.classes)
 
 
 def read_partial_labels(

@@ -6,11 +6,10 @@
     NAME=A,B               A, then B
     NAME=A+B               A and B, each half of the images that are shown
 
-For a path may stand ``real``, the photographs that are not for testing, ``prior``, ``start`` or ``learnt`` of a run, or
-an earlier row's name, for what it has.
+For a path may stand ``real``, the photographs that are not for testing, a source of a run, see ``GENERATED_SOURCES``,
+or an earlier row's name, for what it has.
 """
 
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +23,6 @@ from .sets import Example, LabelledSet
 
 REAL = "real"
 MAX_NAMED_IMAGES = 5  # images in a message
-LOOSE_BOX_RATIO = 1.25  # times as wide as generated boxes, from which photographs' labels are said to be looser
 
 
 class Part(NamedTuple):
@@ -242,37 +240,7 @@ def _path(word: str, paths: dict[str, Path]) -> Part:
     if not list_of(Path(word))[0].exists():
         raise DataError(
             f"expected a labelled set at {word!r}, got none; name a folder of COCO, KITTI or YOLO, a JSON file, an "
-            "earlier row, or real, prior, start or learnt where they are given."
+            "earlier row, or real, prior, start, structure, parameters or learnt where they are given."
         )
     paths[word] = Path(word)
     return Part(word)
-
-
-def looser(photographs: LabelledSet, made: LabelledSet) -> str | None:
-    """What to say where people's boxes are clearly wider than those of generated images, which touch the object.
-
-    A margin widens small objects' boxes by most, another magnification all by the same factor: what is said is the
-    margin, the median over classes of half the difference between the median sides.
-    """
-    sides = [_sides(found, len(made.classes), made.examples[0].size) for found in (photographs, made)]
-    known = {name: (a, b) for name, a, b in zip(made.classes, *sides, strict=True) if a > 0 and b > 0}
-    margin = round(float(np.median([(a - b) / 2 for a, b in known.values()]))) if known else 0
-    if margin < 1 or max(a / b for a, b in known.values()) < LOOSE_BOX_RATIO:
-        return None
-    words = ", ".join(f"{name} {a:.0f} for {b:.0f}" for name, (a, b) in known.items())
-    return (
-        f"Boxes of the photographs are wider than those of generated images, in pixels of these: {words} (median "
-        f"root of the area). If people drew loose boxes around the same objects, use --box-margin {margin}."
-    )
-
-
-def _sides(found: LabelledSet, classes: int, size: tuple[int, int]) -> list[float]:
-    """By class the median of the boxes' sides, as large as on images of ``size``; 0 where there is none."""
-    sides: list[list[float]] = [[] for _ in range(classes)]
-    for example in found.examples:
-        scale = math.sqrt(math.prod(size) / math.prod(example.size))
-        extent = example.boxes[:, 2:] - example.boxes[:, :2]
-        for c, side, real in zip(example.classes, np.sqrt(extent.prod(1)) * scale, example.real, strict=True):
-            if real:
-                sides[c].append(float(side))
-    return [float(np.median(each)) if each else 0.0 for each in sides]

@@ -21,16 +21,17 @@ import numpy as np
 from probscene.dataset import range_of
 from probscene.errors import DataError, ProbsceneError, RunError
 
-from ..arguments import checked_seed, positive
+from ..arguments import BoxMargin, checked_box_margin, checked_seed, positive
 from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_text
-from ..fitting.run import RunFolder
+from ..fitting.run import GENERATED_SOURCES, RunFolder
 from ..progress import Progress, silent
 from .begun_photographs import check_not_cut_out, model_file
 from .detector import RECIPES, Recipe, checked, fingerprint
 from .jobs import Job
+from .margins import looser
 from .pictures import draw
-from .plan import REAL, Plan, Row, baselines_of, check, list_of, looser, only, plan, split
+from .plan import REAL, Plan, Row, baselines_of, check, list_of, only, plan, split
 from .results import Results, score
 from .sets import LabelledSet, digest_of, read_set
 from .tables import text
@@ -66,17 +67,17 @@ class GeneratedSets:
 
     Args:
         run: the fit, or its folder.
-        sources: ``"prior"``, ``"start"`` (what pretraining made) and ``"learnt"``, or some of them.
+        sources: of ``GENERATED_SOURCES``; those that are a copy of another are left out.
         number: images of each.
         min_visible: objects of which a smaller fraction is visible have no label.
-        box_margin: pixels by which boxes are wider on each side.
+        box_margin: pixels by which boxes are wider on each side, see ``DatasetOptions``.
     """
 
     run: RunFolder | Path | str
     sources: tuple[str, ...] = ("prior", "start", "learnt")
     number: int = 600
     min_visible: float = 0.2
-    box_margin: int = 0
+    box_margin: BoxMargin = 0
 
     @cached_property
     def opened(self) -> RunFolder:
@@ -205,8 +206,8 @@ def trial(
         for key, path in _generate(generated, out / "sets", seed, workers, show).items():
             loaded[key] = read_labelled(path, names, show)
         check(planned, loaded, tested, set())
-        note = None if photographs is None else looser(photographs, loaded[known[-1]])
-        if note is not None:
+        margin = checked_box_margin(generated.box_margin)
+        if photographs is not None and (note := looser(photographs, loaded[known[-1]], margin, used)):
             callback(note)
     rows = {
         row.name: tuple(tuple((loaded[p.source], p) for p in stage) for stage in row.stages) for row in planned.rows
@@ -293,14 +294,13 @@ def _photographs(test: Path, options: TrialOptions, show: Progress) -> tuple[Lab
 
 
 def _sources(generated: GeneratedSets) -> tuple[str, ...]:
-    """Those that are asked for; no start where guides begin from the prior."""
-    unknown = set(generated.sources) - {"prior", "start", "learnt"}
+    """Those that are asked for and are no copy of another."""
+    unknown = set(generated.sources) - set(GENERATED_SOURCES)
     if unknown or not generated.sources:
-        actual = ", ".join(sorted(unknown)) or "none"
-        raise ProbsceneError(f"expected sources of a run among prior, start and learnt, got {actual}.")
-    generated.opened.check_finished()
-    same = generated.opened.model.pretraining is None
-    return tuple(name for name in dict.fromkeys(generated.sources) if not (name == "start" and same))
+        expected, actual = ", ".join(GENERATED_SOURCES), ", ".join(sorted(unknown)) or "none"
+        raise ProbsceneError(f"expected sources of a run among {expected}, got {actual}.")
+    different = generated.opened.generated_sources()
+    return tuple(name for name in dict.fromkeys(generated.sources) if name in different)
 
 
 def _check_classes(generated: GeneratedSets, classes: tuple[str, ...], same: bool) -> None:
@@ -317,7 +317,6 @@ def _generate(generated: GeneratedSets, into: Path, seed: int, workers: int, sho
     """Write what is generated of a run, as far as it is not there; by source its folder."""
     run, number = generated.opened, positive(generated.number, "images to generate")
     options = DatasetOptions(min_visible=generated.min_visible, box_margin=generated.box_margin)
-    policies = {"prior": run.model.prior, "start": run.model.pretraining_policy}
     folders = {}
     for source in _sources(generated):
         folders[source] = into / source
@@ -329,8 +328,7 @@ def _generate(generated: GeneratedSets, into: Path, seed: int, workers: int, sho
             w = 1 if run.objects else workers
             generate(run, number, into / source, seed, w, "coco", callback, options)
         else:
-            policy = policies[source]
-            generate_scenes(run.model, policy, number, into / source, seed, "coco", callback, options)
+            generate_scenes(run.model, run.policy(source), number, into / source, seed, "coco", callback, options)
     return folders
 
 

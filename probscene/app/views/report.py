@@ -5,7 +5,7 @@ import json
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from ..chunks import chunk_randomness
 from ..evaluation.diagnose import FitDiagnostics, diagnose
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.labels import TargetLabels
+from ..evaluation.sizes import given_boxes
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
 from ..evaluation.sources import ESTIMATE, READ, START, baseline_policies
 from ..evaluation.visible import Visible
@@ -28,10 +29,12 @@ from ..files import make_folder, write_text
 from ..fitting.pipeline import open_target
 from ..fitting.run import RunFolder
 from ..fitting.store import OTHER, timing
+from ..labels.boxes import Boxes
 from ..pictures import pixels
 from ..progress import STAGES, Display
 from ..style import style_sheet
 from . import charts, tables, verdict_text
+from .crops import object_crops
 from .markup import folded, paragraphs, picture, table, text_table
 from .preview import scenes
 
@@ -40,8 +43,12 @@ SITES = (
     "Distances are Wasserstein-1 from what is read in images of the target that nothing was learnt from; the noise "
     "floor is the distance between two halves of them."
 )
-QUANTILES, QUANTILE_SCENES = (0.05, 0.5, 0.95), 1000  # of a site of the scene
-VALUES = "For sites of the whole scene, the last columns give quantiles of their values, in the program's units."
+QUANTILES, QUANTILE_SCENES = (0.05, 0.5, 0.95), 1000  # of a site
+VALUES = "The last columns give quantiles of the sites' values, in the program's units."
+OBJECTS = (
+    "From the smallest to the largest, at equal steps of rank. All crops of a class have the same scale. Boxes are in "
+    "pixels of the model's canvas."
+)
 READINGS = "read in renders\nand target, 0 to 1"
 OF_SITES = {
     "prior": "read in renders with the prior's parameters",
@@ -192,6 +199,7 @@ def _details(run: RunFolder, evaluation: Evaluation, images: Images | None, diag
             folded(f"Warnings ({len(evaluation.warnings)})", paragraphs(evaluation.warnings)),
             folded("Distances", _distances(evaluation)),
             folded("Histograms by what counts depend on", f'<div class="charts">{nested}</div>' if nested else ""),
+            folded("Objects by size", _objects(run, images, evaluation.boxes)),
             folded("Sites: where things stand and how they look", _sites(run)),
             folded("Learning curves", f'<div class="charts">{curves}</div>' if curves else ""),
             folded("Grammar", f"<pre>{html.escape(str(run.model.grammar))}</pre>"),
@@ -210,6 +218,27 @@ def _parts(found: FitDiagnostics | None, images: Images | None) -> str:
         picture(list(found.generated_uncovered), "Generated scenes least like any target image", 4),
     ]
     return verdict_text.details(found, pictures)
+
+
+def _objects(run: RunFolder, images: Images | None, boxes: Boxes | None) -> str:
+    """Crops of each class, a row of each source."""
+    sources = {caption.partition(":")[0]: policy for caption, policy in _sources(run).items()}
+    shown = {name: policy for name, policy in sources.items() if name in ("Prior", "Learnt")}
+    if images is not None and boxes is None:
+        boxes = given_boxes(run, images)
+    parts = []
+    for name, found in object_crops(run, shown, images, boxes).items():
+        rows = [
+            picture(crops.images, f"{source.capitalize()}: median box {_size(crops.median)}, {crops.number} objects", 6)
+            for source, crops in found.items()
+        ]
+        parts.append(f'<h3>{html.escape(name)}</h3><div class="images">{"".join(rows)}</div>')
+    without = "" if boxes is not None else " Photographs are not shown, as none of their boxes are known."
+    return "".join(parts) + f'<p class="soft">{OBJECTS}{without}</p>' if parts else ""
+
+
+def _size(size: tuple[float, float]) -> str:
+    return " x ".join(f"{side:.1f}" for side in size)
 
 
 def _distances(evaluation: Evaluation) -> str:
@@ -241,7 +270,7 @@ def _sites(run: RunFolder) -> str:
     record = run.parameters
     if not record:
         return "<p>Parameters were not learnt: where things stand and how they look keeps the prior.</p>"
-    sites, values = record["sites"], scene_values(run)
+    sites, values = record["sites"], site_values(run)
     is_read = any(site["skill"] is not None or "read" in site for site in sites)
     head = ["site", "of", "parameters"]
     head += ["skill", "distance\nprior", "distance\nthis fit", "noise\nfloor", READINGS] if is_read else []
@@ -251,7 +280,8 @@ def _sites(run: RunFolder) -> str:
         what = f"keeps the prior: {site['because']}"
         if site["learnt"]:
             what = "learnt" if record["kept"] == "learnt" else "learnt, and not kept"
-        of = ", ".join(site["kinds"]) or "the scene" * (site["name"] in values)
+        known = values.get(site["name"])
+        of = ", ".join(site["kinds"]) or "the scene" * (known is not None and known.one)
         cells = [html.escape(site["name"]), html.escape(of), f"<p>{html.escape(what)}</p>"]
         read = site.get("read")
         if is_read:
@@ -259,8 +289,8 @@ def _sites(run: RunFolder) -> str:
             chart = f'<div class="site">{charts.site(site["name"], read)}</div>' if read else "–"
             cells += [_figure(site["skill"]), *distances, chart]
         if values:
-            before, after = values.get(site["name"], (None, None))
-            cells += [_numbers(before), _numbers(after if site["learnt"] else None)]
+            after = known.learnt if known is not None and site["learnt"] else None
+            cells += [_numbers(None if known is None else known.prior), _numbers(after)]
         rows.append(cells)
     kept = _not_kept(record) if any(site["learnt"] for site in sites) and record["kept"] != "learnt" else ""
     legend = f'<p class="legend">{_legend(OF_SITES)}</p>' if is_read else ""
@@ -268,12 +298,26 @@ def _sites(run: RunFolder) -> str:
     return f'{kept}{legend}{table(head, rows, "sites")}<p class="soft">{notes}</p>'
 
 
-def scene_values(run: RunFolder) -> dict[str, tuple[list[float], list[float] | None]]:
-    """Of each site with one value a scene, quantiles ``QUANTILES`` in scenes of the prior and of the fit; None where
-    the latter has the prior's parameters."""
-    sites = {site["name"] for site in run.parameters["sites"] if not site["kinds"]}
+class SiteValues(NamedTuple):
+    """Of a site.
+
+    Attributes:
+        prior, learnt: quantiles ``QUANTILES`` of its values in scenes of the prior and of the fit; None where the fit's
+            have the prior's parameters.
+        one: whether a scene has one value.
+    """
+
+    prior: list[float]
+    learnt: list[float] | None
+    one: bool
+
+
+def site_values(run: RunFolder) -> dict[str, SiteValues]:
+    """By site, of those whose values are numbers."""
+    sites = {site["name"] for site in run.parameters["sites"]}
     found: list[dict[str, list[float]]] = []
-    for policy in (run.model.prior, run.guide) if sites else ():
+    single: set[str] = set()
+    for policy in (run.model.prior, run.guide):
         if policy.with_parameters is None and found:
             break
         with torch.no_grad(), threads(1), chunk_randomness(0, 0):
@@ -281,13 +325,13 @@ def scene_values(run: RunFolder) -> dict[str, tuple[list[float], list[float] | N
         values: dict[str, list[Tensor]] = {}
         for name, value in scenes.parameters.items():
             own, mask = site_name(run.model.grammar, name), scenes.site_mask[name]
-            one = own in sites and value.shape == mask.shape and mask.any() and mask.sum(1).max() == 1
-            if one and value.is_floating_point():
+            if own in sites and value.shape == mask.shape and mask.any() and value.is_floating_point():
                 values.setdefault(own, []).append(value[mask])
+                single |= {own} if mask.sum(1).max() == 1 else set()
         at = torch.tensor(QUANTILES)
         found.append({name: torch.cat(some).float().quantile(at).tolist() for name, some in values.items()})
     after = found[1] if len(found) > 1 else {}
-    return {name: (before, after.get(name)) for name, before in found[0].items()} if found else {}
+    return {name: SiteValues(before, after.get(name), name in single) for name, before in found[0].items()}
 
 
 def _numbers(values: list[float] | None) -> str:

@@ -107,6 +107,44 @@ def test_a_margin_that_is_none_is_named(tmp_path, wrong):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("plate", "got 'plate'"),
+        ("plate=", "whole number of pixels"),
+        ("plate=2,plate=3", "once for each class"),
+        ({"plate": -1}, "whole number of pixels"),
+        ("lamp=2", "classes of model .*, got lamp"),
+    ],
+)
+def test_margins_of_classes_that_are_none_are_named(tmp_path, wrong, said):
+    model = load_model(str(FILES["plates"]))
+    with pytest.raises(ProbsceneError, match=said if wrong != "plate" else "whole number of pixels"):
+        generate_scenes(model, model.prior, 1, tmp_path / "out", options=DatasetOptions(box_margin=wrong))
+    with pytest.raises(ProbsceneError, match=said if wrong != "plate" else "whole number of pixels"):
+        SceneDataset(model, 1, box_margin=wrong)
+    assert not (tmp_path / "out").exists()
+
+
+def test_each_class_has_its_own_margin(drawn, tmp_path):
+    """In all formats, the other classes' boxes as they are without."""
+    name, others = drawn.model.classes[0], drawn.model.classes[1:]
+    options = [
+        DatasetOptions(box_margin=each) for each in (f"{name}={MARGIN}", {name: MARGIN, **dict.fromkeys(others, 0)})
+    ]
+    for number, each in enumerate(options):
+        generate_scenes(drawn.model, drawn.model.prior, NUM, tmp_path / str(number), 1, drawn.formats, options=each)
+    one, two = (annotations(tmp_path / str(number)) for number in (0, 1))
+    assert one == two and others
+    of_class = drawn.model.classes.index(name) + 1
+    for found, wide, touching in zip(one, annotations(drawn.of(MARGIN)), annotations(drawn.of(0)), strict=True):
+        assert found == (wide if found["category_id"] == of_class else touching)
+    files = zip(*(sorted((folder / "labels").iterdir()) for folder in (tmp_path / "0", drawn.of(MARGIN))), strict=True)
+    for own, wide in files:
+        lines = zip(own.read_text().splitlines(), wide.read_text().splitlines(), strict=True)
+        assert all(a == b for a, b in lines if a.startswith(f"{of_class - 1} "))
+
+
 def test_kitti_boxes_of_whole_silhouettes_have_none(tmp_path):
     model = load_model(str(FILES["lots"]))
     with pytest.raises(ProbsceneError, match="no box_margin in KITTI's labels of the 3D model"):

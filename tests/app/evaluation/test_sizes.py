@@ -97,7 +97,7 @@ def test_boxes_of_labels_are_held_beside_those_of_scenes(tmp_path):
     labels = {"path": str(tmp_path / "target" / "annotations.json")}
     run = SimpleNamespace(model=model, guide=guide, record={"labels": labels}, visible_shares=dict)
     boxes, told = given_boxes(run, target), []
-    found = sizes(run, boxes, told.append)
+    found = sizes(run, boxes, target, told.append)
     assert found["red"].grade is Grade.NO_BETTER and found["red"].worse and sum(told) == 2 * NUM_SCENES
     assert found["blue"].grade is Grade.GOOD and found["blue"].given == found["blue"].prior == found["blue"].learnt
     assert found["red"].boxes == sum(int((each[:, 0] == 0).sum()) for each in boxes.boxes)

@@ -181,12 +181,12 @@ def test_labelled_objects_are_those_of_the_boxes(lit, target):
     images = ImageFolder(target.images, (64, 64), 3)
     boxes = (torch.tensor([[0, 4.0, 6.0, 20.0, 18.0]]), torch.zeros(0, 5), torch.tensor([[0, 30.0, 31.0, 40.0, 50.0]]))
     labels = PartialLabels(torch.tensor([1, 4, 7]), torch.zeros(3, 1), ("blue",), boxes, ())
-    found = labelled_objects(run, labels, images)
+    found = labelled_objects(run, labels.as_boxes, images)
     assert found.image.tolist() == [0, 2] and found.label.tolist() == [1, 1] and found.images == 3
     assert found.seen[0, :2] == pytest.approx(np.log([16, 12])) and found.seen[1, :2] == pytest.approx(np.log([10, 19]))
     inside = images.load(7)[:, 31:50, 30:40].double().mean((1, 2)) / 255
     assert found.seen[1, 4:7] == pytest.approx(inside.numpy())
-    assert labelled_objects(run, labels._replace(boxes=None), images) is None
+    assert labels._replace(boxes=None).as_boxes is None
     assert labelled_objects(run, None, images) is None
 
 

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from probscene.app.trial.plan import Part, chosen, looser, only, plan, split
+from probscene.app.trial.margins import looser
+from probscene.app.trial.plan import Part, chosen, only, plan, split
 from probscene.app.trial.sets import BEYOND, EASY, HARD, MODERATE, read_set
 from probscene.errors import DataError, ProbsceneError
 
@@ -187,19 +188,30 @@ def test_what_a_plan_refuses(sets, said):
         plan(sets, ("learnt", "real") if sets else (), ())
 
 
-@pytest.mark.parametrize(("wider", "margin"), [(0, None), (1, None), (4, 4)])
-def test_labels_that_are_looser_than_masks_are_said_with_their_margin(tmp_path, wider, margin):
+def loosened(folder: Path, pixels: int, side: int = SIDE) -> Path:
+    """A set whose boxes leave room around objects."""
+
     def loosen(record):
         for one in record["annotations"]:
             x, y, w, h = one["bbox"]
-            one["bbox"] = [x - wider, y - wider, w + 2 * wider, h + 2 * wider]
+            one["bbox"] = [x - pixels, y - pixels, w + 2 * pixels, h + 2 * pixels]
 
-    made = read_set(draw_set(tmp_path / "made", 30, 5))
-    photographs = draw_set(tmp_path / "photographs", 30, 6, side=4 * SIDE)  # objects of the same size in pixels
-    change(photographs, loosen)
-    assert looser(read_set(photographs), made) is None  # as large a share of the image would be four times as wide
-    same = change(draw_set(tmp_path / "same", 30, 6), loosen)
-    said = looser(read_set(same), made)
-    assert (said is None) == (margin is None)
-    if said is not None:
-        assert f"--box-margin {margin}" in said and re.search(r"disc 2\d for 1\d, square 2\d for 1\d", said)
+    return change(draw_set(folder, 60, 6, side=side), loosen)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "side", "given", "wanted"),
+    [
+        (0, SIDE, 0, None),
+        (4, SIDE, 0, "disc=4,square=4"),
+        (4, 2 * SIDE, 0, "disc=2,square=2"),  # in pixels of generated images
+        (4, SIDE, 2, "disc=6,square=6"),
+        (4, SIDE, {"disc": 1}, "disc=5,square=4"),
+    ],
+)
+def test_labels_that_leave_more_room_than_generated_ones_are_said(tmp_path, pixels, side, given, wanted):
+    """With the margin that would be the same."""
+    made = read_set(draw_set(tmp_path / "made", 60, 5))
+    said = looser(read_set(loosened(tmp_path / "photographs", pixels, side)), made, given)
+    assert (said is None) == (wanted is None)
+    assert said is None or said.endswith(f"--box-margin {wanted}.")

@@ -109,20 +109,29 @@ def run(discs, tmp_path_factory) -> RunFolder:
 
 def test_a_run_is_generated_beside_photographs_on_the_command_line(run, discs, tmp_path, call):
     model = load_model(str(discs.file))
-    generate_scenes(model, model.prior, 20, tmp_path / "real", seed=9, options=DatasetOptions(box_margin=9))
+    generate_scenes(model, model.prior, 60, tmp_path / "real", seed=9, options=DatasetOptions(box_margin=5))
     words = ["trial", "--test", tmp_path / "real", "--hold-out", 8, "--real-numbers", "4,all", "--run", run.path]
-    words += ["--generate", 6, "--set", "learnt then 4=learnt,real:4", "--out", tmp_path / "out", "--baseline", "prior"]
+    words += [
+        "--generate",
+        60,
+        "--set",
+        "learnt then 4=learnt,real:4",
+        "--out",
+        tmp_path / "out",
+        "--baseline",
+        "prior",
+    ]
     words += ["--seeds", 1, "--iterations", 2, "--resamples", 10, "--size", "64x64", "--box-margin", 2]
     done = call(*words)
     assert done.code == 0, done.err
     lines = (tmp_path / "out" / "sets" / "learnt" / "provenance.jsonl").read_text().splitlines()
     assert {json.loads(line)["box_margin"] for line in lines} == {2}
-    assert "Boxes of the photographs are wider" in done.err and "--box-margin" in done.err
+    assert "leave more room around objects" in done.err and "use --box-margin" in done.err
     assert "Points more than 'prior'" in done.out and "results.png" in done.out and "Detectors: 40 images" in done.err
     record = json.loads((tmp_path / "out" / "results.json").read_text())
     rows = record["rows"]
     assert record["order"] == ["real 4", "real all", "prior", "learnt", "learnt then 4"]
-    assert [rows[name]["photographs"] for name in ("real 4", "real all", "learnt")] == [4, 12, None]
+    assert [rows[name]["photographs"] for name in ("real 4", "real all", "learnt")] == [4, 52, None]
     assert rows["prior"]["precision"]["AP50"]["mean"]["worth"]["number"]
     assert {path.name for path in (tmp_path / "out" / "sets").iterdir()} == {"prior", "learnt"}
 
