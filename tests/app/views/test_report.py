@@ -91,8 +91,8 @@ def test_images_come_first_then_the_verdict_then_histograms_and_the_rest_is_fold
     assert visible == ["Images", "Verdict", "Histograms", "Details"]
     titles = re.findall(r"<details><summary>(.*?)</summary>", text)
     assert text.count("<details") == len(titles) and "<details open" not in text  # none is open
-    assert titles[-7:] == ["Distances", "Objects by size", "Sites: where things stand and how they look", "Learning curves",
-                           "Grammar", "Times", "Configuration"]  # fmt: skip
+    last = "Sites: where things stand and how they look", "Learning curves", "Grammar", "Times", "Configuration"
+    assert titles[-7:] == ["Distances", "Objects by size", *last]
     page = Page(text)
     assert "There is no verdict" in page.visible and "truth (labels)" in page.visible
     assert not any(words in page.visible for words in ("structure.batches", "mean cost", "Parameters were not learnt"))
