@@ -90,18 +90,26 @@ class FitAndDiagnostics(NamedTuple):
 
 
 def fit_and_diagnose(
-    request: FitRequest, out: Path, resume: bool, execution: Execution, verdict: bool
+    request: FitRequest, out: Path, resume: bool, execution: Execution, verdict: bool, by_detectors: bool = False
 ) -> FitAndDiagnostics:
     """A fit and its verdict, as the command line gives them.
+
+    Args:
+        by_detectors: sources are compared first, see ``compare_and_keep``.
 
     Raises:
         ProbsceneError: see ``fit`` and ``diagnose``.
     """
     with display(execution.progress) as show:
         done = carried_out(request, out, show, resume, execution)
-        found = None
+        found, images = None, done.images
+        if by_detectors and not done.run.sources:
+            from ..detectors.source_comparison import compare_and_keep  # torchvision takes seconds to import
+
+            images = images or open_target(done.run, show)
+            compare_and_keep(done.run, images, show, show.say)
         if verdict and done.unfinished:
-            found = diagnose(done.run, done.images or open_target(done.run, show), show)
+            found = diagnose(done.run, images or open_target(done.run, show), show)
     return FitAndDiagnostics(done.run, found)
 
 

@@ -44,6 +44,13 @@ def train(
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(metavar="N", help="Processes; the bytes do not depend on it.")] = 1,
     onnx: Annotated[bool, typer.Option("--onnx", help="Also write detector.onnx.")] = False,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Scenes of the run: prior, start, structure, parameters, learnt; compared if not given.",
+        ),
+    ] = None,
     classes: Annotated[
         str | None,
         typer.Option(metavar="NAME,...", help="Classes to detect; the model's if not given.", rich_help_panel="Labels"),
@@ -78,6 +85,7 @@ def train(
         box_margin=box_margin,
         seed=seed,
         value_range=range_given(value_range),
+        source=source,
         onnx=onnx,
     )
     trained = calls.train(model_or_run, real, labels, out, options, workers=workers)

@@ -46,6 +46,12 @@ def fit(
     ] = None,
     skip_bad: Annotated[bool | None, typer.Option("--skip-bad", help="Leave out images that do not decode.")] = None,
     no_verdict: Annotated[bool, typer.Option("--no-verdict", help="Do not judge the fit.")] = False,
+    detector_test: Annotated[
+        bool,
+        typer.Option(
+            "--detector-test", help="Compare prior and fit by detectors; parameters that are worse are undone."
+        ),
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     features: Annotated[
         str | None,
@@ -118,7 +124,7 @@ def fit(
     request = fit_request(ModelFile(source, assets), images, config, seed, labels, threads)
     execution = Execution(threads, cluster, False if no_cache else cache or True)
     try:
-        done = fit_and_diagnose(request, out, resume, execution, not no_verdict)
+        done = fit_and_diagnose(request, out, resume, execution, not no_verdict, detector_test)
     except BaseException:
         if not resume and (out / "run.json").exists():
             ctx.obj.words.append("--resume")  # what the message says to run again

@@ -3,9 +3,12 @@
 detector.json, detector.safetensors    the detector, see ``folder``
 training.json, checkpoint.pt           while it is trained: its settings, and how far it is
 generated/                             while it is trained: what it is shown of the run
+sources/, sources.json                 while it is trained: which source of the run trains the best detector
 """
 
 import hashlib
+import json
+import math
 import pickle
 import shutil
 import time
@@ -16,6 +19,7 @@ from typing import Any, NamedTuple, cast
 
 import safetensors.torch
 import torch
+from rich.console import Console
 from torchvision.models.detection.fcos import FCOS
 
 import probscene
@@ -29,11 +33,12 @@ from ..arguments import BoxMargin, checked_box_margin, checked_seed, positive
 from ..chunks import chunk_randomness
 from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_whole
-from ..fitting.run import RunFolder, is_run
+from ..fitting.pipeline import open_target
+from ..fitting.run import GENERATED_SOURCES, RunFolder, is_run
 from ..labels.naming import composed
 from ..loading import assets_record, load_model
 from ..modules import file_digest, module_digests
-from ..progress import Progress, silent
+from ..progress import Display, Progress, silent
 from ..trial.begun_photographs import check_not_cut_out, model_file
 from ..trial.detector import Recipe, build, fingerprint
 from ..trial.jobs import stages_of
@@ -46,8 +51,9 @@ from ..trial.trial import SIDE_MULTIPLE, TrainingBudget, check_same, read_labell
 from .export import check_can_export, export
 from .folder import FORMAT, ONNX, RECORD, SETTINGS, WEIGHTS, TrainedDetector
 from .scores import record_of
+from .source_comparison import DetectorBudget, compare_sources
 
-CHECKPOINT, GENERATED = "checkpoint.pt", "generated"
+CHECKPOINT, GENERATED, COMPARED = "checkpoint.pt", "generated", "sources.json"
 CHECKPOINT_SECONDS = 30.0  # between two
 
 
@@ -67,6 +73,8 @@ class TrainOptions:
         box_margin: pixels by which boxes are wider there on each side, see ``DatasetOptions``.
         seed: of the images, of which are held out, of the start and the order.
         value_range: of photographs of 16 bits, see ``ImageFolder``; the run's, else what is found, where None.
+        source: of a run, what is generated, of ``GENERATED_SOURCES``; where None, the one that trains the best detector
+            by a comparison, see ``source_comparison``, or what was learnt, where sources cannot be compared.
         onnx: write it as ONNX, too, see ``detectors.export``.
     """
 
@@ -81,6 +89,7 @@ class TrainOptions:
     box_margin: BoxMargin = 0
     seed: int = 0
     value_range: Sequence[float] | None = None
+    source: str | None = None
     onnx: bool = False
 
     def check(self) -> Recipe:
@@ -99,6 +108,9 @@ class TrainOptions:
             raise ProbsceneError(f"expected a size of multiples of {SIDE_MULTIPLE}, got {self.size[1]}x{self.size[0]}.")
         if self.hold_out is not None and self.test is not None:
             raise ProbsceneError("expected photographs to test on from --hold-out or from --test, got both; give one.")
+        if self.source is not None and self.source not in GENERATED_SOURCES:
+            expected = ", ".join(GENERATED_SOURCES)
+            raise ProbsceneError(f"expected a source of a run among {expected}, got {self.source!r}.")
         if self.onnx:
             check_can_export(self.detector)
         return recipe
@@ -164,7 +176,7 @@ def train(
         "finetune_fraction": options.budget.finetune_fraction, "seed": seed,
         "value_range": None if used is None else list(used),
         "generated": {
-            **origin.record, "images": options.generate, "min_visible": options.min_visible,
+            **origin.record, "source": options.source, "images": options.generate, "min_visible": options.min_visible,
             "box_margin": checked_box_margin(options.box_margin),
         },
         "photographs_sha256": None if photographs is None else digest_of(photographs),
@@ -173,7 +185,16 @@ def train(
     if not _bind(out, settings):
         for note in notes:
             callback(f"Note: {note}")
-        _generate(origin, out / GENERATED, options, workers, show)
+        budget = DetectorBudget(
+            options.detector,
+            recipe._replace(iterations=math.ceil(recipe.iterations / 2)),
+            size,
+            math.ceil(options.generate / 2),
+            DatasetOptions(min_visible=options.min_visible, box_margin=options.box_margin),
+            seed,
+        )
+        source, compared = _chosen(origin, options.source, budget, out, show, callback)
+        _generate(origin, source, out / GENERATED, options, workers, show)
         made = read_labelled(out / GENERATED, names, show)
         if tested is not None:
             check_apart(GENERATED, made, tested)
@@ -181,8 +202,9 @@ def train(
         if photographs is not None and (note := looser(photographs, made, margin, used)):
             callback(note)
         job = _Job(out, settings, options, recipe, made, photographs, tested, size, used)
-        write_json(out / RECORD, job.run(show))  # last: with it the detector is there
-    for name in (SETTINGS, CHECKPOINT):
+        found = {"source": source, "sources": compared}
+        write_json(out / RECORD, job.run(show) | found)  # last: with it the detector is there
+    for name in (SETTINGS, CHECKPOINT, COMPARED):
         (out / name).unlink(missing_ok=True)
     if (out / GENERATED).is_dir():
         shutil.rmtree(out / GENERATED)
@@ -252,15 +274,46 @@ def _bind(out: Path, settings: dict[str, Any]) -> bool:
     return False
 
 
-def _generate(origin: _Origin, into: Path, options: TrainOptions, workers: int, show: Progress) -> None:
+def _chosen(
+    origin: _Origin,
+    source: str | None,
+    budget: DetectorBudget,
+    out: Path,
+    show: Progress,
+    callback: Callable[[str], None],
+) -> tuple[str | None, dict[str, Any] | None]:
+    """The source of a run that is generated, and what was found where several were compared."""
+    run, file = origin.run, out / COMPARED
+    if run is None or source is not None:
+        return (None if run is None else source), None
+    if file.is_file():
+        found = json.loads(file.read_text(encoding="utf-8"))
+    elif not (found := run.sources):
+        try:
+            images = None if run.read_tensors("real") is None else open_target(run, Display(Console(quiet=True)))
+        except (DataError, RunError) as error:
+            callback(f"Note: sources of the run are not compared, as its target cannot be read: {error}")
+            images = None
+        compared = None if images is None else compare_sources(run, images, budget, out / "sources", show)
+        if compared is None:
+            return "learnt", None
+        callback(str(compared))
+        found = compared.record()
+    write_json(file, found)
+    return found["source"], found
+
+
+def _generate(
+    origin: _Origin, source: str | None, into: Path, options: TrainOptions, workers: int, show: Progress
+) -> None:
     labelled = DatasetOptions(min_visible=options.min_visible, box_margin=options.box_margin)
 
     def progress(done: int, total: int) -> None:
         show("generating", done, total)
 
-    if origin.run is None:
-        prior = origin.model.prior
-        generate_scenes(origin.model, prior, options.generate, into, options.seed, "coco", progress, labelled)
+    if origin.run is None or source != "learnt":
+        policy = origin.model.prior if origin.run is None else origin.run.policy(source or "learnt")
+        generate_scenes(origin.model, policy, options.generate, into, options.seed, "coco", progress, labelled)
     else:
         w = 1 if origin.run.objects else workers
         generate(origin.run, options.generate, into, options.seed, w, "coco", progress, labelled)

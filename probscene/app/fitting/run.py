@@ -294,6 +294,20 @@ class RunFolder(Storage):
             same |= {"structure", "parameters"}
         return tuple(name for name in GENERATED_SOURCES if name not in same)
 
+    def give_back_parameters(self, because: str) -> None:
+        """Let all sites keep the prior from now on.
+
+        Args:
+            because: what is said of each.
+        """
+        tensors, record = self.read_tensors("guide"), self.parameters
+        if tensors is None or not record:
+            return
+        sites = [site | ({"learnt": False, "because": because} if site["learnt"] else {}) for site in record["sites"]]
+        self.write_tensors("guide", split_tensors(tensors)[0])
+        self.write_parameters(record | {"sites": sites})
+        vars(self).pop("guide", None)
+
     def check_finished(self) -> None:
         """See that there is a learnt guide.
 

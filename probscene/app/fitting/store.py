@@ -11,6 +11,7 @@
     outcome.json           how far prior and learnt scenes are from the target, and which are kept
     real.safetensors       features of the target images
     readings.json          how each class is read, where features are suited to the target's images
+    sources.json           which source trains the best detector, where that was asked for
     log.jsonl              one line an update
     checkpoint.safetensors what ``--resume`` goes on from
 
@@ -36,7 +37,7 @@ from .plugins import IN_MEMORY, inner
 
 TIMING, OTHER = "timing.json", "other"  # OTHER: seconds of no stage
 FORMAT, READABLE = 4, (3, 4)  # of the run folder, as it is written and as it can be read
-READINGS, OUTCOME, PARAMETERS = "readings.json", "outcome.json", "parameters.json"
+READINGS, OUTCOME, PARAMETERS, SOURCES = "readings.json", "outcome.json", "parameters.json", "sources.json"
 SAVE_EVERY = 5.0  # seconds between checkpoints: what an interruption can cost
 KEYS = {"model", "model_sha256", "assets"}  # that every run.json has
 
@@ -122,6 +123,16 @@ class Storage:
     def write_parameters(self, found: dict[str, Any]) -> None:
         """Keep what ``parameters`` gives."""
         write_json(self.path / PARAMETERS, found)
+
+    @property
+    def sources(self) -> dict[str, Any]:
+        """Which source trains the best detector, see ``detectors.source_comparison``; empty where that was not asked
+        for."""
+        return self._read_json(SOURCES)
+
+    def write_sources(self, found: dict[str, Any]) -> None:
+        """Keep what ``sources`` gives."""
+        write_json(self.path / SOURCES, found)
 
     def _read_json(self, name: str) -> dict[str, Any]:
         file = self.path / name

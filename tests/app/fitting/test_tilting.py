@@ -1,6 +1,7 @@
 """``fit --parameters tilting``: kept, used by all that draws, and resumed; for photographs it is the way."""
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from probscene.app.detectors import source_comparison
+from probscene.app.detectors.source_comparison import SourceComparison, compare_and_keep
 from probscene.app.fitting import parameter_stage, site_selection
 from probscene.app.fitting import store as storage
 from probscene.app.fitting.image_level import labelled_objects
@@ -16,6 +19,7 @@ from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.partial_labels import PartialLabels
 from probscene.app.loading import load_model
+from probscene.app.progress import silent
 from probscene.dataset import ImageFolder
 from probscene.inference.parameters.guide import ParameterGuide
 from probscene.inference.parameters.tilting import learning
@@ -84,6 +88,37 @@ def test_all_that_draws_takes_them(fitted, call, tmp_path):
     assert torch.equal(moved["x"], still["x"]) and not torch.equal(moved["light"], still["light"])
     assert call("preview", fitted, "--out", tmp_path / "p.png").code == 0
     assert call("report", fitted).code == 0
+
+
+def test_structure_and_parameters_can_be_drawn_each_for_itself(fitted):
+    run = RunFolder.at(fitted)
+    assert run.generated_sources() == ("prior", "structure", "parameters", "learnt")
+    drawn = {}
+    for source in run.generated_sources():
+        seed_everything(0)
+        drawn[source] = sample(run.model, run.policy(source), 40)
+    light = {source: scenes.parameters["light"] for source, scenes in drawn.items()}
+    rules = {source: scenes.derivation.rules for source, scenes in drawn.items()}
+    assert torch.equal(rules["prior"], rules["parameters"]) and not torch.equal(light["prior"], light["parameters"])
+    assert torch.equal(rules["structure"], rules["learnt"]) and not torch.equal(light["structure"], light["learnt"])
+
+
+@pytest.mark.parametrize("better", ["learnt", "structure", "prior"])
+def test_parameters_are_given_back_where_detectors_are_better_without(fitted, tmp_path, monkeypatch, better):
+    run = RunFolder.at(shutil.copytree(fitted, tmp_path / "run"))
+    agreement = {"learnt": 0.5, "prior": 0.4} | ({} if better == "learnt" else {"structure": 0.6, better: 0.7})
+    found = SourceComparison(max(agreement, key=agreement.get), agreement, ("red",), 9)
+    monkeypatch.setattr(source_comparison, "compare_sources", lambda *_: found)
+    before, told = run.guide_hash(), []
+    kept = compare_and_keep(run, None, silent, told.append)
+    again = RunFolder.at(run.path)
+    assert again.sources == kept.record() and kept.source == {"structure": "learnt"}.get(better, better)
+    for each in (run, again):
+        assert (each.guide.with_parameters is not None) is (better == "learnt")
+    assert (run.guide_hash() == before) is (better == "learnt")
+    because = "detectors count better when they are trained on scenes with the prior's"
+    assert (again.parameters["sites"][2]["because"] == because) is (better != "learnt")
+    assert len(told) == (1 if better == "learnt" else 2)
 
 
 def test_a_fit_goes_on_to_the_same_bytes(fitted, call, lit, discs, target, tmp_path, monkeypatch):
