@@ -1,6 +1,7 @@
 """What a model that was begun from a few labelled photographs is worth to a detector.
 
-    python benchmarks/begin_detector.py --photographs FOLDER [--out FOLDER] [--labelled 20] [--draws 5] [--workers 2]
+    python benchmarks/begin_detector.py --photographs FOLDER [--out FOLDER] [--labelled 20] [--draws 5] [--seeds 1]
+        [--sets alone begun then mixed] [--workers 2]
 
 FOLDER is a labelled set of COCO: annotations.json and images/. A quarter of its photographs, with all their near
 duplicates, is held out for tests. Of the others, some are drawn at random as the labelled ones, several times; from
@@ -11,9 +12,10 @@ each draw a model is begun, and scenes of its prior are generated. A trial then 
     then          the scenes, then the photographs
     mixed         both in turn, half of the images shown each
 
-Printed are the average precisions at an overlap of 0.5 of each draw, and the mean over draws of what the others
-have more than ``alone``, with a 95 % interval of Student's t over the draws, which share the held-out
-photographs. Photographs are near duplicates where their pixels, at 32 x 32, correlate by more than 0.95.
+each with several seeds. Printed are the average precisions at an overlap of 0.5 of each draw, and the mean over draws
+of what the others have more than ``alone``, with two 95 % intervals: Student's t over the draws, which share the
+held-out photographs; and a bootstrap over held-out photographs, draws and, within a draw, seeds. Photographs are near
+duplicates where their pixels, at 32 x 32, correlate by more than 0.95.
 """
 
 import argparse
@@ -23,6 +25,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from given import needed, out_option
+from safetensors.numpy import load_file
 from scipy.stats import t as student
 
 from probscene.app.cut_paste.begin import begin
@@ -30,10 +33,17 @@ from probscene.app.datasets.generate import DatasetOptions, generate_scenes
 from probscene.app.files import write_json
 from probscene.app.loading import load_model
 from probscene.app.memory import tune_malloc
-from probscene.app.trial.trial import TrialOptions, trial
+from probscene.app.trial.bootstrap import draw as drawn
+from probscene.app.trial.bootstrap import estimate
+from probscene.app.trial.results import MEAN, precisions
+from probscene.app.trial.scoring import MAIN
+from probscene.app.trial.training import Detections
+from probscene.app.trial.trial import TrialOptions, read_labelled, trial
 from probscene.decoding import read_rgb
 
 MIN_CORRELATION, SIDE = 0.95, 32  # of near duplicates; pixels
+SETS = "alone", "begun", "then", "mixed"
+RESAMPLES = 1000
 
 
 def groups_of(files: list[Path]) -> np.ndarray:
@@ -78,17 +88,42 @@ def begun_set(args: argparse.Namespace, names: list[str], out: Path, seed: int) 
 
 
 def measured(args: argparse.Namespace, draw: int, pool: list[str], test: Path) -> dict[str, dict[str, float]]:
-    """The precisions of a draw's rows, of each class and of their mean."""
+    """The precisions of a draw's rows, of each class and of their mean, over seeds."""
     out = args.out / f"draw-{draw}"
     names = sorted(np.random.default_rng([args.seed, 1, draw]).choice(pool, args.labelled, replace=False).tolist())
     made = begun_set(args, names, out, draw)
     (out / "labelled.txt").write_text("\n".join(names) + "\n")
-    sets = {"alone": "real", "begun": str(made), "then": "begun,real", "mixed": "begun+real"}
-    options = TrialOptions(real=f"{args.photographs}@{out / 'labelled.txt'}", numbers=[], seeds=1, seed=draw)
+    sets = {"alone": "real", "begun": f"{made}", "then": f"{made},real", "mixed": f"{made}+real"}
+    sets = {name: sets[name] for name in args.sets}
+    options = TrialOptions(real=f"{args.photographs}@{out / 'labelled.txt'}", numbers=[], seeds=args.seeds, seed=draw)
     found = trial(Path(f"{args.photographs}@{test}"), out / "trial", sets, options, workers=args.workers).record()
     return {
         name: {of: one["value"] for of, one in row["precision"]["AP50"].items()} for name, row in found["rows"].items()
     }
+
+
+def resampled(args: argparse.Namespace, test: Path, name: str) -> np.ndarray:
+    """``(1 + B,)`` the mean precision of a set over draws and seeds, then its resamples, the same for all sets."""
+    tested = read_labelled(Path(f"{args.photographs}@{test}"), None, lambda *_: None)
+    draws = drawn(len(tested.examples), args.draws, RESAMPLES, args.seed)
+    total = np.zeros(1 + RESAMPLES)
+    for number in range(args.draws):
+        files = [
+            args.out / f"draw-{number}" / "trial" / "trainings" / f"{name}-{s}.safetensors" for s in range(args.seeds)
+        ]
+        each = precisions(tested, [detections(file, len(tested.examples)) for file in files], draws)
+        (of_mean,) = (values for (of, measure), values in each.items() if of == MEAN and measure in MAIN)
+        seeds = drawn(1, args.seeds, RESAMPLES, args.seed + 1 + number).seeds  # (1 + B, S)
+        weight = draws.seeds[:, number] / draws.seeds.sum(1)
+        total += weight * (of_mean.T * seeds).sum(1) / seeds.sum(1)
+    return total
+
+
+def detections(file: Path, images: int) -> list[Detections]:
+    """What a training's detector found, by test image."""
+    found = load_file(file)
+    rows = [found["images"] == i for i in range(images)]
+    return [Detections(*(found[key][row] for key in ("boxes", "classes", "scores"))) for row in rows]
 
 
 def main():
@@ -98,9 +133,13 @@ def main():
     parser.add_argument("--labelled", type=int, default=20)
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--scenes", type=int, default=600)
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each set and draw")
+    parser.add_argument("--sets", nargs="+", default=SETS, choices=SETS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     args = parser.parse_args()
+    if args.sets[0] != "alone":
+        parser.error("expected --sets to begin with alone, which the others are compared with")
     tune_malloc()
     args.photographs = needed(args.photographs, "a labelled set of photographs by --photographs FOLDER")
     files = sorted((args.photographs / "images").iterdir())
@@ -113,12 +152,15 @@ def main():
         each.append(measured(args, draw, pool, args.out / "test.txt"))
         print(draw, json.dumps(each[-1]), flush=True)
         write_json(args.out / "results.json", each)
-    for name in ("begun", "then", "mixed"):
+    base = resampled(args, args.out / "test.txt", "alone")
+    for name in args.sets[1:]:
         more = 100 * np.array([rows[name]["mean"] - rows["alone"]["mean"] for rows in each])
         line = f"{name}: {more.mean():+.1f} points over the photographs alone"
         if len(more) > 1:
             half = student.ppf(0.975, len(more) - 1) * more.std(ddof=1) / len(more) ** 0.5
-            line += f" ({more.mean() - half:+.1f} to {more.mean() + half:+.1f})"
+            line += f" ({more.mean() - half:+.1f} to {more.mean() + half:+.1f}, t over draws)"
+        over = estimate(100 * (resampled(args, args.out / "test.txt", name) - base))
+        line += f" ({over.low:+.1f} to {over.high:+.1f}, bootstrap over photographs, draws and seeds)"
         print(line)
 
 
