@@ -160,13 +160,13 @@ class TiltingLearning(TrainingLoop):
     def why_not(self, site: Site) -> str:
         """Why a site is not learnt."""
         if site not in self.open_to:
-            return site.keeps or "it is of single objects, and none is labelled with a box"
+            return site.keeps or "it is of single objects, and no box of one is known"
         if not site.of_scene:
             return "labelled objects do not depend on it"
         if self.aspects[self.scene_sites.index(site)] < 0:
             return "the similarity of images does not depend on it"
         if self.objects is None:
-            return "sizes or places of objects go by it, and none is labelled with a box"
+            return "sizes or places of objects go by it, and no box of one is known"
         return "sizes or places of objects go by it, and labelled ones do not say which way"
 
     def run(self, callback: Callback | None = None) -> None:

@@ -27,6 +27,7 @@ from probscene.sampling import sample
 from probscene.threads import threads
 
 from ..chunks import CHUNK, chunk_randomness
+from ..fitting.given_boxes import given_boxes
 from ..fitting.outcome import feature_mask
 from ..fitting.pipeline import Progress
 from ..fitting.rendered_features import RenderedFeatures
@@ -39,7 +40,7 @@ from .components import VerdictComponents, verdict_components
 from .evaluate import Evaluation
 from .explain import label_images
 from .label_agreement import Agreement, agreement
-from .sizes import Sizes, given_boxes, sizes, with_sizes
+from .sizes import Sizes, sizes, with_sizes
 from .source_features import LEARNT, PRIOR, TARGET
 
 NUM_SCENES = 1000  # of the guide, and as many of the prior

@@ -15,8 +15,6 @@ import torch
 from numpy.typing import NDArray
 
 from probscene.dataset import Images
-from probscene.errors import DataError
-from probscene.inference.features.base import Detections
 from probscene.inference.statistics.residual import RESAMPLES, Grade, worst_grade
 from probscene.policy import Policy
 
@@ -25,8 +23,6 @@ from ..datasets.coco import labelled
 from ..fitting.box_margins import box_margins, without_margins
 from ..fitting.run import RunFolder
 from ..labels.boxes import Boxes
-from ..labels.detections import read_detections
-from ..labels.partial_labels import read_partial_labels
 from ..loading import renderer_for
 from .components import UNSURE, VerdictComponent, VerdictComponents
 
@@ -84,35 +80,6 @@ class Sizes(NamedTuple):
         given, prior, learnt = map(_text, (self.given, self.prior, self.learnt))
         room = f", without the labels' margin of {self.margin:.1f}" if self.margin else ""
         return f"{given} pixels in the images ({limits}{room}), {prior} in the prior, {learnt} learnt"
-
-
-def given_boxes(run: RunFolder, target: Images) -> Boxes | None:
-    """The boxes that the run was given with its labels, else with its readings; None where these were none, or are gone
-    by now.
-
-    Args:
-        target: the images that it was fitted to.
-    """
-    try:
-        if "labels" in run.record:
-            labels = read_partial_labels(run.record["labels"]["path"], run.model, target)
-            if labels.boxes is not None:
-                return labels.as_boxes
-        if "readings" in run.record:
-            return _found_boxes(run, read_detections(run.record["readings"]["path"], run.model, target).found)
-    except DataError:
-        pass
-    return None
-
-
-def _found_boxes(run: RunFolder, found: Detections) -> Boxes:
-    """Of the classes that detections count, from the score on from which they do."""
-    of_class = [run.readings["classes"][name] for name in run.model.classes]
-    least = np.array([record["min_score"] if record["readable"] else np.inf for record in of_class])
-    kept = found.score >= least[found.label]
-    box = torch.from_numpy(np.column_stack([found.label, found.box])).float()
-    each = tuple(box[kept & (found.image == row)] for row in range(found.images))
-    return Boxes(list(range(found.images)), each, run.model.classes)
 
 
 def sizes(

@@ -1,8 +1,9 @@
-"""Ways of learning parameters without a reader: by images as wholes, and by labelled objects. Axis letters: L images, K
+"""Ways of learning parameters without a reader: by images as wholes, and by objects in boxes. Axis letters: L images, K
 labelled ones, M boxes of one, C H W."""
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
@@ -22,6 +23,7 @@ from .rendered_features import RenderedFeatures
 from .run import RunFolder
 
 ImageLevelTraining = MetaSimLearning | TiltingLearning
+MAX_BOXED_IMAGES = 500
 
 
 def meta_sim_learning(
@@ -63,9 +65,11 @@ def tilting_learning(
 
 
 def labelled_objects(run: RunFolder, boxes: Boxes | None, images: Images) -> Objects | None:
-    """The objects of the target that are labelled with boxes; None where there are none."""
+    """The objects of the target that are in boxes, of at most ``MAX_BOXED_IMAGES``; None where there are none."""
     if boxes is None or not any(map(len, boxes.boxes)):
         return None
+    some = np.linspace(0, len(boxes.rows) - 1, min(len(boxes.rows), MAX_BOXED_IMAGES)).round().astype(int)
+    boxes = boxes._replace(rows=[boxes.rows[i] for i in some], boxes=tuple(boxes.boxes[i] for i in some))
     number = torch.tensor([run.model.classes.index(name) for name in boxes.classes])
     label = [number[found[:, 0].long()] for found in boxes.boxes]
     pictures = torch.stack([images.load(row) for row in boxes.rows])

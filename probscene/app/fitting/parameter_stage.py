@@ -25,10 +25,10 @@ from probscene.inference.training import Training, batch_seed
 from probscene.sampling import seed_everything
 from probscene.scenarios import JointGrammar
 
-from ..labels.partial_labels import PartialLabels
 from ..progress import Progress
 from .box_margins import box_margins, margins_said, without_margins
 from .config import LIKELIHOOD
+from .given_boxes import given_boxes
 from .image_level import ImageLevelTraining, labelled_objects, meta_sim_learning, sites_record, tilting_learning
 from .learnt_parameters import NAME, prefixed, with_parameters
 from .plugins import inner
@@ -48,7 +48,6 @@ def learn_parameters(
     net: FeatureNet,
     guide: Guide,
     images: Callable[[], Images],
-    labels: PartialLabels | None,
     progress: Progress,
     say: Callable[[str], None],
 ) -> None:
@@ -58,7 +57,6 @@ def learn_parameters(
         net: what structure was learnt by.
         guide: of the structures; its scenes are rendered.
         images: opens the target.
-        labels: of some of its images.
         say: is told which sites were learnt.
 
     Raises:
@@ -94,7 +92,7 @@ def learn_parameters(
             learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
         else:
             assert isinstance(schedule, TiltingSchedule)
-            boxes = None if labels is None else labels.as_boxes
+            boxes = given_boxes(run, target)
             margins = {} if boxes is None else box_margins(run.model, boxes, target)
             if boxes is not None and margins:
                 say(margins_said(margins))

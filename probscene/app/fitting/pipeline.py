@@ -129,7 +129,7 @@ def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, clust
             guide = learn_structure(run, observer, net.net, real, show, cluster)
             if run.config.parameters is not None:
                 with threads(run.record["threads"]):
-                    learn_parameters(run, observer, net.net, guide, images, begun.labels, show, show.say)
+                    learn_parameters(run, observer, net.net, guide, images, show, show.say)
                 refine_structure(run, net.net, real, guide, images, show, cluster)
             message = conclude(run, observer, net.net, real[: len(images())], guide, begun.labels, show)
     for name in (f"{FIRST}-checkpoint", f"{REFINEMENT}-checkpoint", READER):

@@ -21,11 +21,11 @@ from ..chunks import chunk_randomness
 from ..evaluation.diagnose import FitDiagnostics, diagnose
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.labels import TargetLabels
-from ..evaluation.sizes import given_boxes
 from ..evaluation.source_features import LEARNT, PRIOR, STRUCTURE, policies
 from ..evaluation.sources import ESTIMATE, READ, START, baseline_policies
 from ..evaluation.visible import Visible
 from ..files import make_folder, write_text
+from ..fitting.given_boxes import given_boxes
 from ..fitting.pipeline import open_target
 from ..fitting.run import RunFolder
 from ..fitting.store import OTHER, timing

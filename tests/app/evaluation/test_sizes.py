@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.evaluation.components import KINDS, VerdictComponent, VerdictComponents
-from probscene.app.evaluation.sizes import NUM_SCENES, BoxSizes, _medians, compare_sizes, given_boxes, sizes, with_sizes
+from probscene.app.evaluation.sizes import NUM_SCENES, BoxSizes, _medians, compare_sizes, sizes, with_sizes
+from probscene.app.fitting.given_boxes import given_boxes
 from probscene.dataset import ImageFolder
 from probscene.drawing import Sprites
 from probscene.grammar import Grammar

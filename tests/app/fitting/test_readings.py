@@ -8,7 +8,8 @@ import pytest
 
 import probscene as ps
 from probscene.app.datasets.generate import generate_scenes
-from probscene.app.evaluation.sizes import given_boxes
+from probscene.app.fitting import parameter_stage
+from probscene.app.fitting.given_boxes import given_boxes
 from probscene.app.fitting.pipeline import open_target
 from probscene.app.fitting.run import RunFolder
 from probscene.app.labels.detections import read_detections
@@ -78,6 +79,17 @@ def test_sizes_are_judged_by_the_boxes_that_were_found(fitted):
     del run.record["labels"]
     boxes = given_boxes(run, target)
     assert len(boxes.boxes) == len(target) and boxes.counts.sum() == run.read_tensors("real")["features"][:, 2].sum()
+
+
+def test_parameters_are_learnt_from_the_boxes_that_were_found(call, discs, found, tmp_path, monkeypatch):
+    measured, seen = parameter_stage.labelled_objects, []
+    monkeypatch.setattr(parameter_stage, "labelled_objects", lambda *a: seen.append(measured(*a)) or seen[-1])
+    small = [word for key in ("rounds=1", "first=50", "scenes=20", "steps=2") for word in ("--set", f"parameters.{key}")]
+    words = ("--readings", found.found, "--learn", "structure,parameters", "--parameters", "tilting", *small)
+    done = call("fit", discs.file, "--target", found.images, "--out", tmp_path / "run", *words, *QUICK[2:])
+    assert done.code == 0, done.err
+    (objects,) = seen
+    assert objects.images == 80 and len(objects.label) == len(found.all["annotations"])
 
 
 def test_a_run_goes_on_with_the_same_readings_alone(fitted, call, found, tmp_path):

@@ -67,8 +67,8 @@ def test_a_run_keeps_what_it_has_learnt(fitted):
     run = RunFolder.at(fitted)
     assert run.config.parameter_method == run.parameters["method"] == "tilting"
     assert [(site["name"], site["learnt"], site["because"]) for site in run.parameters["sites"]] == [
-        ("x", False, "it is of single objects, and none is labelled with a box"),
-        ("y", False, "it is of single objects, and none is labelled with a box"),
+        ("x", False, "it is of single objects, and no box of one is known"),
+        ("y", False, "it is of single objects, and no box of one is known"),
         ("light", True, ""),
     ]
     assert run.parameters["kept"] == "learnt" and isinstance(run.guide.with_parameters.__self__, ParameterGuide)
