@@ -52,7 +52,8 @@ class MarginEstimate(NamedTuple):
 
     Attributes:
         scale: how many times.
-        pixels: on each side, of the median box; ``low`` and ``high`` its 90 % limits, of a bootstrap over images.
+        pixels: on each side, of the median box; ``low`` and ``high`` its 90 % limits, of a bootstrap over images of both
+            sides.
     """
 
     scale: float
@@ -83,13 +84,10 @@ def estimate_margin(labels: EdgeProfiles, renders: EdgeProfiles, label: int) -> 
     own, there = labels.label == label, renders.label == label
     if min(own.sum(), there.sum()) < MIN_BOXES:
         return None
-    touching, image = renders.contrast[there].mean(0), labels.image[own]
-    numbers = np.unique(image)
-    each = np.stack([labels.contrast[own][image == i].sum(0) for i in numbers])
-    boxes = np.array([(image == i).sum() for i in numbers])
-    weight = np.random.default_rng(0).multinomial(len(numbers), np.full(len(numbers), 1 / len(numbers)), RESAMPLES)
-    weight = np.concatenate([np.ones((1, len(numbers)), np.int64), weight])  # (1 + B, images)
-    scale, explained = _scales((weight @ each) / (weight @ boxes)[:, None], touching)
+    rng = np.random.default_rng(0)
+    sides = [_resampled(each.image[of], each.contrast[of], rng) for each, of in ((labels, own), (renders, there))]
+    found = np.array([_scale(contrast, touching) for contrast, touching in zip(*sides, strict=True)])
+    scale, explained = found.T
     pixels = np.median(labels.side[own]) * (1 - 1 / scale) / 2
     low, high = np.quantile(pixels[1:], [0.05, 0.95])
     if explained[0] < MIN_EXPLAINED or pixels[0] < MIN_MARGIN or low <= 0:
@@ -97,21 +95,28 @@ def estimate_margin(labels: EdgeProfiles, renders: EdgeProfiles, label: int) -> 
     return MarginEstimate(float(scale[0]), float(pixels[0]), float(low), float(high))
 
 
-def _scales(contrast: Array, touching: Array) -> tuple[Array, Array]:
-    """``(B,)`` of contrasts ``(B, R)``: by how much each is wider than ``touching (R,)``, and the share of its variance
-    that is explained by that."""
+def _resampled(image: NDArray[np.int64], contrast: Array, rng: np.random.Generator) -> Array:
+    """``(1 + B, R)`` the mean of all contrasts ``(n, R)``, then those of resamples of the images."""
+    numbers, row = np.unique(image, return_inverse=True)
+    total = np.zeros((len(numbers), contrast.shape[1]))
+    np.add.at(total, row, contrast)
+    boxes = np.bincount(row)
+    drawn = rng.multinomial(len(numbers), np.full(len(numbers), 1 / len(numbers)), RESAMPLES)
+    weight = np.concatenate([np.ones((1, len(numbers)), np.int64), drawn])
+    return (weight @ total) / (weight @ boxes)[:, None]
+
+
+def _scale(contrast: Array, touching: Array) -> tuple[float, float]:
+    """By how much a contrast ``(R,)`` is wider than ``touching (R,)``, and the share of its variance that this
+    explains."""
     radius = (np.arange(RINGS) + 0.5) * REACH / RINGS
     used = radius < USED
-    y = contrast[:, used] - contrast[:, used].mean(1, keepdims=True)
-    whole = np.maximum(np.square(y).sum(1), 1e-12)
-    explained = np.zeros((len(SCALES), len(contrast)))
-    for number, scale in enumerate(SCALES):
-        x = np.interp(scale * radius[used], radius, touching)
-        x -= x.mean()
-        common = y @ x
-        explained[number] = np.where(common > 0, np.square(common) / max(np.square(x).sum(), 1e-12), 0.0) / whole
-    best = explained.argmax(0)
-    return SCALES[best], explained[best, np.arange(len(contrast))]
+    x = np.interp(SCALES[:, None] * radius[used], radius, touching)
+    x, y = x - x.mean(1, keepdims=True), contrast[used] - contrast[used].mean()
+    common = (x @ y).clip(min=0)  # a negative gain is none
+    explained = np.square(common) / np.maximum(np.square(x).sum(1) * np.square(y).sum(), 1e-12)
+    best = explained.argmax()
+    return float(SCALES[best]), float(explained[best])
 
 
 def _whole(box: Tensor, label: Tensor, shape: torch.Size) -> Tensor:

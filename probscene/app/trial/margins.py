@@ -26,7 +26,7 @@ def looser(
         made: generated images, whose boxes have a ``margin``, see ``checked_box_margin``.
         value_range: of photographs of 16 bits.
     """
-    own, generated = _profiles(photographs, value_range), _profiles(made)
+    own, generated = set_profiles(photographs, value_range), set_profiles(made)
     given = dict.fromkeys(made.classes, margin) if isinstance(margin, int) else margin
     scale = math.sqrt(math.prod(made.examples[0].size) / math.prod(photographs.examples[0].size))
     found = {name: estimate_margin(own, generated, number) for number, name in enumerate(made.classes)}
@@ -44,7 +44,8 @@ def looser(
     )
 
 
-def _profiles(found: LabelledSet, value_range: tuple[float, float] | None = None) -> EdgeProfiles:
+def set_profiles(found: LabelledSet, value_range: tuple[float, float] | None = None) -> EdgeProfiles:
+    """Of at most ``MAX_IMAGES`` images of a set."""
     parts = []
     for number, example in enumerate(found.examples[:MAX_IMAGES]):
         image = torch.from_numpy(read_rgb(example.path, value_range)).permute(2, 0, 1)

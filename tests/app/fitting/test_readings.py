@@ -84,7 +84,9 @@ def test_sizes_are_judged_by_the_boxes_that_were_found(fitted):
 def test_parameters_are_learnt_from_the_boxes_that_were_found(call, discs, found, tmp_path, monkeypatch):
     measured, seen = parameter_stage.labelled_objects, []
     monkeypatch.setattr(parameter_stage, "labelled_objects", lambda *a: seen.append(measured(*a)) or seen[-1])
-    small = [word for key in ("rounds=1", "first=50", "scenes=20", "steps=2") for word in ("--set", f"parameters.{key}")]
+    small = [
+        word for key in ("rounds=1", "first=50", "scenes=20", "steps=2") for word in ("--set", f"parameters.{key}")
+    ]
     words = ("--readings", found.found, "--learn", "structure,parameters", "--parameters", "tilting", *small)
     done = call("fit", discs.file, "--target", found.images, "--out", tmp_path / "run", *words, *QUICK[2:])
     assert done.code == 0, done.err
