@@ -52,8 +52,8 @@ class MarginEstimate(NamedTuple):
 
     Attributes:
         scale: how many times.
-        pixels: on each side, of the median box; ``low`` and ``high`` its 90 % limits, of a bootstrap over images of both
-            sides.
+        pixels: on each side, of the median box; ``low`` and ``high`` its 90 % limits, of a bootstrap over the images of
+            labels and renders.
     """
 
     scale: float

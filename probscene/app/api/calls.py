@@ -33,6 +33,7 @@ from ..workers.processes import end_if_starting
 if TYPE_CHECKING:
     from ..detectors.folder import TrainedDetector
     from ..detectors.predict import Predictions
+    from ..detectors.source_comparison import SourceComparison
     from ..detectors.train import TrainOptions
     from ..trial.results import Results
     from ..trial.trial import TrialOptions
@@ -259,6 +260,24 @@ def train(
     with display(progress) as show:
         options = options or training.TrainOptions()
         return training.train(source, real, labels, Path(out), options, workers=workers, show=show, callback=show.say)
+
+
+def compare_sources(run: RunFolder, *, progress: bool = True) -> "SourceComparison | None":
+    """Find out whether a detector is better for what was learnt: small ones are trained on each source of the run, and
+    what they count in photographs of its target is compared with what the fit reads there. ``train`` takes the best.
+    Learnt parameters are given back where detectors are better with the prior's.
+
+    Returns:
+        what was found; None where nothing was learnt, or nothing can be read in the photographs.
+
+    Raises:
+        ProbsceneError: the fit is not finished, or its target cannot be read.
+    """
+    end_if_starting()
+    from ..detectors.source_comparison import compare_and_keep  # torchvision takes seconds to import
+
+    with display(progress) as show:
+        return compare_and_keep(run, open_target(run, show), show, show.say)
 
 
 def predict(

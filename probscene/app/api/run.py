@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from probscene.batch import RenderBatch
 from probscene.inference.divergence import Divergence
@@ -23,6 +23,9 @@ from ..fitting.run import RunFolder
 from ..fitting.store import check_free
 from ..targets import Target, TargetImages
 from . import calls
+
+if TYPE_CHECKING:
+    from ..detectors.source_comparison import SourceComparison
 
 
 class Run(RunFolder):
@@ -97,6 +100,10 @@ class Run(RunFolder):
     ) -> Evaluation:
         """Compare what was learnt with the target, see ``evaluate``."""
         return calls.evaluate(self, target, labels, **options)
+
+    def compare_sources(self, *, progress: bool = True) -> "SourceComparison | None":
+        """Compare what a detector learns from the prior and from the fit, see ``compare_sources``."""
+        return calls.compare_sources(self, progress=progress)
 
     def report(self, out: Path | str | None = None, **options: Any) -> Path:
         """Write an HTML page about the run, see ``report``."""

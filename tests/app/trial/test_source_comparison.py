@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import probscene as ps
 from probscene.app.datasets.generate import DatasetOptions
 from probscene.app.detectors import source_comparison
 from probscene.app.detectors.source_comparison import RESULT, DetectorBudget, compare_sources, count_agreement
@@ -134,6 +135,17 @@ def test_a_detector_is_trained_on_the_best_source(fitted, photographs, tmp_path,
     learnt = train(run, photographs / "train", None, tmp_path / "learnt", small_options())
     assert learnt.record["source"] == "learnt" and counters.trained == trained
     assert learnt.record["weights_sha256"] != own.record["weights_sha256"]
+
+
+def test_a_run_keeps_what_was_found(fitted, tmp_path, counters, monkeypatch, call):
+    monkeypatch.setattr("probscene.app.api.calls.open_target", lambda run, show: Black())
+    counters.right |= {"learnt": 0.4, "prior": 0.9}
+    run = ps.Run.open(shutil.copytree(fitted, tmp_path / "run"))
+    found = run.compare_sources(progress=False)
+    assert found is not None and found.source == "prior" and ps.Run.open(run.path).sources == found.record()
+    monkeypatch.setattr(source_comparison, "_reading", lambda run, images: None)
+    assert run.compare_sources(progress=False) is None
+    assert call("fit", "--resume", "--out", run.path, "--detector-test").code == 0  # it has been compared
 
 
 class Black:
