@@ -193,8 +193,8 @@ def train(
             DatasetOptions(min_visible=options.min_visible, box_margin=options.box_margin),
             seed,
         )
-        source, compared = _chosen(origin, options.source, budget, out, show, callback)
-        _generate(origin, source, out / GENERATED, options, workers, show)
+        chosen, compared = _chosen(origin, options.source, budget, out, show, callback)
+        _generate(origin, chosen, out / GENERATED, options, workers, show)
         made = read_labelled(out / GENERATED, names, show)
         if tested is not None:
             check_apart(GENERATED, made, tested)
@@ -202,7 +202,7 @@ def train(
         if photographs is not None and (note := looser(photographs, made, margin, used)):
             callback(note)
         job = _Job(out, settings, options, recipe, made, photographs, tested, size, used)
-        found = {"source": source, "sources": compared}
+        found = {"source": chosen, "sources": compared}
         write_json(out / RECORD, job.run(show) | found)  # last: with it the detector is there
     for name in (SETTINGS, CHECKPOINT, COMPARED):
         (out / name).unlink(missing_ok=True)
