@@ -40,7 +40,11 @@ MAX_PHOTOGRAPHS = 300
 SCORES = np.linspace(0.05, 0.9, 35)
 MIN_SD = 0.05  # objects, of what is read of a class: with less, all photographs read alike
 FIRST = ("learnt", "prior")  # others are tested only where the prior is better than what was learnt
-NUM_IMAGES, MIN_VISIBLE = 300, 0.2  # generated for each detector; of an object that is labelled
+NUM_IMAGES, MIN_VISIBLE, SEEDS = (
+    300,
+    0.2,
+    2,
+)  # generated for each detector; of a labelled object; of ``compare_and_keep``
 RESULT = "agreement.json"
 
 Array = NDArray[np.float64]
@@ -55,7 +59,8 @@ class DetectorBudget(NamedTuple):
         size: height and width at which images come.
         images: generated for each.
         dataset: how they are labelled.
-        seed: of the images, the initialisation and the order.
+        seed: of the images, the first initialisation and its order.
+        seeds: detectors of each source.
     """
 
     detector: str
@@ -64,29 +69,35 @@ class DetectorBudget(NamedTuple):
     images: int
     dataset: DatasetOptions
     seed: int
+    seeds: int = 1
 
 
 class SourceComparison(NamedTuple):
     """What was found.
 
     Attributes:
-        source: the best of those that were compared.
-        agreement: by source, -1 to 1.
+        source: the best of those that were compared, in the mean over seeds.
+        agreement: by source, of each seed, -1 to 1.
         classes: that were compared.
         photographs: how many.
     """
 
     source: str
-    agreement: dict[str, float]
+    agreement: dict[str, list[float]]
     classes: tuple[str, ...]
     photographs: int
+
+    def is_better(self, source: str, other: str) -> bool:
+        """Whether one source that was compared agrees better than another, with every seed."""
+        both = self.agreement.get(source, []), self.agreement.get(other, [])
+        return bool(both[0]) and all(a > b for a, b in zip(*both, strict=True))
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
         return {**self._asdict(), "classes": list(self.classes)}
 
     def __str__(self) -> str:
-        figures = ", ".join(f"{name} {value:.3f}" for name, value in self.agreement.items())
+        figures = ", ".join(f"{name} {np.mean(values):.3f}" for name, values in self.agreement.items())
         return (
             f"Detectors that were trained on each source count {', '.join(self.classes)} in {self.photographs} "
             f"photographs. Correlation with what the fit reads there: {figures}. Best: {self.source}."
@@ -112,30 +123,31 @@ def compare_sources(
         return None
     classes, rows, read = reading
     make_folder(into)
-    file, agreement = into / RESULT, dict[str, float]()
+    file, agreement = into / RESULT, dict[str, list[float]]()
     if file.is_file():
         agreement = json.loads(file.read_text(encoding="utf-8"))
-    shown = 0
+    each, wanted, shown = budget.recipe.num_images + len(rows), len(FIRST), 0
 
     def more(number: int) -> None:
         nonlocal shown
         shown += number
-        show("training", shown, budget.recipe.num_images * wanted)
+        show("training", shown, each * wanted * budget.seeds)
 
-    wanted = len(FIRST)
     for source in (*FIRST, *(name for name in sources if name not in FIRST)):
-        if source not in FIRST and agreement["learnt"] >= agreement["prior"]:
+        if source not in FIRST and np.mean(agreement["learnt"]) >= np.mean(agreement["prior"]):
             break
         wanted = len(FIRST) if source in FIRST else len(sources)
-        if source in agreement:
-            more(budget.recipe.num_images)
-            continue
-        count = _trained(run, source, budget, into / source, more)
-        found = np.stack([count(pixels(images.load(row)[None])[0], classes) for row in rows], 1)
-        agreement[source] = count_agreement(found, read)
-        write_json(file, agreement)
+        done = agreement.setdefault(source, [])
+        more(each * len(done))
+        for seed in range(budget.seed + len(done), budget.seed + budget.seeds):
+            count, found = _trained(run, source, budget._replace(seed=seed), into / f"{source}-{seed}", more), []
+            for row in rows:
+                found.append(count(pixels(images.load(row)[None])[0], classes))
+                more(1)
+            done.append(count_agreement(np.stack(found, 1), read))
+            write_json(file, agreement)
     shutil.rmtree(into)
-    best = max(agreement, key=lambda name: agreement[name])
+    best = max(agreement, key=lambda name: np.mean(agreement[name]))
     return SourceComparison(best, agreement, classes, len(rows))
 
 
@@ -157,14 +169,14 @@ def compare_and_keep(
     recipe = recipe._replace(iterations=recipe.iterations // 2)
     dataset = DatasetOptions(min_visible=MIN_VISIBLE)
     budget = DetectorBudget(
-        "efficientnet", recipe, size_for([run.model.canvas]), NUM_IMAGES, dataset, run.record["seed"]
+        "efficientnet", recipe, size_for([run.model.canvas]), NUM_IMAGES, dataset, run.record["seed"], SEEDS
     )
     found = compare_sources(run, images, budget, run.path / "sources", show)
     if found is None:
         say("Sources are not compared by detectors: nothing was learnt, or nothing can be read in the photographs.")
         return None
     say(str(found))
-    if found.agreement.get("structure", -1.0) > found.agreement["learnt"]:
+    if found.is_better("structure", "learnt"):
         run.give_back_parameters("detectors count better when they are trained on scenes with the prior's")
         say("All sites keep the prior, as detectors count better with it.")
         found = found._replace(source="learnt" if found.source == "structure" else found.source)

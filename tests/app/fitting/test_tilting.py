@@ -106,7 +106,7 @@ def test_structure_and_parameters_can_be_drawn_each_for_itself(fitted):
 @pytest.mark.parametrize("better", ["learnt", "structure", "prior"])
 def test_parameters_are_given_back_where_detectors_are_better_without(fitted, tmp_path, monkeypatch, better):
     run = RunFolder.at(shutil.copytree(fitted, tmp_path / "run"))
-    agreement = {"learnt": 0.5, "prior": 0.4} | ({} if better == "learnt" else {"structure": 0.6, better: 0.7})
+    agreement = {"learnt": [0.5], "prior": [0.4]} | ({} if better == "learnt" else {"structure": [0.6], better: [0.7]})
     found = SourceComparison(max(agreement, key=agreement.get), agreement, ("red",), 9)
     monkeypatch.setattr(source_comparison, "compare_sources", lambda *_: found)
     before, told = run.guide_hash(), []

@@ -103,11 +103,21 @@ def test_a_comparison_goes_on_after_an_interruption(counters, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         compare_sources(stub("prior", "learnt"), Black(), BUDGET, work, stopping)
     assert json.loads((work / RESULT).read_text()).keys() == {"learnt"}
-    shutil.rmtree(work / "prior")
+    shutil.rmtree(work / "prior-0")
     found = compare_sources(stub("prior", "learnt"), Black(), BUDGET, work, silent)
     assert counters.trained == ["learnt", "prior", "prior"] and found.source == "learnt"
     whole = compare_sources(stub("prior", "learnt"), Black(), BUDGET, work, silent)
-    assert whole == found and shown == [(4, 8), (8, 8)]
+    assert whole == found and shown[-1] == (58, 108)  # of 4 images and 50 photographs each
+
+
+def test_one_source_is_better_than_another_where_it_is_with_every_seed(counters, tmp_path):
+    counters.right |= {"learnt": 0.4, "prior": 0.9}
+    found = compare_sources(stub("prior", "learnt"), Black(), BUDGET._replace(seeds=3), tmp_path / "work", silent)
+    assert counters.trained == ["learnt"] * 3 + ["prior"] * 3 and found.source == "prior"
+    assert found.is_better("prior", "learnt") and not found.is_better("learnt", "prior")
+    assert not found.is_better("structure", "learnt")
+    mixed = found._replace(agreement={"prior": [0.9, 0.5], "learnt": [0.4, 0.6]})
+    assert not mixed.is_better("prior", "learnt") and not mixed.is_better("learnt", "prior")
 
 
 def test_detectors_of_a_run_are_trained_and_compared_the_same_each_time(fitted, tmp_path):
@@ -115,7 +125,7 @@ def test_detectors_of_a_run_are_trained_and_compared_the_same_each_time(fitted, 
     images = open_target(run, Display())
     one, two = (compare_sources(run, images, BUDGET, tmp_path / name, silent) for name in "ab")
     assert one is not None and one == two and one.agreement.keys() == {"learnt", "prior"}
-    assert one.classes == ("red", "blue") and all(-1 <= value <= 1 for value in one.agreement.values())
+    assert one.classes == ("red", "blue") and all(-1 <= value <= 1 for (value,) in one.agreement.values())
     run.guide = run.model.prior
     assert compare_sources(run, images, BUDGET, tmp_path / "c", silent) is None
 
