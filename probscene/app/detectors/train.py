@@ -31,6 +31,7 @@ from probscene.threads import threads
 
 from ..arguments import BoxMargin, checked_box_margin, checked_seed, positive
 from ..chunks import chunk_randomness
+from ..datasets.coco import check_margin_classes
 from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_whole
 from ..fitting.pipeline import open_target
@@ -156,6 +157,7 @@ def train(
             f"expected classes of model {model.name!r} ({', '.join(model.classes)}), got {', '.join(unknown)}; name "
             "some of its own by --classes."
         )
+    check_margin_classes(model, checked_box_margin(options.box_margin))
     photographs, tested = _photographs(real, labels, names, options, show)
     given = [found for found in (photographs, tested) if found is not None]
     for note in dict.fromkeys(note for found in given for note in found.notes):

@@ -3,7 +3,6 @@ labelled ones, M boxes of one, C H W."""
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
@@ -68,8 +67,7 @@ def labelled_objects(run: RunFolder, boxes: Boxes | None, images: Images) -> Obj
     """The objects of the target that are in boxes, of at most ``MAX_BOXED_IMAGES``; None where there are none."""
     if boxes is None or not any(map(len, boxes.boxes)):
         return None
-    some = np.linspace(0, len(boxes.rows) - 1, min(len(boxes.rows), MAX_BOXED_IMAGES)).round().astype(int)
-    boxes = boxes._replace(rows=[boxes.rows[i] for i in some], boxes=tuple(boxes.boxes[i] for i in some))
+    boxes = boxes.some(MAX_BOXED_IMAGES)
     number = torch.tensor([run.model.classes.index(name) for name in boxes.classes])
     label = [number[found[:, 0].long()] for found in boxes.boxes]
     pictures = torch.stack([images.load(row) for row in boxes.rows])

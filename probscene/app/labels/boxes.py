@@ -42,6 +42,12 @@ class Boxes(NamedTuple):
     notes: tuple[str, ...] = ()
     scores: tuple[Tensor, ...] | None = None
 
+    def some(self, most: int) -> "Boxes":
+        """Those of at most so many of the images, evenly spread."""
+        at = np.linspace(0, len(self.rows) - 1, min(len(self.rows), most)).round().astype(int).tolist()
+        scores = None if self.scores is None else tuple(self.scores[i] for i in at)
+        return self._replace(rows=[self.rows[i] for i in at], boxes=tuple(self.boxes[i] for i in at), scores=scores)
+
     @property
     def counts(self) -> NDArray[np.int64]:
         """``(K, C)``."""

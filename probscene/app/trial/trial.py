@@ -22,6 +22,7 @@ from probscene.dataset import range_of
 from probscene.errors import DataError, ProbsceneError, RunError
 
 from ..arguments import BoxMargin, checked_box_margin, checked_seed, positive
+from ..datasets.coco import check_margin_classes
 from ..datasets.generate import DatasetOptions, generate, generate_scenes
 from ..files import make_folder, write_json, write_text
 from ..fitting.run import GENERATED_SOURCES, RunFolder
@@ -184,6 +185,7 @@ def trial(
     check(planned, loaded, tested, set(known) - {REAL})
     if generated is not None:
         _check_classes(generated, names, same)
+        check_margin_classes(generated.opened.model, checked_box_margin(generated.box_margin))
         if (file := model_file(generated.opened)) is not None:
             check_not_cut_out(file, tested)
     size = options.size or size_for(example.size for example in tested.examples)

@@ -18,6 +18,7 @@ from ..loading import renderer_for
 from ..pictures import Pixels, pixels
 
 NUM_SCENES = 192  # of a policy
+MAX_IMAGES = 500  # of the target
 NUM_CROPS = 12  # of a class
 AROUND = 1.3  # times the side of the largest object that is shown
 MIN_CROP = 12  # pixels
@@ -61,6 +62,7 @@ def object_crops(
 
 
 def _of_target(run: RunFolder, target: Images, boxes: Boxes) -> _Found:
+    boxes = boxes.some(MAX_IMAGES)
     images = [pixels(target.load(row)[None])[0] for row in boxes.rows]
     number = torch.tensor([run.model.classes.index(name) for name in boxes.classes])
     every = torch.cat([*boxes.boxes, torch.zeros(0, 5)])

@@ -5,6 +5,8 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from probscene.app.datasets.generate import DatasetOptions, generate_scenes
 from probscene.app.fitting.box_margins import box_margins, margins_said, without_margins
@@ -53,3 +55,13 @@ def test_images_without_a_box_have_no_margin(tmp_path):
     boxes = Boxes([0, 1], (torch.zeros(0, 5), torch.zeros(0, 5)), ("red", "blue"))
     assert box_margins(dots(6.0), boxes, None) == {}
     assert without_margins(boxes, {}) is boxes
+
+
+@given(st.integers(0, 30), st.integers(1, 40))
+def test_some_of_the_images_keep_their_boxes(number, most):
+    each = tuple(torch.full((1, 5), float(i)) for i in range(number))
+    some = Boxes(list(range(100, 100 + number)), each, ("red",), scores=each).some(most)
+    assert len(some.rows) == len(set(some.rows)) == min(number, most) and some.rows == sorted(some.rows)
+    assert (
+        [int(box[0, 0]) + 100 for box in some.boxes] == [int(score[0, 0]) + 100 for score in some.scores] == some.rows
+    )
