@@ -17,7 +17,7 @@ from ..labels.boxes import Boxes
 from ..loading import renderer_for
 from ..pictures import Pixels, pixels
 
-NUM_SCENES = 192  # of a policy
+NUM_SCENES = 128  # of a policy
 MAX_IMAGES = 500  # of the target
 NUM_CROPS = 12  # of a class
 AROUND = 1.3  # times the side of the largest object that is shown
