@@ -6,7 +6,6 @@ import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
-from scipy.stats import spearmanr
 
 from probscene.app.datasets.generate import generate_scenes
 from probscene.app.labels.boxes import read_boxes
@@ -60,7 +59,8 @@ def test_crops_of_a_class_have_one_scale_and_go_from_small_to_large(target):
             middle = crops.images[0].shape[0] // 2
             assert all(image[middle, middle].argmax() == COLOURS[name] for image in crops.images)
             covered = [(image[..., COLOURS[name]] > image[..., 2 - COLOURS[name]]).sum() for image in crops.images]
-            assert spearmanr(covered, np.arange(len(covered))).statistic > 0.9
+            small, middling, large = np.array(covered).reshape(3, -1).mean(1)  # boxes of equal area come in any order
+            assert small < middling < large
 
 
 def test_what_has_no_object_has_no_crop(target):
