@@ -64,5 +64,6 @@ def _of_prior(model: SceneModel) -> EdgeProfiles:
     for chunk in range(NUM_SCENES // CHUNK):
         batch = render(draw_chunk(model, model.prior, 0, chunk).drawing)
         image = grey(batch.image) if model.channels == 1 else batch.image
-        parts.append(edge_profiles(image, batch.box.float(), classes[batch.kind].masked_fill(batch.pixels == 0, -1)))
+        part = edge_profiles(image, batch.box.float(), classes[batch.kind].masked_fill(batch.pixels == 0, -1))
+        parts.append(part._replace(image=part.image + chunk * CHUNK))
     return EdgeProfiles(*map(np.concatenate, zip(*parts, strict=True)))
