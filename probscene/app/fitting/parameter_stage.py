@@ -20,7 +20,6 @@ from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
 from probscene.inference.parameters.reader_counts import counting_state
 from probscene.inference.parameters.schedule import ParameterSchedule
 from probscene.inference.parameters.tilting.schedule import TiltingSchedule
-from probscene.inference.statistics.box_margin import MarginEstimate
 from probscene.inference.training import Training, batch_seed
 from probscene.sampling import seed_everything
 from probscene.scenarios import JointGrammar
@@ -74,7 +73,7 @@ def learn_parameters(
         )
         say(f"Position and appearance keep the prior: {why}.")
         return
-    kept, margins = run.read_tensors(NAME), dict[str, MarginEstimate]()
+    kept = run.read_tensors(NAME)
     if kept is None:
         target = images()
         held = torch.arange(len(target)) % HELD == HELD - 1
@@ -110,9 +109,7 @@ def learn_parameters(
         if isinstance(learning, ParameterLearning) and isinstance(backbone, RenderBackbone):
             run.write_tensors(READER, counting_state(learning.calibrated.reader))
         kept = {} if learning.guide is None else {**learning.guide.net.state_dict()}
-        record = _record(run, guide, learning, _some(target, held, MAX_HELD_OUT))
-        found = {"box_margins": {name: margin._asdict() for name, margin in margins.items()}} if margins else {}
-        run.write_parameters(record | found)
+        run.write_parameters(_record(run, guide, learning, _some(target, held, MAX_HELD_OUT)))
         run.write_tensors(NAME, kept)
         (run.path / f"{NAME}-checkpoint.safetensors").unlink(missing_ok=True)
     say(_said(run.parameters))
