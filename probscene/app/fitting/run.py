@@ -280,8 +280,11 @@ class RunFolder(Storage):
             return self.model.prior
         if source == "start":
             return self.model.pretraining_policy
-        structures = self.model.prior if source == "parameters" else self.guide
-        return _with_parameters_of(structures, None if source == "structure" else self.guide)
+        if source == "learnt":
+            return self.guide
+        found = copy.copy(self.model.prior if source == "parameters" else self.guide)
+        found.with_parameters = self.guide.with_parameters if source == "parameters" else None
+        return found
 
     def generated_sources(self) -> tuple[str, ...]:
         """Those of ``GENERATED_SOURCES`` that are no copy of another.
@@ -336,13 +339,6 @@ class RunFolder(Storage):
                 f"expected the {what} file {file} as it was when {self.path} was fitted, got a missing or changed "
                 f"file. {kept or 'Put it back, or fit again.'}"
             )
-
-
-def _with_parameters_of(policy: Policy, other: Policy | None) -> Policy:
-    """The same policy of structures, whose scenes have another's parameters; the prior's where None."""
-    found = copy.copy(policy)
-    found.with_parameters = None if other is None else other.with_parameters
-    return found
 
 
 def _is_ours(part: Any) -> bool:
