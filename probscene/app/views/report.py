@@ -222,8 +222,8 @@ def _parts(found: FitDiagnostics | None, images: Images | None) -> str:
 
 def _objects(run: RunFolder, images: Images | None, boxes: Boxes | None) -> str:
     """Crops of each class, a row of each source."""
-    sources = {caption.partition(":")[0]: policy for caption, policy in _sources(run).items()}
-    shown = {name: policy for name, policy in sources.items() if name in ("Prior", "Learnt")}
+    prior, learnt = run.model.prior, run.guide
+    shown = {"prior": prior} | ({} if learnt is prior else {"learnt": learnt})
     if images is not None and boxes is None:
         boxes = given_boxes(run, images)
     parts = []
