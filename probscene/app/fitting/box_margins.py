@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-from torch.nn.utils.rnn import pad_sequence
 
 from probscene.dataset import Images, grey
 from probscene.inference.features.base import class_table
@@ -13,6 +12,7 @@ from ..arguments import margin_text
 from ..chunks import CHUNK, draw_chunk
 from ..labels.boxes import Boxes
 from ..loading import renderer_for
+from .given_boxes import stacked
 
 NUM_SCENES = 256  # of the prior
 MAX_IMAGES = 500  # of the target
@@ -24,16 +24,9 @@ def box_margins(model: SceneModel, boxes: Boxes, images: Images) -> dict[str, Ma
     Args:
         boxes: of some of the images; those of ``MAX_IMAGES`` are looked at.
     """
-    boxes = boxes.some(MAX_IMAGES)
-    rows = [i for i, found in enumerate(boxes.boxes) if len(found)]
-    if not rows:
+    if not any(map(len, boxes.boxes)):
         return {}
-    number = torch.tensor([model.classes.index(name) for name in boxes.classes])
-    pictures = torch.stack([images.load(boxes.rows[i]) for i in rows])
-    corners = pad_sequence([boxes.boxes[i][:, 1:] for i in rows], batch_first=True)
-    label = [number[boxes.boxes[i][:, 0].long()] for i in rows]
-    own = edge_profiles(pictures, corners, pad_sequence(label, batch_first=True, padding_value=-1))
-    renders = _of_prior(model)
+    own, renders = edge_profiles(*stacked(boxes.some(MAX_IMAGES), model.classes, images)), _of_prior(model)
     each = {name: estimate_margin(own, renders, model.classes.index(name)) for name in boxes.classes}
     return {name: margin for name, margin in each.items() if margin is not None}
 

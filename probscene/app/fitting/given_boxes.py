@@ -2,6 +2,8 @@
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from probscene.dataset import Images
 from probscene.errors import DataError
@@ -30,6 +32,16 @@ def given_boxes(run: RunFolder, target: Images) -> Boxes | None:
     except DataError:
         pass
     return None
+
+
+def stacked(boxes: Boxes, classes: tuple[str, ...], images: Images) -> tuple[Tensor, Tensor, Tensor]:
+    """Images ``(K, C, H, W)`` uint8, their boxes ``(K, M, 4)`` float32, x0 y0 x1 y1 in pixels of the canvas, and the
+    numbers of these in ``classes``, ``(K, M)`` int64, -1 where there is none."""
+    number = torch.tensor([classes.index(name) for name in boxes.classes])
+    label = [number[found[:, 0].long()] for found in boxes.boxes]
+    pictures = torch.stack([images.load(row) for row in boxes.rows])
+    corners = pad_sequence([found[:, 1:] for found in boxes.boxes], batch_first=True)
+    return pictures, corners, pad_sequence(label, batch_first=True, padding_value=-1)
 
 
 def _found_boxes(run: RunFolder, found: Detections) -> Boxes:

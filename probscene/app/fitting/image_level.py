@@ -3,9 +3,7 @@ labelled ones, M boxes of one, C H W."""
 
 from typing import Any
 
-import torch
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from probscene.dataset import Images
 from probscene.inference.guides.base import Guide
@@ -18,6 +16,7 @@ from probscene.inference.parameters.tilting.schedule import TiltingSchedule
 from probscene.inference.training import batch_seed
 
 from ..labels.boxes import Boxes
+from .given_boxes import stacked
 from .rendered_features import RenderedFeatures
 from .run import RunFolder
 
@@ -67,12 +66,7 @@ def labelled_objects(run: RunFolder, boxes: Boxes | None, images: Images) -> Obj
     """The objects of the target that are in boxes, of at most ``MAX_BOXED_IMAGES``; None where there are none."""
     if boxes is None or not any(map(len, boxes.boxes)):
         return None
-    boxes = boxes.some(MAX_BOXED_IMAGES)
-    number = torch.tensor([run.model.classes.index(name) for name in boxes.classes])
-    label = [number[found[:, 0].long()] for found in boxes.boxes]
-    pictures = torch.stack([images.load(row) for row in boxes.rows])
-    corners = pad_sequence([found[:, 1:] for found in boxes.boxes], batch_first=True)
-    return measure(pictures, corners, pad_sequence(label, batch_first=True, padding_value=-1))
+    return measure(*stacked(boxes.some(MAX_BOXED_IMAGES), run.model.classes, images))
 
 
 def sites_record(learning: ImageLevelTraining, discarded: dict[str, str]) -> list[dict[str, Any]]:
