@@ -34,10 +34,7 @@ def rendered(model: SceneModel, scenes: int, margin: int, seed: int) -> EdgeProf
 
 
 def line(name: str, found: dict[str, MarginEstimate | None], scale: float = 1.0) -> str:
-    words = [
-        f"{of} -" if m is None else f"{of} {m.pixels * scale:.1f} ({m.low * scale:.1f} to {m.high * scale:.1f})"
-        for of, m in found.items()
-    ]
+    words = [f"{of} {'-' if margin is None else margin.resized(scale)}" for of, margin in found.items()]
     return f"{name}: {', '.join(words)}"
 
 

@@ -61,6 +61,13 @@ class MarginEstimate(NamedTuple):
     low: float
     high: float
 
+    def resized(self, factor: float) -> "MarginEstimate":
+        """In images that are so many times as large."""
+        return self._replace(pixels=self.pixels * factor, low=self.low * factor, high=self.high * factor)
+
+    def __str__(self) -> str:
+        return f"{self.pixels:.1f} ({self.low:.1f} to {self.high:.1f})"
+
 
 def edge_profiles(images: Tensor, box: Tensor, label: Tensor) -> EdgeProfiles:
     """Of images ``(N, 1 or 3, H, W)`` uint8 the objects in boxes ``(N, M, 4)``, x0 y0 x1 y1 in pixels, of classes

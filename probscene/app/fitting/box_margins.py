@@ -44,7 +44,7 @@ def without_margins(boxes: Boxes, margins: dict[str, MarginEstimate]) -> Boxes:
 
 def margins_said(margins: dict[str, MarginEstimate]) -> str:
     """One sentence for a person, and what to do."""
-    words = ", ".join(f"{name} {m.pixels:.1f} ({m.low:.1f} to {m.high:.1f})" for name, m in margins.items())
+    words = ", ".join(f"{name} {margin}" for name, margin in margins.items())
     pixels = margin_text({name: round(margin.pixels) for name, margin in margins.items()})
     return (
         f"Labels leave room around objects, in pixels on each side: {words}. Objects are taken to be as large as their "

@@ -30,13 +30,12 @@ def looser(
     given = dict.fromkeys(made.classes, margin) if isinstance(margin, int) else margin
     scale = math.sqrt(math.prod(made.examples[0].size) / math.prod(photographs.examples[0].size))
     found = {name: estimate_margin(own, generated, number) for number, name in enumerate(made.classes)}
-    more = {name: each for name, each in found.items() if each is not None and round(each.pixels * scale)}
+    resized = {name: margin.resized(scale) for name, margin in found.items() if margin is not None}
+    more = {name: margin for name, margin in resized.items() if round(margin.pixels)}
     if not more:
         return None
-    words = ", ".join(
-        f"{name} {m.pixels * scale:.1f} ({m.low * scale:.1f} to {m.high * scale:.1f})" for name, m in more.items()
-    )
-    total = {name: given.get(name, 0) + round(more[name].pixels * scale if name in more else 0) for name in found}
+    words = ", ".join(f"{name} {margin}" for name, margin in more.items())
+    total = {name: given.get(name, 0) + (round(more[name].pixels) if name in more else 0) for name in made.classes}
     wider = margin_text({name: pixels for name, pixels in total.items() if pixels})
     return (
         f"Labels of the photographs leave more room around objects than those of generated images, in pixels of these "
