@@ -151,6 +151,10 @@ def train(
     positive(workers, "workers")
     origin = _origin(source)
     model = origin.model
+    if origin.run is None and options.source is not None:
+        raise ProbsceneError(
+            f"expected a run for the source {options.source!r}, got model {model.name!r}; leave it out."
+        )
     names = tuple(sorted(map(composed, options.classes or model.classes)))
     if unknown := sorted(set(names) - {composed(name) for name in model.classes}):
         raise DataError(
@@ -287,7 +291,7 @@ def _chosen(
     """The source of a run that is generated, and what was found where several were compared."""
     run, file = origin.run, out / COMPARED
     if run is None or source is not None:
-        return (None if run is None else source), None
+        return source, None
     if file.is_file():
         found = json.loads(file.read_text(encoding="utf-8"))
     elif not (found := run.sources):

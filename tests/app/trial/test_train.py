@@ -198,6 +198,7 @@ def test_nor_does_a_trial_test_on_them(fitted, photographs, tmp_path):
         ({"box_margin": "disc=2"}, r"box_margin of classes of model 'discs' \(red, blue\), got disc"),
         ({"box_margin": "two"}, "whole number of pixels, 0 or more, got two"),
         ({"source": "best"}, "a source of a run among prior, .*, got 'best'"),
+        ({"source": "prior"}, "a run for the source 'prior', got model 'discs'"),
         ({"detector": "maskrcnn=x", "onnx": True}, "file of weights|efficientnet for --onnx"),
     ],
 )
