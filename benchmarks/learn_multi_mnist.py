@@ -60,10 +60,10 @@ def distributions(target: int) -> tuple[np.ndarray, np.ndarray]:
     return rng.dirichlet(np.ones(11)), rng.dirichlet(np.ones(10))
 
 
-def glyphs_of(mnist: Path) -> list[np.ndarray]:
-    """The digits of t10k, ``(n, 28, 28)`` uint8 of each class."""
-    pixels = np.frombuffer(gzip.decompress((mnist / "t10k-images-idx3-ubyte.gz").read_bytes()), np.uint8, offset=16)
-    labels = np.frombuffer(gzip.decompress((mnist / "t10k-labels-idx1-ubyte.gz").read_bytes()), np.uint8, offset=8)
+def glyphs_of(mnist: Path, part: str = "t10k") -> list[np.ndarray]:
+    """The digits of t10k, or of another part of MNIST, ``(n, 28, 28)`` uint8 of each class."""
+    pixels = np.frombuffer(gzip.decompress((mnist / f"{part}-images-idx3-ubyte.gz").read_bytes()), np.uint8, offset=16)
+    labels = np.frombuffer(gzip.decompress((mnist / f"{part}-labels-idx1-ubyte.gz").read_bytes()), np.uint8, offset=8)
     return [pixels.reshape(-1, 28, 28)[labels == c] for c in range(10)]
 
 

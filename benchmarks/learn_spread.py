@@ -77,11 +77,11 @@ def draw_row(rng: np.random.Generator, target: int, n: int) -> Row:
     return Row(x, np.full(n, y), turns)
 
 
-def draw_images(mnist: Path, target: int, folder: Path, images: int) -> None:
+def draw_images(mnist: Path, part: str, target: int, folder: Path, images: int) -> None:
     """The target's folder."""
     if folder.is_dir():
         return
-    glyphs = glyphs_of(mnist)
+    glyphs = glyphs_of(mnist, part)
     number, share = distributions(target)
     rng = np.random.default_rng([11, target])
     aside = folder.with_suffix(".part")
@@ -145,9 +145,9 @@ def figures(rows: list[Row], true: list[Row]) -> dict[str, float]:
 
 def measured(target: int, args: argparse.Namespace) -> dict:
     """The rows of one target."""
-    images = args.out / f"target-{target}"
-    draw_images(args.mnist, target, images, args.images)
-    config, out = preset(args.preset).set(*args.set), args.out / f"{args.preset}-{target}-{args.seed}"
+    images = args.out / f"{args.digits}-{target}"
+    draw_images(args.mnist, args.digits, target, images, args.images)
+    config, out = preset(args.preset).set(*args.set), args.out / f"{args.preset}-{args.digits}-{target}-{args.seed}"
     execution = Execution(1, cache=args.out / "cache")
     model = ModelFile("multi_mnist", args.assets)
     run = fit(model, images, config, out=out, seed=args.seed, resume=True, execution=execution)
@@ -177,6 +177,7 @@ def main():
     out_option(parser, __file__)
     parser.add_argument("--targets", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--images", type=int, default=2000)
+    parser.add_argument("--digits", choices=("t10k", "train"), default="t10k", help="part of MNIST that draws targets")
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], help="as of probscene fit")
