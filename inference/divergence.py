@@ -171,7 +171,7 @@ class Blockwise:
         _check_features(generated, real)
         blocks = zip(self.divergences, generated.split(self.sizes, 1), real.split(self.sizes, 1), strict=True)
         costs = [divergence(*block) for divergence, *block in blocks if divergence is not None]
-        return sum(costs, torch.zeros(len(generated)))
+        return sum(costs, generated.new_zeros(len(generated)))
 
 
 def _centred(points: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:
@@ -193,7 +193,7 @@ def _log_sums(points: Tensor, data: Tensor, variance: float, leave_one_out: bool
     nearest = bias.topk(min(2, L), 1).indices
     pivot = nearest[:, :1].expand(B, N)
     if leave_one_out:
-        pivot = pivot.where(pivot != torch.arange(N), nearest[:, 1:])
+        pivot = pivot.where(pivot != torch.arange(N, device=pivot.device), nearest[:, 1:])
     fill = partial(torch.addcmul, value=1 / variance) if d == 1 else partial(torch.baddbmm, alpha=1 / variance)
     rows, samples = min(N, max(1, BLOCK_SIZE // L)), min(B, max(1, BLOCK_SIZE // (N * L)))
     memory = points.new_empty(samples * rows * L)

@@ -107,6 +107,15 @@ class LocatesObjects(Protocol):
 
 
 @runtime_checkable
+class Placeable(Protocol):
+    """A ``FeatureNet`` that computes on a device of choice. Others compute where they are."""
+
+    def place(self, device: torch.device) -> None:
+        """From now on compute there; images, labels and features stay on the CPU."""
+        ...
+
+
+@runtime_checkable
 class CountsObjects(Protocol):
     """A ``FeatureNet`` whose features count objects: 1 in a feature is ``unit`` of them, a number or ``(D,)``."""
 

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.device import device_of
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 
@@ -47,9 +48,14 @@ class PresenceNet(nn.Module):
             [f"pool_{i}" for i in range(widths[-1])] + [f"fc{j}_{i}" for j in (1, 2) for i in range(hidden)]
         )
 
+    def place(self, device: torch.device) -> None:
+        """See ``Placeable``."""
+        self.to(device)
+
     def layers(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Features ``(N, D)`` and logits, ``(N, classes)`` or ``(N, classes, ways)``, of uint8 images ``(N, 1 or 3, H,
         W)``."""
+        images = images.to(device_of(self))
         pool = self.blocks(images.expand(-1, 3, -1, -1).contiguous(memory_format=NHWC).float() / 255).mean((2, 3))
         first = F.leaky_relu(self.fc1(pool), 0.01)
         second = F.leaky_relu(self.fc2(first), 0.01)
@@ -59,7 +65,7 @@ class PresenceNet(nn.Module):
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
         """``(N, D)`` features of ``(N, 1 or 3, H, W)`` uint8 images."""
-        parts = [self.layers(some)[0] for some in images.split(50)]
+        parts = [self.layers(some)[0].cpu() for some in images.split(50)]
         return torch.cat(parts) if parts else torch.zeros(0, len(self.names))
 
 
@@ -166,7 +172,8 @@ class PresenceTraining(TrainingLoop):
         """An epoch."""
         total, right, ways = 0.0, 0.0, self.net.ways
         for rows in torch.randperm(self.images).split(self.batch_size):
-            logits, number = self.net.layers(self.image[rows])[1], self.number[rows]
+            logits = self.net.layers(self.image[rows])[1]
+            number = self.number[rows].to(logits.device)
             if ways:
                 loss = F.cross_entropy(logits.flatten(0, 1), number.flatten())
             else:

@@ -32,6 +32,7 @@ from efficientnet_lite_pytorch import EfficientNet
 from torch import Tensor, nn
 from torchvision.models import Inception_V3_Weights, ResNet50_Weights, inception_v3, resnet50
 
+from probscene.device import device_of
 from probscene.errors import DataError
 
 from .folding import fold
@@ -57,12 +58,20 @@ class _Frozen(nn.Module):
         names: of the features.
     """
 
+    middle: Tensor
+    scale: Tensor
     pooled: Callable[[Tensor], Tensor]
     """Features ``(N, D)`` of what ``enter`` gives."""
 
     def __init__(self, size: int, step: int, middle: float | Tensor, scale: float | Tensor, names: tuple[str, ...]):
         super().__init__()
-        self.size, self.step, self.middle, self.scale, self.names = size, step, middle, scale, names
+        self.size, self.step, self.names = size, step, names
+        self.register_buffer("middle", torch.as_tensor(middle), persistent=False)
+        self.register_buffer("scale", torch.as_tensor(scale), persistent=False)
+
+    def place(self, device: torch.device) -> None:
+        """See ``Placeable``."""
+        self.to(device)
 
     def train(self, mode: bool = True) -> "_Frozen":
         """Stays in evaluation mode."""
@@ -77,8 +86,9 @@ class _Frozen(nn.Module):
         return height, width
 
     def enter(self, images: Tensor) -> Tensor:
-        """``(N, 3, h, w)`` float32 of uint8 images ``(N, 1 or 3, H, W)``; grey ones thrice."""
-        x = images.float().contiguous()  # renders lie interleaved, files planar; resizing one rounds unlike the other
+        """``(N, 3, h, w)`` float32 of uint8 images ``(N, 1 or 3, H, W)``; grey ones thrice. On the network's device."""
+        # Renders lie interleaved, files planar; resizing one rounds unlike the other.
+        x = images.to(device_of(self)).float().contiguous()
         size = self.entering(*x.shape[-2:])
         if x.shape[-2:] != size:
             x = F.interpolate(x, size, mode="bilinear", antialias=True)
@@ -87,7 +97,7 @@ class _Frozen(nn.Module):
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:
         """``(N, D)`` features of ``(N, 1 or 3, H, W)`` uint8 images."""
-        parts = [self.pooled(self.enter(some)) for some in images.split(AT_ONCE)] if len(images) else []
+        parts = [self.pooled(self.enter(some)).cpu() for some in images.split(AT_ONCE)] if len(images) else []
         return torch.cat(parts) if parts else torch.zeros(0, len(self.names))
 
 
@@ -140,8 +150,8 @@ class EfficientNetLite(_Frozen):
         whole, texture = [], []
         for some in images.split(AT_ONCE):
             maps = self.pyramid(self.enter(some))
-            whole.append(self._pool(maps[-1]))
-            texture.append(torch.cat([maps[0].mean((2, 3)), maps[0].std((2, 3))], 1))
+            whole.append(self._pool(maps[-1]).cpu())
+            texture.append(torch.cat([maps[0].mean((2, 3)), maps[0].std((2, 3))], 1).cpu())
         return torch.cat(whole), torch.cat(texture)
 
     @torch.no_grad()
@@ -151,17 +161,17 @@ class EfficientNetLite(_Frozen):
         whole, found = [], []
         for some in images.split(AT_ONCE):
             maps = self.pyramid(self.enter(some))
-            whole.append(self._pool(maps[-1]))
+            whole.append(self._pool(maps[-1]).cpu())
             each = maps[0].flatten(2).transpose(1, 2)  # (n, h w, C)
             usual = each.median(1, keepdim=True).values
             most = ((each - usual) ** 2).sum(2).topk(PLACES, 1).indices
-            found.append(torch.cat([usual, each.gather(1, most.unsqueeze(2).expand(-1, -1, each.shape[2]))], 1))
+            found.append(torch.cat([usual, each.gather(1, most.unsqueeze(2).expand(-1, -1, each.shape[2]))], 1).cpu())
         return torch.cat(whole), torch.cat(found)
 
     @torch.no_grad()
     def logits(self, images: Tensor) -> Tensor:
         """``(N, 1000)`` of ImageNet's classes, for ``(N, 1 or 3, H, W)`` uint8 images."""
-        return self.net._fc(self.embed(images))
+        return self.net._fc(self.embed(images).to(device_of(self))).cpu()
 
 
 class Inception(_Frozen):

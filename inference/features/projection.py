@@ -30,7 +30,7 @@ from probscene.sampling import seed_everything
 
 from ..divergence import bandwidth, self_share
 from ..training import Callback, batch_seed
-from .base import FeatureNet, Features, Photographs, Renders, slow_settings
+from .base import FeatureNet, Features, Photographs, Placeable, Renders, slow_settings
 from .names import network_name
 
 MAX_COMPONENTS = 100  # principal ones that the discriminant is sought in, and no more than a quarter of the pairs
@@ -139,6 +139,11 @@ class Projected(nn.Module):
                 "that file back, or fit again."
             )
         return super().load_state_dict(state, strict, assign)
+
+    def place(self, device: torch.device) -> None:
+        """See ``Placeable``; the projection stays on the CPU."""
+        if isinstance(self.pretrained, Placeable):
+            self.pretrained.place(device)
 
     @torch.no_grad()
     def embed(self, images: Tensor) -> Tensor:

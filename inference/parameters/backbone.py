@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.device import device_of
+
 from ..features.base import FeatureNet, enter
 from ..features.counting.batches import images_per_step
 from ..features.counting.net import CountNet, conv, layers
@@ -62,6 +64,7 @@ class RenderBackbone(Backbone):
         self.both = nn.Sequential(nn.BatchNorm2d(WIDTH), nn.ReLU(inplace=True), *conv(WIDTH, WIDTH, 3, 1))
         self.cell = torch.full((2,), float(STRIDE * self.reduce))
         self.pretrained_parts = self.fine, self.coarse
+        self.to(device_of(counts))
 
     def enter(self, images: Tensor) -> Tensor:
         """Reduced images, padded to whole cells."""
@@ -86,6 +89,11 @@ class FrozenMaps(Protocol):
     @property
     def map_channels(self) -> Sequence[int]:
         """Of each map."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where its maps are."""
         ...
 
     def compute_maps(self, images: Tensor) -> list[Tensor]:
@@ -119,6 +127,7 @@ class PhotographBackbone(Backbone):
         self.colours = nn.Conv2d(6, WIDTH, 1, bias=False)
         self.both = nn.Sequential(nn.BatchNorm2d(WIDTH), nn.ReLU(inplace=True), *conv(WIDTH, WIDTH, 3, 1))
         self.cell = FINEST / net.scale()
+        self.to(net.device)
 
     def enter(self, images: Tensor) -> Tensor:
         """As they are."""
@@ -129,7 +138,7 @@ class PhotographBackbone(Backbone):
         net = self.net[0]
         maps, size = net.normalise(net.compute_maps(x)), net.places(FINEST)
         if self.training:
-            shifted = (some + SHIFT * torch.randn(*some.shape[:2], 1, 1) for some in maps)
+            shifted = (some + SHIFT * torch.randn(*some.shape[:2], 1, 1).to(some.device) for some in maps)
             maps = [F.dropout2d(some, DROPPED) for some in shifted]
         seen = self.colours(cell_colours(x, size))
         for side, some in zip(self.sides, maps, strict=True):

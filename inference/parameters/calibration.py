@@ -82,7 +82,7 @@ class CalibratedReader:
         most = min(mistakes) + math.sqrt(min(mistakes))
         as_good = [threshold for threshold, some in zip(self.reader.thresholds, mistakes, strict=True) if some <= most]
         self.reader.score_threshold.fill_(as_good[0])
-        enough = found.score > self.reader.score_threshold
+        enough = found.score > float(self.reader.score_threshold)
         return found.select(enough), which[enough]
 
     def calibrate(self, valued: SupervisedBatch, images: Tensor) -> None:

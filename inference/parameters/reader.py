@@ -17,6 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.device import device_of
+
 from .backbone import WIDTH, Backbone
 from .global_head import GlobalHead, global_features
 
@@ -54,10 +56,10 @@ class Detections(NamedTuple):
 
 
 class Reader(nn.Module):
-    """Heads on a backbone.
+    """Heads on a backbone. What it detects is on the CPU, wherever it computes.
 
     Args:
-        backbone: the backbone.
+        backbone: the backbone, on the device where the reader computes.
         classes, sites, scene_sites: C, S and G.
 
     Attributes:
@@ -82,6 +84,7 @@ class Reader(nn.Module):
             bias = cast(Tensor, self.class_head.bias)
             bias.zero_()
             bias[0] = 3.0
+        self.to(device_of(backbone))
 
     def forward(self, entered: Tensor) -> tuple[Tensor, Tensor]:
         """Of what has entered the backbone: what it sees ``(N, WIDTH, h, w)``, and logits ``(N, 1 + C, h, w)``."""
@@ -101,7 +104,7 @@ class Reader(nn.Module):
     def detect(self, images: Tensor) -> Detections:
         """Objects in ``(N, 1 or 3, H, W)`` uint8 images."""
         found = self.detect_all(images)
-        return found.select(found.score > self.score_threshold)
+        return found.select(found.score > float(self.score_threshold))
 
     @torch.no_grad()
     def detect_all(self, images: Tensor) -> Detections:
@@ -112,16 +115,16 @@ class Reader(nn.Module):
     @torch.no_grad()
     def count(self, images: Tensor) -> Tensor:
         """How many objects of each class it detects, ``(N, C)``, in ``(N, 1 or 3, H, W)`` uint8 images."""
-        counts = torch.zeros(len(images), self.classes)
+        counts, device = torch.zeros(len(images), self.classes), device_of(self)
         for i, some in enumerate(images.split(64)):
-            mass = self(self.backbone.enter(some))[1].softmax(1)[:, 1:]
+            mass = self(self.backbone.enter(some.to(device)))[1].softmax(1)[:, 1:]
             n, y, x, inside = find_objects(mass.sum(1), float(self.score_threshold))
             label = held(mass, n, y, x)[0]
-            counts.index_put_((n + 64 * i, label), torch.ones(len(n)), accumulate=True)
+            counts.index_put_((n.cpu() + 64 * i, label.cpu()), torch.ones(len(n)), accumulate=True)
         return counts
 
     def _detect(self, images: Tensor, first: int) -> Detections:
-        entered = self.backbone.enter(images)
+        entered = self.backbone.enter(images.to(device_of(self)))
         seen, logits = self(entered)
         mass = logits.softmax(1)[:, 1:]
         n, y, x, inside = find_objects(mass.sum(1), self.thresholds[0])
@@ -130,9 +133,9 @@ class Reader(nn.Module):
         share = (share / share.sum(1, keepdim=True).clamp(min=1e-6)).unsqueeze(-1)  # of what each of the cells says
         parent, values = self.values_at(seen, image, rows, columns)
         here = torch.stack([columns, rows], -1) + 0.5
-        scale = self.backbone.cell
+        scale = self.backbone.cell.to(here.device)
         scene_raw = self._read_scene(entered) if self.scene_sites else seen.new_zeros(len(seen), 0, 2 + HARMONICS)
-        return Detections(
+        found = Detections(
             n + first,
             inside,
             label,
@@ -141,6 +144,7 @@ class Reader(nn.Module):
             (share.unsqueeze(-1) * values).sum(1),
             scene_raw,
         )
+        return Detections(*(part.cpu() for part in found))
 
     def _read_scene(self, entered: Tensor) -> Tensor:
         return self.scene_head.from_features(global_features(entered))
@@ -169,7 +173,7 @@ def find_objects(mass: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor
             for j in (0, 1):
                 left[n, y + i, x + j] = 0.0
     if not found:
-        none = torch.zeros(0, dtype=torch.int64)
+        none = torch.zeros(0, dtype=torch.int64, device=mass.device)
         return none, none, none, mass.new_zeros(0)
     n, y, x, inside = (torch.cat(part) for part in zip(*found, strict=True))
     order = n.argsort(stable=True)

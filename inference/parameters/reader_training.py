@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from probscene.device import device_of
 from probscene.sampling import seed_everything
 
 from ..features.base import Examples
@@ -126,9 +127,9 @@ class GlobalHeadTraining(AdamTraining):
         while self.drawn < number:  # a training that was resumed draws all of them again
             self._draw()
         torch.set_rng_state(state)
-        rows = torch.randint(self.drawn, (SCENE_IMAGES,))
-        u = self.u[rows]
-        loss = value_loss(self.head.from_features(self.features[rows]), u.nan_to_num(0.5))
+        rows, device = torch.randint(self.drawn, (SCENE_IMAGES,)), device_of(self.head)
+        u = self.u[rows].to(device)
+        loss = value_loss(self.head.from_features(self.features[rows].to(device)), u.nan_to_num(0.5))
         return loss.where(~u.isnan(), 0.0).sum(1).mean()
 
     @torch.no_grad()
@@ -144,19 +145,19 @@ class GlobalHeadTraining(AdamTraining):
 
 def reader_loss(reader: Reader, valued: SupervisedBatch) -> Tensor:
     """Cross-entropy of the cells, the error of where parents are, and of u, summed over an image's objects."""
-    drawn, scale = valued.drawn, reader.backbone.cell
-    seen, logits = reader(reader.backbone.enter(drawn.image))
+    drawn, scale, device = valued.drawn, reader.backbone.cell, device_of(reader)
+    seen, logits = reader(reader.backbone.enter(drawn.image.to(device)))
     h, w = logits.shape[-2:]
     label = drawn.label.masked_fill(drawn.visible < MIN_VISIBLE, -1)
-    target = cells(drawn.centre / scale * CELL, label, reader.classes, h, w)
+    target = cells(drawn.centre / scale * CELL, label, reader.classes, h, w).to(device)
     entropy = -(target * F.log_softmax(logits, 1)).sum((1, 2, 3)).mean()
     parts = zip(*shares(drawn.centre / scale * CELL, label, h, w), strict=True)
     n, m, i, j, share = (torch.cat(part) for part in parts)
+    u, above = valued.u[n, m].to(device), valued.parent[n, m]
+    has, at = (above >= 0).float().to(device), (drawn.centre[n, above.clamp(min=0)] / scale).to(device)
+    n, i, j, share = (part.to(device) for part in (n, i, j, share))
     parent, output = reader.values_at(seen, n, i, j)
-    u = valued.u[n, m]
     of_values = value_loss(output, u.nan_to_num(0.5)).where(~u.isnan(), 0.0)
-    has = (valued.parent[n, m] >= 0).float()
-    at = drawn.centre[n, valued.parent[n, m].clamp(min=0)] / scale
     away = (torch.stack([j, i], -1) + 0.5 + parent - at).abs().clamp(max=20.0).sum(-1)
     of_nodes = (share * (of_values.sum(1) + has * away)).sum()
     return entropy + of_nodes / len(logits)

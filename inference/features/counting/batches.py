@@ -5,13 +5,14 @@ many of them a second; the last part trains on whole images, without which crops
 letters: N images, M nodes, K crops.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from probscene.device import device_of
 from probscene.prefetch import ahead
 from probscene.sampling import seed_everything
 
@@ -103,6 +104,19 @@ class CountBatch(NamedTuple):
     votes: Votes | None
     group_cells: Tensor | None
 
+    def to(self, device: torch.device) -> "CountBatch":
+        """On a device."""
+        return self._each(lambda part: part.to(device, non_blocking=True))
+
+    def pinned(self) -> "CountBatch":
+        """In memory that a CUDA GPU copies from while the CPU goes on."""
+        return self._each(Tensor.pin_memory)
+
+    def _each(self, move: Callable[[Tensor], Tensor]) -> "CountBatch":
+        votes = None if self.votes is None else Votes(*map(move, self.votes))
+        group_cells = None if self.group_cells is None else move(self.group_cells)
+        return CountBatch(move(self.image), move(self.target), self.margin, votes, group_cells)
+
 
 def images_per_step(most: int, area: float) -> int:
     """``most``, of images of up to 128 x 128 pixels when reduced; of images of a larger ``area``, which hold more
@@ -136,7 +150,8 @@ class CountBatches:
         steps, images = min(STEPS_A_DRAW, self.schedule.steps - done), self.images
         drawn = self.draw(steps * images)
         rows = (slice(i * images, (i + 1) * images) for i in range(steps))
-        return [self._batch(Examples(*(x[some] for x in drawn)), done + i) for i, some in enumerate(rows)]
+        made = [self._batch(Examples(*(x[some] for x in drawn)), done + i) for i, some in enumerate(rows)]
+        return [batch.pinned() for batch in made] if device_of(self.net).type == "cuda" else made
 
     def _batch(self, batch: Examples, step: int) -> CountBatch:
         s = self.schedule

@@ -41,11 +41,13 @@ def tally_groups(
     peak[:, 1:] &= height[:, 1:] > height[:, :-1]
     peak[:, :-1] &= height[:, :-1] >= height[:, 1:]
     number = peak.sum(1)
-    away = (object_vote.flatten(1).unsqueeze(-1) - torch.arange(length)).abs().masked_fill(~peak.unsqueeze(1), length)
+    away = (object_vote.flatten(1).unsqueeze(-1) - torch.arange(length, device=peak.device)).abs()
+    away = away.masked_fill(~peak.unsqueeze(1), length)
     rank = (peak.cumsum(1) - 1).gather(1, away.argmin(-1)).clamp(0, max_groups - 1)  # of each cell's group
-    counts = torch.zeros(N, max_groups, C)
+    counts = objects.new_zeros(N, max_groups, C)
     counts.scatter_add_(1, rank.unsqueeze(-1).expand(-1, -1, C), objects.flatten(2).transpose(1, 2))
-    there = torch.arange(max_groups) < number.clamp(min=1).unsqueeze(1)  # objects of no group go to the first
+    # Objects of no group go to the first.
+    there = torch.arange(max_groups, device=number.device) < number.clamp(min=1).unsqueeze(1)
     counts = counts.where(there.unsqueeze(-1), ABSENT)
     return torch.cat([number.unsqueeze(1).float(), counts.flatten(1)], 1)
 
@@ -54,9 +56,9 @@ def _density(place: Tensor, weight: Tensor, length: int) -> Tensor:
     """Votes a pixel ``(N, P)``, smoothed."""
     low = place.floor().long()
     part = place - low
-    votes = torch.zeros(len(place), length + 1)
+    votes = weight.new_zeros(len(place), length + 1)
     votes.scatter_add_(1, low, weight * (1 - part))
     votes.scatter_add_(1, low + 1, weight * part)
     reach = int(4 * VOTE_SD)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / VOTE_SD) ** 2)
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=votes.device) / VOTE_SD) ** 2)
     return F.conv1d(votes[:, None, :length], (kernel / kernel.sum())[None, None], padding=reach)[:, 0]

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from probscene.device import device_of
 from probscene.model import Groups
 
 from ..base import enter
@@ -88,6 +89,11 @@ class CountNet(nn.Module):
             bias[0] = 3.0
         self._fused: nn.Module | None = None
 
+    def place(self, device: torch.device) -> None:
+        """See ``Placeable``."""
+        self._fused = None
+        self.to(device)
+
     @property
     def reduce(self) -> int:
         """By how much images are reduced."""
@@ -130,10 +136,10 @@ class CountNet(nn.Module):
         """``(N, D)`` soft counts of ``(N, 1 or 3, H, W)`` uint8 images."""
         if self._fused is None:
             self._fused = _fuse(self.body)
-        out = []
+        out, device = [], device_of(self)
         for some in images.split(64):
-            x = self.enter(some).contiguous(memory_format=torch.channels_last)
-            out.append(self._read(self._fused(x)))
+            x = self.enter(some.to(device)).contiguous(memory_format=torch.channels_last)
+            out.append(self._read(self._fused(x)).cpu())
         soft = torch.cat(out) if out else torch.zeros(0, len(self.names))
         return toward_whole(soft) if self.rounding else soft
 
@@ -141,13 +147,13 @@ class CountNet(nn.Module):
     def cells(self, images: Tensor) -> Tensor:
         """How many objects of each class each cell is expected to hold, ``(N, C, h, w)``, of ``(N, 1 or 3, H, W)``
         uint8 images, in the order of ``classes``; of a group, what part of an ordinary one."""
-        number, out = 1 + len(self.objects), []
+        number, out, device = 1 + len(self.objects), [], device_of(self)
         for some in images.split(64):
-            logits = self(self.enter(some))
+            logits = self(self.enter(some.to(device)))
             found = dict(zip(self.objects, logits[:, :number].softmax(1)[:, 1:].unbind(1), strict=True))
             if self.groups is not None:
                 found[self.groups.kind] = logits[:, number].sigmoid() / self.group_cells
-            out.append(torch.stack([found[name] for name in self.classes], 1))
+            out.append(torch.stack([found[name] for name in self.classes], 1).cpu())
         return torch.cat(out)
 
     def _read(self, logits: Tensor) -> Tensor:
@@ -158,7 +164,8 @@ class CountNet(nn.Module):
             return torch.cat([counts, counts.sum(1, keepdim=True)], 1)
         height, width = logits.shape[2:]
         size = height if self.groups.along == "y" else width
-        here = (torch.arange(size) + 0.5).view(-1, 1) if self.groups.along == "y" else torch.arange(size) + 0.5
+        here = torch.arange(size, device=logits.device) + 0.5
+        here = here.view(-1, 1) if self.groups.along == "y" else here
         surface, way, pull = logits[:, number:].unbind(1)
         votes = STRIDE * (here + way), STRIDE * (here + pull)
         length, mass, number = size * STRIDE, float(self.group_cells), self.groups.max_groups

@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.device import device_of
 from probscene.model import SceneModel
 from probscene.sampling import seed_everything
 from probscene.threads import threads
@@ -116,7 +117,7 @@ class CountTraining(TrainingLoop):
 
     def step(self) -> float:
         """See ``TrainingLoop``."""
-        batch = next(self.left)
+        batch = next(self.left).to(device_of(self.net))
         s = self.schedule
         factor = min(1.0, (self.done + 1) / WARMUP_STEPS) * 0.5 * (1 + math.cos(math.pi * self.done / s.steps))
         for optimiser, rate in zip(self.optimisers.values(), (s.learning_rate, s.muon_rate), strict=True):

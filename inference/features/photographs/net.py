@@ -25,6 +25,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from probscene.device import device_of
+
 from ...divergence import bandwidth
 from ..base import Examples
 from ..pretrained import AT_ONCE, NHWC, EfficientNetLite
@@ -169,6 +171,16 @@ class PretrainedCountNet(nn.Module):
             nn.ModuleList(Head(kind, frozen.channels, 1 + C) for _ in range(HEADS)) for kind in KINDS
         )
 
+    def place(self, device: torch.device) -> None:
+        """See ``Placeable``; heads and frozen network go there, and what is kept of classes stays on the CPU."""
+        self.frozen[0].place(device)
+        self.heads.to(device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where its maps and heads are."""
+        return device_of(self.heads)
+
     @property
     def feature_mask(self) -> Tensor:
         """``(D,)`` bool, which features say anything of the target's images: things that can be read."""
@@ -240,7 +252,7 @@ class PretrainedCountNet(nn.Module):
 
     @torch.no_grad()
     def compute_maps(self, images: Tensor) -> Maps:
-        """Maps of ``(N, 1 or 3, H, W)`` uint8 images."""
+        """Maps of ``(N, 1 or 3, H, W)`` uint8 images, on ``device``."""
         net = self.frozen[0]
         parts = [net.pyramid(net.enter(some)) for some in images.split(AT_ONCE)]
         return [torch.cat(part) for part in zip(*parts, strict=True)]
@@ -262,9 +274,11 @@ class PretrainedCountNet(nn.Module):
         ).float()
 
     def normalise(self, maps: Maps) -> Maps:
-        """Maps in their channels' scales, float32."""
-        wide = [some.float().contiguous(memory_format=NHWC) for some in maps]
-        return [(some - getattr(self, f"mean_{i}")) / getattr(self, f"scale_{i}") for i, some in enumerate(wide)]
+        """Maps in their channels' scales, float32, on ``device``."""
+        device = self.device
+        wide = [some.to(device).float().contiguous(memory_format=NHWC) for some in maps]
+        scales = ([getattr(self, f"{name}_{i}").to(device) for name in ("mean", "scale")] for i in range(len(maps)))
+        return [(some - mean) / scale for some, (mean, scale) in zip(wide, scales, strict=True)]
 
     def forward(self, maps: Maps) -> list[Tensor]:
         """For each of ``KINDS``, logits of the places by each head, ``(HEADS, N, its scopes, 1 + C, h, w)``, of maps as
@@ -286,7 +300,7 @@ class PretrainedCountNet(nn.Module):
             mean = probability.mean(0)
             held = whole(mean.flatten(0, 1), PSEUDO_LABEL_RULE).unflatten(0, mean.shape[:2])
             held = held / held.sum(2, keepdim=True).clamp(min=1)
-            out.append(torch.cat([1 - held.sum(2, keepdim=True), held], 2))
+            out.append(torch.cat([1 - held.sum(2, keepdim=True), held], 2).cpu())
         return out
 
     @torch.no_grad()
@@ -295,8 +309,8 @@ class PretrainedCountNet(nn.Module):
         whole, each = [], []
         for some in zip(*(part.split(64) for part in maps), strict=True):
             kinds = self.head_probabilities(list(some))
-            whole.append(torch.cat([_all_scopes(probability.mean(0)) for probability in kinds], 1))
-            each.append(torch.cat([torch.stack([*map(_all_scopes, probability)]) for probability in kinds], 2))
+            whole.append(torch.cat([_all_scopes(probability.mean(0)) for probability in kinds], 1).cpu())
+            each.append(torch.cat([torch.stack([*map(_all_scopes, probability)]) for probability in kinds], 2).cpu())
         return torch.cat(whole), torch.cat(each, 1)
 
     @torch.no_grad()
@@ -309,7 +323,7 @@ class PretrainedCountNet(nn.Module):
                 for within, s in enumerate(kind.scopes):
                     which = self.scope == s
                     rules = self.rules[int(photographs), which]
-                    counts[:, which] = read_each(probability[:, :, within, which].mean(0), rules)
+                    counts[:, which] = read_each(probability[:, :, within, which].mean(0), rules).cpu()
             parts.append(by_steps(counts, self.steps) if photographs else counts)
         return torch.cat(parts)
 
@@ -325,7 +339,7 @@ class PretrainedCountNet(nn.Module):
                 for within, s in enumerate(kind.scopes):
                     which = self.scope == s
                     if which.any():
-                        found[:, which] = F.interpolate(whole[:, within, which], found.shape[2:])
+                        found[:, which] = F.interpolate(whole[:, within, which], found.shape[2:]).cpu()
             out.append(found)
         return torch.cat(out)
 

@@ -145,7 +145,7 @@ class PretrainedCountTraining(TrainingLoop):
             drawn = self.draw_twice(number)
             maps = self.net.compute_maps(augment(drawn.image, rng))
             targets = [self._target(drawn, kind).half() for kind in KINDS]
-            parts.append([*(some.half() for some in maps), *targets, self.net.true_counts(drawn)])
+            parts.append([*(some.half().cpu() for some in maps), *targets, self.net.true_counts(drawn)])
             shown = drawn.label.masked_fill(drawn.visible < SCOPES[SMALL].visible, -1)
             for c, of_class in enumerate(sizes):
                 of_class.append((drawn.size * self.net.scale()).amax(-1)[shown == c])
@@ -168,7 +168,7 @@ class PretrainedCountTraining(TrainingLoop):
         """Maps, float16."""
         parts, done = [], 2 * self._structures
         for some in self.photographs:
-            parts.append([part.half() for part in self.net.compute_maps(some)])
+            parts.append([part.half().cpu() for part in self.net.compute_maps(some)])
             done += len(some)
             if callback is not None:
                 callback(self, {"images": done, "of": self._images})
@@ -199,14 +199,16 @@ class PretrainedCountTraining(TrainingLoop):
 
     def _loss(self, maps: Maps, targets: list[Tensor], self_training: bool = False) -> Tensor:
         """Of all heads, or of those alone that teach themselves."""
-        flipped = torch.rand(len(maps[0])) < 0.5
+        device = self.net.device
+        flipped = (torch.rand(len(maps[0])) < 0.5).to(device)
         seen = [torch.where(flipped[:, None, None, None], some.flip(3), some) for some in self.net.normalise(maps)]
-        loss = torch.zeros(())
+        loss = torch.zeros((), device=device)
         for kind, heads, target in zip(KINDS, self.net.heads, targets, strict=True):
             if self_training and not kind.self_training:
                 continue
+            target = target.to(device)
             target = torch.where(flipped[:, None, None, None, None], target.flip(4), target).float()
-            shifted = [some + kind.shift * torch.randn(*some.shape[:2], 1, 1) for some in seen]
+            shifted = [some + kind.shift * torch.randn(*some.shape[:2], 1, 1).to(device) for some in seen]
             logits = torch.stack([head(shifted) for head in cast(nn.ModuleList, heads)])
             each = target.expand_as(logits)  # (heads, N, scopes, 1 + C, h, w)
             loss = loss + relative_count_loss(logits.flatten(0, 2), each.flatten(0, 2))

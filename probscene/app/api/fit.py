@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from probscene.dataset import Images
+from probscene.device import chosen_device
 from probscene.model import SceneModel
 
 from ..arguments import checked_seed
@@ -55,7 +56,7 @@ def fit(
             ``label_2`` or YOLO's ``labels``.
         resume: go on with the run in ``out`` where there is one; arguments that are given have to be those that it was
             begun with. Model, target, labels and readings may lie elsewhere by now, if they are the same bytes.
-        execution: threads, cluster, cache and progress.
+        execution: threads, cluster, cache, progress and device.
 
     Raises:
         ProbsceneError: an input is at fault; the message says which and what to do. What was finished of the run stays,
@@ -107,7 +108,7 @@ def fit_and_diagnose(
             from ..detectors.source_comparison import compare_and_keep  # torchvision takes seconds to import
 
             images = images or open_target(done.run, show)
-            compare_and_keep(done.run, images, show, show.say)
+            compare_and_keep(done.run, images, show, show.say, execution.device)
         if verdict and done.unfinished:
             found = diagnose(done.run, images or open_target(done.run, show), show)
     return FitAndDiagnostics(done.run, found)
@@ -133,11 +134,12 @@ def carried_out(request: FitRequest, out: Path, show: Display, resume: bool, exe
     Raises:
         ProbsceneError: see ``fit``.
     """
+    device = chosen_device(execution.device)
     with connected(execution.cluster, show.say) as nodes:  # first, so that a wrong address leaves no run behind
         begun: Begun = (beginning.resume if resume else beginning.begin)(request, out, show, Run)
         run, unfinished = begun.run, not begun.run.is_finished
         assert isinstance(run, Run)
-        carry_out(begun, show, execution.cache, nodes)
+        carry_out(begun, show, execution.cache, nodes, device)
     if unfinished:
         warn_of_saturated_lists(run, show)
     return Done(run, begun.images, unfinished)

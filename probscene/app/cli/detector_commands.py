@@ -11,6 +11,7 @@ from .options import (
     Batch,
     BoxMargin,
     Detector,
+    Device,
     FinetuneFraction,
     Iterations,
     MinVisible,
@@ -64,6 +65,7 @@ def train(
     rate: Rate = None,
     finetune_fraction: FinetuneFraction = 0.5,
     value_range: ValueRange = None,
+    device: Device = "cpu",
 ) -> str:
     """Train a detector on generated images, then on labelled photographs."""
     from rich.console import Console
@@ -79,7 +81,7 @@ def train(
         hold_out=hold_out,
         classes=None if classes is None else words_given(classes),
         detector=detector,
-        budget=TrainingBudget(iterations, batch, rate, finetune_fraction),
+        budget=TrainingBudget(iterations, batch, rate, finetune_fraction, device=device),
         size=size_given(size),
         min_visible=min_visible,
         box_margin=box_margin,
@@ -108,14 +110,17 @@ def predict(
         Path | None, typer.Option(metavar="DIR", help="Also draw the detections on each photograph.")
     ] = None,
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out images that do not decode.")] = False,
+    device: Device = "cpu",
 ) -> str:
     """Label photographs with a trained detector."""
     from rich.console import Console
 
     from ..api import calls
+    from ..detectors.folder import TrainedDetector
     from ..detectors.tables import show_predictions
 
-    found = calls.predict(detector, photos, out, format, min_score=min_score, overlays=overlays, skip_bad=skip_bad)
+    trained = TrainedDetector.at(detector, device)
+    found = calls.predict(trained, photos, out, format, min_score=min_score, overlays=overlays, skip_bad=skip_bad)
     show_predictions(found, Console(highlight=False))
     print(f"The labels are in {out}" + (f", the pictures in {overlays}" if overlays is not None else ""))
     if overlays is None:

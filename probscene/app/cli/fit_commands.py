@@ -11,7 +11,7 @@ from probscene.errors import ProbsceneError
 
 from ..arguments import checked_seed, range_given
 from .application import command, command_line
-from .options import Assets, Cache, ClusterAddress, NoCache, PresetName, Seed, ValueRange
+from .options import Assets, Cache, ClusterAddress, Device, NoCache, PresetName, Seed, ValueRange
 
 
 @command()
@@ -98,6 +98,7 @@ def fit(
         int | None,
         typer.Option(metavar="N", help="OMP_NUM_THREADS, or all cores, if not given.", rich_help_panel="Computing"),
     ] = None,
+    device: Device = "cpu",
     cluster: ClusterAddress = None,
     cache: Cache = None,
     no_cache: NoCache = False,
@@ -122,7 +123,7 @@ def fit(
     source = None if model is None else with_scenarios(model, scenarios)
     images = TargetImages(target, skip_bad, range_given(value_range), readings)
     request = fit_request(ModelFile(source, assets), images, config, seed, labels, threads)
-    execution = Execution(threads, cluster, False if no_cache else cache or True)
+    execution = Execution(threads, cluster, False if no_cache else cache or True, device=device)
     try:
         done = fit_and_diagnose(request, out, resume, execution, not no_verdict, detector_test)
     except BaseException:

@@ -29,6 +29,12 @@ NoCache = Annotated[
     bool,
     typer.Option("--no-cache", help="Neither use nor keep trained feature networks.", rich_help_panel="Computing"),
 ]
+Device = Annotated[
+    str,
+    typer.Option(
+        metavar="DEVICE", help="Where networks compute: cpu, cuda, cuda:1, mps or auto.", rich_help_panel="Computing"
+    ),
+]
 MinHeight = Annotated[
     float,
     typer.Option(

@@ -13,6 +13,7 @@ from .options import (
     Batch,
     BoxMargin,
     Detector,
+    Device,
     FinetuneFraction,
     Iterations,
     MinVisible,
@@ -100,6 +101,7 @@ def trial(
         ),
     ] = 1000,
     value_range: ValueRange = None,
+    device: Device = "cpu",
 ) -> str:
     """Compare training sets by the detectors that are trained on them."""
     from rich.console import Console
@@ -126,7 +128,7 @@ def trial(
         generated=generated,
         classes=None if classes is None else words_given(classes),
         detector=detector,
-        budget=TrainingBudget(iterations, batch, rate, finetune_fraction, warm_start),
+        budget=TrainingBudget(iterations, batch, rate, finetune_fraction, warm_start, device),
         size=size_given(size),
         seeds=seeds,
         seed=seed,

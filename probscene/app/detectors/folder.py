@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from torch import nn
 
+from probscene.device import chosen_device
 from probscene.errors import DataError
 
 from ..trial.detector import build
@@ -36,13 +37,15 @@ class TrainedDetector:
     Attributes:
         path: its folder.
         record: the contents of its ``detector.json``.
+        device: where it computes, see ``chosen_device``.
     """
 
     path: Path
     record: dict[str, Any]
+    device: str = "cpu"
 
     @classmethod
-    def at(cls, path: Path | str) -> "TrainedDetector":
+    def at(cls, path: Path | str, device: str = "cpu") -> "TrainedDetector":
         """The detector in a folder; its weights are read when it is first called.
 
         Raises:
@@ -67,7 +70,7 @@ class TrainedDetector:
             raise DataError(
                 f"expected the record of a detector in {file}, got a damaged file; train it again."
             ) from error
-        return cls(path, record)
+        return cls(path, record, device)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -103,8 +106,9 @@ class TrainedDetector:
 
         Raises:
             DataError: its weights are missing or damaged.
+            ProbsceneError: see ``chosen_device``.
         """
-        file = self.path / WEIGHTS
+        file, device = self.path / WEIGHTS, chosen_device(self.device)
         try:
             data = file.read_bytes()
             if hashlib.sha256(data).hexdigest() != self.record["weights_sha256"]:
@@ -117,7 +121,7 @@ class TrainedDetector:
                 f"expected the weights of the detector in {file}, got {actual}; put them back, or train it again in "
                 "another folder."
             ) from error
-        return network.eval()
+        return network.eval().to(device)
 
     def __call__(self, image: NDArray[np.uint8]) -> Detections:
         return detect_in(self.network, image, self.size, self.record["recipe"]["first_label"])

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probscene.dataset import Images
+from probscene.device import chosen_device
 from probscene.threads import threads
 
 from ..chunks import chunk_randomness
@@ -61,6 +62,7 @@ class DetectorBudget(NamedTuple):
         dataset: how they are labelled.
         seed: of the images, the first initialisation and its order.
         seeds: detectors of each source.
+        device: where, see ``chosen_device``.
     """
 
     detector: str
@@ -70,6 +72,7 @@ class DetectorBudget(NamedTuple):
     dataset: DatasetOptions
     seed: int
     seeds: int = 1
+    device: str = "cpu"
 
 
 class SourceComparison(NamedTuple):
@@ -152,7 +155,7 @@ def compare_sources(
 
 
 def compare_and_keep(
-    run: RunFolder, images: Images, show: Progress, say: Callable[[str], None]
+    run: RunFolder, images: Images, show: Progress, say: Callable[[str], None], device: str = "cpu"
 ) -> SourceComparison | None:
     """Compare a run's sources, keep what was found for ``train``, and give learnt parameters back where detectors are
     better with the prior's.
@@ -160,6 +163,7 @@ def compare_and_keep(
     Args:
         images: of the run's target.
         say: is told what was found.
+        device: of the detectors, see ``chosen_device``.
 
     Raises:
         RunError: see ``RunFolder.guide``.
@@ -169,7 +173,7 @@ def compare_and_keep(
     recipe = recipe._replace(iterations=recipe.iterations // 2)
     dataset = DatasetOptions(min_visible=MIN_VISIBLE)
     budget = DetectorBudget(
-        "efficientnet", recipe, size_for([run.model.canvas]), NUM_IMAGES, dataset, run.record["seed"], SEEDS
+        "efficientnet", recipe, size_for([run.model.canvas]), NUM_IMAGES, dataset, run.record["seed"], SEEDS, device
     )
     found = compare_sources(run, images, budget, run.path / "sources", show)
     if found is None:
@@ -219,7 +223,7 @@ def _trained(
     generate_scenes(run.model, run.policy(source), budget.images, into, budget.seed, "coco", options=budget.dataset)
     made, recipe = read_set(into), budget.recipe
     with threads(1), chunk_randomness(budget.seed, 0):
-        network = build(budget.detector, len(made.classes), budget.size)
+        network = build(budget.detector, len(made.classes), budget.size).to(chosen_device(budget.device))
         stage = Stage((made.examples,), recipe.num_images)
         train(network, [stage], recipe, budget.size, (budget.seed, 0), more)
 

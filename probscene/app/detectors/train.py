@@ -25,6 +25,7 @@ from torchvision.models.detection.fcos import FCOS
 import probscene
 from probscene.dataset import range_of
 from probscene.decoding import read_rgb
+from probscene.device import chosen_device, device_of
 from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.model import SceneModel
 from probscene.threads import threads
@@ -198,6 +199,7 @@ def train(
             math.ceil(options.generate / 2),
             DatasetOptions(min_visible=options.min_visible, box_margin=options.box_margin),
             seed,
+            device=options.budget.device,
         )
         chosen, compared = _chosen(origin, options.source, budget, out, show, callback)
         _generate(origin, chosen, out / GENERATED, options, workers, show)
@@ -351,13 +353,15 @@ class _Job(NamedTuple):
         # The start and the order of a trial's first seed.
         with threads(1), chunk_randomness(seed, 0):
             network = build(self.options.detector, len(self.made.classes), size)
+            network.to(chosen_device(self.options.budget.device))
             kept = Checkpoints(self._checkpoint(), self._keeper())
             train_stages(network, stages, self.recipe, size, (seed, 0), more, self.value_range, kept)
-        state = {key: value.contiguous() for key, value in network.state_dict().items()}
+        state = {key: value.cpu().contiguous() for key, value in network.state_dict().items()}
         write_whole(self.out / WEIGHTS, lambda temporary: safetensors.torch.save_file(state, temporary))
         record = {
             **self.settings,
             "version": probscene.__version__,
+            "device": str(device_of(network)),
             "generated_sha256": digest_of(self.made),
             "photographs": _named(self.photographs),
             "held_out": _named(tested),
@@ -365,7 +369,7 @@ class _Job(NamedTuple):
             "scores": None,
         }
         if tested is not None:
-            trained, found = TrainedDetector(self.out, record), []
+            trained, found = TrainedDetector(self.out, record, self.options.budget.device), []
             with threads(1):
                 for number, example in enumerate(tested.examples, 1):
                     found.append(trained(read_rgb(example.path, self.value_range)))

@@ -56,6 +56,7 @@ class NetworkCache:
             "code": _code_digest(),
             "torch": torch.__version__,
             "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability(), record["threads"]],
+            **({"devices": record["devices"]} if record.get("devices", ["cpu"]) != ["cpu"] else {}),
             "model": [record["model"], record["model_sha256"], record["assets"], list(run.model.canvas)],
             **({"modules": record["modules"]} if "modules" in record else {}),
             "assets": folder_digest(assets_folder(run.model, record.get("assets_folder"))),

@@ -16,8 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from probscene.dataset import ImageFolder, Images
+from probscene.device import CPU
 from probscene.errors import DataError, ProbsceneError, RunError
-from probscene.inference.features.base import Detections, EmbedsTarget, FeatureNet, embed_all
+from probscene.inference.features.base import Detections, EmbedsTarget, FeatureNet, Placeable, embed_all
 from probscene.inference.statistics.energy import MIN_IMAGES, check_features
 from probscene.inference.training import Training, batch_seed
 from probscene.policy import Policy
@@ -65,23 +66,33 @@ class Begun(NamedTuple):
 
 @dataclass(frozen=True)
 class Execution:
-    """How a fit is computed. Nothing of it but ``threads`` changes a result.
+    """How a fit is computed. Nothing of it but ``threads`` and ``device`` changes a result.
 
     Args:
         threads: of torch; as ``OMP_NUM_THREADS`` says, else all cores, where None. Another number rounds differently.
         cluster: the address of a Ray cluster whose nodes render scenes and read them while structure is learnt, see
             ``Cluster``. They have to see the run's folder by the same path.
         cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
-        folder. progress: show it, on stderr.
+            folder.
+        progress: show it, on stderr.
+        device: of networks: ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"mps"``, or ``"auto"``, see ``chosen_device``.
+            Programs and rendering stay on the CPU, as do the networks of a cluster's nodes. Another rounds differently.
     """
 
     threads: int | None = None
     cluster: str | None = None
     cache: Path | str | bool = True
     progress: bool = True
+    device: str = "cpu"
 
 
-def carry_out(begun: Begun, show: Display, cache: Path | str | bool = True, cluster: Cluster | None = None) -> Policy:
+def carry_out(
+    begun: Begun,
+    show: Display,
+    cache: Path | str | bool = True,
+    cluster: Cluster | None = None,
+    device: torch.device = CPU,
+) -> Policy:
     """Finish a fit: take the stages that it lacks. ``timing.json`` in the run's folder then holds the seconds that each
     stage has taken, over all sittings that were not killed, and as ``other`` those that no stage has: together they are
     the whole.
@@ -89,6 +100,7 @@ def carry_out(begun: Begun, show: Display, cache: Path | str | bool = True, clus
     Args:
         cache: see ``Execution``.
         cluster: of which all nodes render scenes and read them while structure is learnt.
+        device: of networks; the run's record lists those that it was computed on.
 
     Raises:
         DataError: the target cannot be used: see ``check_target`` and ``check_features``.
@@ -98,13 +110,14 @@ def carry_out(begun: Begun, show: Display, cache: Path | str | bool = True, clus
     run, before = begun.run, timing(begun.run)
     if run.is_finished:
         return run.guide
+    _record_device(run, device, show.say)
     if cluster is not None and run.objects:
         raise ProbsceneError(
             f"expected no cluster for a fit with parts in memory alone ({', '.join(run.objects)}); put model and parts "
             "in files, which nodes can open."
         )
     try:
-        return _take_stages(begun, show, cache, cluster)
+        return _take_stages(begun, show, cache, cluster, device)
     finally:
         now = {stage: show.seconds.get(stage, 0.0) for stage in STAGES}
         now[OTHER] = show.elapsed - sum(show.seconds.values())
@@ -112,12 +125,27 @@ def carry_out(begun: Begun, show: Display, cache: Path | str | bool = True, clus
         write_json(run.path / TIMING, {stage: seconds for stage, seconds in spent.items() if seconds})
 
 
-def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, cluster: Cluster | None) -> Policy:
+def _record_device(run: RunFolder, device: torch.device, say: Callable[[str], None]) -> None:
+    """Add the device to the run's, and say so where it is another."""
+    devices = run.record.setdefault("devices", [])
+    if devices and devices[-1] != str(device):
+        say(
+            f"Note: the run was computed on {devices[-1]} and goes on on {device}, which rounds differently: its bytes "
+            "are not those of either alone."
+        )
+    if not devices or devices[-1] != str(device):
+        devices.append(str(device))
+        write_json(run.path / "run.json", run.record)
+
+
+def _take_stages(
+    begun: Begun, show: Display, cache_in: Path | str | bool, cluster: Cluster | None, device: torch.device
+) -> Policy:
     run = begun.run
     images = cache(lambda: open_target(run, show) if begun.images is None else begun.images)
     observer = RenderedFeatures(run.model, run.record["threads"])
     with threads(run.record["threads"]):
-        net = _Network(begun, observer, show, images)
+        net = _Network(begun, observer, show, images, device)
         net.finish(cache_in)
         run.keep_network(net.net)
         real = _real_features(run, net.net, show, images)
@@ -126,11 +154,11 @@ def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, clust
         if which is not None and not which.any():
             message = give_up(run)
         else:
-            guide = learn_structure(run, observer, net.net, real, show, cluster)
+            guide = learn_structure(run, observer, net.net, real, show, cluster, device)
             if run.config.parameters is not None:
                 with threads(run.record["threads"]):
                     learn_parameters(run, observer, net.net, guide, images, show, show.say)
-                refine_structure(run, net.net, real, guide, images, show, cluster)
+                refine_structure(run, net.net, real, guide, images, show, cluster, device)
             message = conclude(run, observer, net.net, real[: len(images())], guide, begun.labels, show)
     for name in (f"{FIRST}-checkpoint", f"{REFINEMENT}-checkpoint", READER):
         (run.path / f"{name}.safetensors").unlink(missing_ok=True)
@@ -142,11 +170,21 @@ def _take_stages(begun: Begun, show: Display, cache_in: Path | str | bool, clust
 class _Network:
     """The run's feature network on its way to being trained."""
 
-    def __init__(self, begun: Begun, observer: RenderedFeatures, show: Display, target: Callable[[], Images]):
+    def __init__(
+        self,
+        begun: Begun,
+        observer: RenderedFeatures,
+        show: Display,
+        target: Callable[[], Images],
+        device: torch.device,
+    ):
         self.run, self.observer, self.progress, self.say, self.target = begun.run, observer, show, show.say, target
         self.photographs = cache(lambda: PartlyLabelledImages(target(), begun.labels, begun.detections))
         seed_everything(batch_seed(self.run.record["seed"], 0))
         self.net = self.run.build_network() if begun.net is None else begun.net
+        module = inner(self.net)
+        if isinstance(module, Placeable):
+            module.place(device)
 
     def finish(self, cache_in: Path | str | bool) -> None:
         """Load it from the run or from the cache, else train it."""

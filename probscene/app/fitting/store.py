@@ -250,7 +250,7 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
 def save_tensors(file: Path, tensors: dict[str, Tensor]) -> None:
     """Write a file of tensors, whole or not at all."""
     # As bytes: safetensors' own writing says neither OSError nor why where the disk is full.
-    whole = safetensors.torch.save({key: value.detach().contiguous() for key, value in tensors.items()})
+    whole = safetensors.torch.save({key: value.detach().cpu().contiguous() for key, value in tensors.items()})
     write_whole(file, lambda temporary: temporary.write_bytes(whole))
 
 

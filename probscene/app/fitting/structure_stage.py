@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from probscene.dataset import Images
+from probscene.device import CPU
 from probscene.inference.count_penalty import PriorCountPenalty
 from probscene.inference.divergence import Divergence
 from probscene.inference.features.base import FeatureNet, embed_all
@@ -34,7 +35,7 @@ from .config import ScoreFunctionTraining
 from .learnt_parameters import NAME, prefixed, with_parameters
 from .outcome import feature_mask
 from .parameter_stage import READER
-from .plugins import inner
+from .plugins import ValidatedDivergence, inner
 from .rendered_features import RENDERED_AT_ONCE, Chunk, Observe, RenderedFeatures
 from .run import RunFolder
 from .store import Checkpointer
@@ -51,12 +52,14 @@ def learn_structure(
     real: Tensor,
     progress: Progress,
     cluster: Cluster | None = None,
+    device: torch.device = CPU,
 ) -> Guide:
     """A guide of the structures of a model with the prior's parameters.
 
     Args:
         real: ``(L, D)``.
         cluster: of which all nodes render and read scenes; else this process does.
+        device: where features are compared.
 
     Raises:
         ProbsceneError: a cost or a parameter is no longer finite.
@@ -69,7 +72,7 @@ def learn_structure(
         return guide
     pool, crew = _pool(run, run.model), _crew(run, cluster, training.draws_per_structure)
     observe = observer.resample_and_embed(net, training.draws_per_structure, crew)
-    objective = _objective(run, run.model, observe, net, guide, pool)
+    objective = _objective(run, run.model, observe, _divergence(run, net, device), guide, pool)
     schedule = _schedule(training, training.batches, training.learning_rate)
     trainer = StructureTraining(run.model, guide, objective, real, schedule, batch_seed(seed, 3), pool)
     keep = Checkpointer(run, FIRST, trainer)
@@ -98,6 +101,7 @@ def refine_structure(
     images: Callable[[], Images],
     progress: Progress,
     cluster: Cluster | None = None,
+    device: torch.device = CPU,
 ) -> None:
     """Go on with a guide whose scenes have learnt parameters; as it is where they have none, and as it was where its
     scenes end farther from the target. Both are seen by what the reader of parameters finds, where that tells more of
@@ -106,7 +110,7 @@ def refine_structure(
     Args:
         real: ``(L, D)``.
         images: opens the target.
-        cluster: see ``learn_structure``.
+        cluster, device: see ``learn_structure``.
 
     Raises:
         ProbsceneError: a cost or a parameter is no longer finite.
@@ -124,7 +128,8 @@ def refine_structure(
     if finder is not None:
         net, real = finder, embed_all(finder, images().batches(RENDERED_AT_ONCE))
     pool, crew = _pool(run, model), _crew(run, cluster, 1, again=True, finder=finder is not None)
-    objective = _objective(run, model, observer.resample_and_embed(net, 1, crew), net, guide, pool)
+    observe = observer.resample_and_embed(net, 1, crew)
+    objective = _objective(run, model, observe, _divergence(run, net, device), guide, pool)
     schedule = _schedule(config.structure, config.refine.batches, SLOWER * config.structure.learning_rate)
     trainer = StructureTraining(model, guide, objective, real, schedule, batch_seed(seed, 7), pool)
     seen = _features_of_samples(run, observer, net, guide)
@@ -195,18 +200,26 @@ def _actor(path: Path, draws_per_structure: int, again: bool, finder: bool) -> C
     return lambda part: observer.part(part, net, draws_per_structure)
 
 
+def _divergence(run: RunFolder, net: FeatureNet, device: torch.device) -> Divergence:
+    """The run's, of features on the CPU; computed on the device where it is ours."""
+    divergence = run.divergence(inner(net))
+    if device == CPU or isinstance(divergence, ValidatedDivergence):
+        return divergence
+    return lambda generated, real: divergence(generated.to(device), real.to(device)).cpu()
+
+
 def _objective(
     run: RunFolder,
     model: SceneModel,
     observe: Observe,
-    net: FeatureNet,
+    divergence: Divergence,
     guide: Guide,
     pool: RenderCache | None,
 ) -> ScoreFunction:
     kinds = {*run.unread, *(model.stuff if run.readings else ())}
     held = PriorCountPenalty(model, kinds, run.config.structure.num_scenes)
     observe = held.append_counts(observe if pool is None else pool.wrap(observe))
-    return score_function(run.config.structure, model, observe, held.add_to(run.divergence(inner(net))), guide)
+    return score_function(run.config.structure, model, observe, held.add_to(divergence), guide)
 
 
 def score_function(

@@ -13,10 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 import safetensors.torch
+import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
+from probscene.device import CPU
 from probscene.errors import RunError
 from probscene.threads import threads
 
@@ -44,6 +46,7 @@ class Job(NamedTuple):
         finetune_fraction: the share of the images that the last of several stages is shown.
         warm_start: every row starts from the detector of the row before.
         value_range: of images of 16 bits, see ``decoding.read_rgb``.
+        device: where detectors are trained and detect.
     """
 
     out: Path
@@ -59,6 +62,7 @@ class Job(NamedTuple):
     finetune_fraction: float
     warm_start: bool
     value_range: tuple[float, float] | None = None
+    device: torch.device = CPU
 
     def run(self, workers: int, progress: Callable[[int, int], None]) -> None:
         """Do what is missing; ``progress`` is called with the number of images shown, and of all.
@@ -96,7 +100,7 @@ class Job(NamedTuple):
             row, s = names.index(name), self._seed_of(task)
             # The same start and order for all rows, whatever was drawn before.
             with chunk_randomness(self.seed, s):
-                detector = build(self.choice, len(self.classes), self.size)
+                detector = build(self.choice, len(self.classes), self.size).to(self.device)
                 rate = 1.0
                 if self.warm_start:
                     rate = WARM_START_RATES[min(row, len(WARM_START_RATES) - 1)]
@@ -108,7 +112,7 @@ class Job(NamedTuple):
             like = self.size, self.recipe.first_label, self.value_range
             found = [detect(detector, example.path, *like) for example in self.test]
             if self.warm_start and row + 1 < len(names):
-                state = {key: value.contiguous() for key, value in detector.state_dict().items()}
+                state = {key: value.cpu().contiguous() for key, value in detector.state_dict().items()}
                 write_whole(self._weights(name, s), partial(safetensors.torch.save_file, state))
             write_whole(self._file(name, s), partial(_save, found, {"settings": self.digests[name]}))
             if self.warm_start and row:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probscene.decoding import read_rgb
+from probscene.device import device_of
 from probscene.errors import ProbsceneError
 
 from .detector import Recipe, pretrained_part
@@ -100,6 +101,7 @@ def train(
     """Train in place, stage after stage, each with an optimiser and a schedule of its own.
 
     Args:
+        detector: on the device where it is trained.
         size: height and width at which images come.
         seed: words of it.
         shown: called with the number of images of each step; first, where there is a start, with those before it.
@@ -142,10 +144,11 @@ def detect_in(detector: nn.Module, image: NDArray[np.uint8], size: tuple[int, in
     """``detect``, in an image ``(H, W, 3)``."""
     small, scale = fitted(image, size)
     with torch.no_grad():
-        found = detector.eval()([_tensor(small)])[0]
-    boxes = found["boxes"].numpy() / scale
+        output = detector.eval()([_tensor(small).to(device_of(detector))])[0]
+    found = {key: output[key].cpu().numpy() for key in ("boxes", "labels", "scores")}
+    boxes = found["boxes"] / scale
     boxes = np.clip(boxes, 0, np.array([image.shape[1], image.shape[0]] * 2, np.float32))
-    return Detections(boxes.astype(np.float32), found["labels"].numpy() - first, found["scores"].numpy())
+    return Detections(boxes.astype(np.float32), found["labels"] - first, found["scores"])
 
 
 def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> tuple[NDArray[np.uint8], float]:
@@ -258,6 +261,7 @@ def _train_stage(
         adam.load_state_dict(start.optimizer)
         before = start.steps
     detector.train()
+    device = device_of(detector)
     examples, left = order(stage.parts, stage.num_images, random), stage.num_images
     for step in range(steps):
         batch = [next(examples) for _ in range(min(recipe.batch_size, left))]
@@ -270,9 +274,10 @@ def _train_stage(
         images, targets = [], []
         for example, each in zip(batch, how, strict=True):
             image, boxes, classes = augmented(example, pictures, each)
-            images.append(_tensor(image))
+            images.append(_tensor(image).to(device))
             labels = torch.from_numpy(classes) + recipe.first_label
-            targets.append({"boxes": torch.from_numpy(boxes).reshape(-1, 4), "labels": labels})
+            target = {"boxes": torch.from_numpy(boxes).reshape(-1, 4), "labels": labels}
+            targets.append({key: value.to(device) for key, value in target.items()})
         loss = torch.stack([*detector(images, targets).values()]).sum()
         if not torch.isfinite(loss):
             raise ProbsceneError("expected a finite loss of the detector, got one that is not; give a lower --rate.")

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from probscene.dataset import range_of
+from probscene.device import chosen_device
 from probscene.errors import DataError, ProbsceneError, RunError
 
 from ..arguments import BoxMargin, checked_box_margin, checked_seed, positive
@@ -53,6 +54,7 @@ class TrainingBudget(NamedTuple):
         finetune_fraction: the share of the images that the last of several stages is shown.
         warm_start: every row starts from the detector of the row before, as in the paper, at half the learning rate and
             then at a tenth.
+        device: where, see ``chosen_device``; another rounds differently.
     """
 
     iterations: int | None = None
@@ -60,6 +62,7 @@ class TrainingBudget(NamedTuple):
     learning_rate: float | None = None
     finetune_fraction: float = 0.5
     warm_start: bool = False
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,7 @@ def trial(
         MachineError: the disk is full, or a worker was killed.
     """
     recipe, budget, generated = recipe_of(options.detector, options.budget), options.budget, options.generated
+    device = chosen_device(budget.device)
     options.check()
     positive(workers, "workers")
     tested, photographs = _photographs(test, options, show)
@@ -229,6 +233,7 @@ def trial(
         budget.finetune_fraction,
         budget.warm_start,
         used,
+        device,
     )
     for row in planned.rows:
         for s in range(seeds):
@@ -249,8 +254,9 @@ def recipe_of(choice: str, budget: TrainingBudget) -> Recipe:
     """What a detector is trained with.
 
     Raises:
-        ProbsceneError: a budget that makes no sense; see also ``checked``.
+        ProbsceneError: a budget that makes no sense; see also ``checked`` and ``chosen_device``.
     """
+    chosen_device(budget.device)
     if not 0 < budget.finetune_fraction < 1:
         raise ProbsceneError(f"expected a fine-tuning fraction between 0 and 1, got {budget.finetune_fraction}.")
     recipe = RECIPES[checked(choice)]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from second_device import SECOND, second_device
 from torchvision.models import resnet50
 
 import probscene as ps
@@ -84,3 +85,16 @@ def test_parts_are_shown_in_turn_and_all_of_each():
     shown = list(order((tuple("abc"), tuple("XY")), 12, np.random.default_rng(0)))
     assert "".join(shown[1::2]).isupper() and sorted(shown[0::2]) == sorted("abc" * 2)
     assert sorted(shown[1::2]) == sorted("XY" * 3)
+
+
+def test_a_detector_on_another_device_has_the_bytes_of_one_on_the_cpu(drawn, monkeypatch):
+    adam = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, "Adam", lambda groups, fused: adam(groups))  # torch fuses on devices that it knows
+    examples, recipe, found = read_set(drawn / "train").examples, RECIPES["efficientnet"], []
+    for device in (torch.device("cpu"), SECOND):
+        with second_device():
+            torch.manual_seed(0)
+            detector = build("efficientnet", 2, (64, 64)).to(device)
+            train(detector, [Stage((examples[:4],), 8)], recipe, (64, 64), (0,))
+            found.append(detect(detector, examples[0].path, (64, 64), recipe.first_label))
+    assert len(found[0].scores) and all((one == other).all() for one, other in zip(*found, strict=True))
