@@ -7,11 +7,13 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import probscene
 
@@ -23,6 +25,7 @@ PACKAGES = {
     "probscene.inference": ROOT / "inference",
 }
 ENGINE = "probscene.renderers.engine"
+PAIR = {"torch": "2.14.1", "torchvision": "0.29.1"}
 
 
 def library() -> dict[str, Path]:
@@ -282,7 +285,17 @@ def test_no_tracked_file_names_a_registry_or_a_home():
         assert not (found := named.search(path.read_bytes())), f"{path.relative_to(ROOT)} names {found[0]!r}"
 
 
+def test_builds_for_the_cpu_alone_satisfy_requirements_and_pins():
+    required = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    for line in [*required, *(ROOT / "constraints.txt").read_text().splitlines()[1:]]:
+        one = Requirement(line)
+        if one.name in PAIR:
+            assert one.specifier.contains(f"{PAIR[one.name]}+cpu"), line
+    command = " ".join(["pip install", *(f"{name}=={version}+cpu" for name, version in PAIR.items())])
+    assert all(command in (ROOT / file).read_text(encoding="utf-8") for file in ("README.md", "docs/start/install.md"))
+
+
 def test_constraints_only_pin():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
-    assert {"torch==2.14.1", "torchvision==0.29.1"} <= set(lines)
+    assert {f"{name}=={version}" for name, version in PAIR.items()} <= set(lines)
