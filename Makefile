@@ -1,5 +1,5 @@
 BENCHMARKS := $(shell grep -l '^def main' benchmarks/*.py)
-.PHONY: install demo docs tutorial test pytest lint benchmark blender clean $(BENCHMARKS)
+.PHONY: install demo docs tutorial test pytest pytest-quadrants lint benchmark blender clean $(BENCHMARKS)
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -45,13 +45,21 @@ tutorial: install
 	@OMP_NUM_THREADS=1 $(BIN)/python docs/run_page.py docs/tutorials/own_model.md
 
 test: install
-	@$(MAKE) --no-print-directory --jobs 3 pytest lint docs
+	@$(MAKE) --no-print-directory --jobs 3 pytest lint docs pytest-quadrants
 
 # One thread a process: two processes with one thread each are faster than one with two. Without xdist's own order, in
 # which files of few tests come last, however long these take. Three for two cores: tests of clusters mostly wait.
 pytest: export OMP_NUM_THREADS := 1
 pytest: install
 	$(BIN)/python -m pytest --quiet --numprocesses 3 --dist loadfile --no-loadscope-reorder
+
+# What draws, with the other engine; a test of tests/models compares bytes. Without what takes long, and memory, which
+# is not the engine's.
+pytest-quadrants: export OMP_NUM_THREADS := 1
+pytest-quadrants: export PROBSCENE_ENGINE := quadrants
+pytest-quadrants: install
+	@$(BIN)/python -m pytest --quiet -p no:cacheprovider tests/renderers \
+	    -k 'not (second_process or users_own_engine or memory)'
 
 # An evening's worth. MNIST's files for the benchmarks that need them: make benchmark MNIST=FOLDER
 # Two at a time, for what is learnt and not for speed: make --jobs 2 benchmark. A script that fails does not stop others.

@@ -1,7 +1,7 @@
-"""The one module that imports Taichi: started lazily, on the CPU, in the process that renders.
+"""The one module that imports Taichi, or Quadrants in its place: started lazily, on the CPU, in the process that draws.
 
 Kernels live in modules of their own, take ``ti`` from here, and have arrays as their only arguments. Three facts about
-Taichi on a CPU shape them: a loop of at most 512 iterations runs on one thread, so a kernel counts to 512 for every
+both on a CPU shape them: a loop of at most 512 iterations runs on one thread, so a kernel counts to 512 for every
 worker and lets the first of each 512 work; arrays should be flat; postponed annotations break kernels.
 """
 
@@ -16,13 +16,18 @@ from probscene.cache import cache_folder
 from probscene.errors import ModelError, ProbsceneError
 from probscene.threads import cores
 
+from .engine_choice import engine_name
+
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("ENABLE_QUADRANTS_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # otherwise the import asks a server for the latest version
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # deprecations inside Taichi must not fail a run under -W error
-    import taichi as ti
-    from taichi.lang.impl import get_runtime
+    warnings.simplefilter("ignore")  # deprecations inside the engine must not fail a run under -W error
+    if engine_name() == "quadrants":
+        import quadrants as ti
+    else:
+        import taichi as ti
 
 __all__ = ["check_canvas", "started", "start", "ti"]
 
@@ -44,21 +49,21 @@ def check_canvas(canvas: tuple[int, int], threads: int | None, most: int) -> tup
 
 
 def started() -> bool:
-    """Whether Taichi runs in this process, by ``start`` or by the user's own ``ti.init``."""
-    return get_runtime().prog is not None
+    """Whether the engine runs in this process, by ``start`` or by the user's own ``ti.init``."""
+    return ti.cfg is not None
 
 
 def start() -> None:
-    """Start Taichi unless it runs already; a program that has called ``ti.init`` itself keeps what it chose.
+    """Start the engine unless it runs already; a program that has called ``ti.init`` itself keeps what it chose.
 
-    How many threads a kernel uses is decided at each call by its number of workers; Taichi gets one for every core.
+    How many threads a kernel uses is decided at each call by its number of workers; the engine gets one for every core.
 
     Raises:
-        ProbsceneError: in a process forked from one in which Taichi ran; its threads are gone and a kernel would hang.
+        ProbsceneError: in a process forked from one in which it ran; its threads are gone and a kernel would hang.
     """
     if _forked_after_start:
         raise ProbsceneError(
-            "expected to render in a process that started Taichi itself, got a fork of one that had rendered; "
+            f"expected to render in a process that started {ti.__name__} itself, got a fork of one that had rendered; "
             "start worker processes with multiprocessing's 'spawn' method."
         )
     if started():
@@ -76,7 +81,7 @@ def start() -> None:
 
 def _cache() -> dict[str, Any]:
     """Where compiled kernels are kept between runs, safe with several processes; nowhere if nothing can be written."""
-    folder = cache_folder() / "taichi"
+    folder = cache_folder() / ti.__name__
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     if os.access(folder, os.W_OK | os.X_OK):

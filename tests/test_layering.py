@@ -7,11 +7,13 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import probscene
 
@@ -23,6 +25,7 @@ PACKAGES = {
     "probscene.inference": ROOT / "inference",
 }
 ENGINE = "probscene.renderers.engine"
+PAIR = {"torch": "2.14.1", "torchvision": "0.29.1"}
 
 
 def library() -> dict[str, Path]:
@@ -147,13 +150,14 @@ def test_benchmarks_import_what_there_is():
                 assert found, f"{path.name} imports {name}"
 
 
-def test_only_the_engine_imports_taichi():
+def test_only_the_engine_imports_taichi_or_quadrants():
     files = [
         path
         for folder in (*PACKAGES.values(), ROOT / "tests", ROOT / "examples", ROOT / "benchmarks")
         for path in folder.rglob("*.py")
     ]
-    importers = {path for path in files if any(f"{name}.".startswith("taichi.") for name in imported(path))}
+    engines = {"taichi", "quadrants"}
+    importers = {path for path in files if any(name.split(".")[0] in engines for name in imported(path))}
     assert importers <= {library().get(ENGINE)}
 
 
@@ -169,28 +173,29 @@ def tidy_codes(filename: str, source: str) -> set[str]:
 
 WRONG = {
     "probscene/x.py": [
-        "import taichi as ti", "import torchvision", "from torchvision.models import resnet18",
-        "import probscene.models.multi_mnist", "from probscene.renderers.engine import render",
+        "import taichi as ti", "import quadrants as ti", "import torchvision",
+        "from torchvision.models import resnet18", "import probscene.models.multi_mnist",
+        "from probscene.renderers.engine import render",
         "from probscene.inference import features", "from probscene import models",
         "from probscene.app.cli import main", "from probscene import app", "def f():\n    import probscene.app.cli",
     ],
     "models/x.py": [
-        "import taichi", "from probscene.renderers.engine import render", "import probscene.inference.lstm",
-        "from probscene import renderers", "from probscene.app.cli import main",
+        "import taichi", "import quadrants", "from probscene.renderers.engine import render",
+        "import probscene.inference.lstm", "from probscene import renderers", "from probscene.app.cli import main",
     ],
     "renderers/x.py": [
-        "import taichi", "from taichi import kernel", "import pyro\n\npyro.sample('x', None)",
+        "import taichi", "from taichi import kernel", "import quadrants", "import pyro\n\npyro.sample('x', None)",
         "from pyro import sample", "from probscene.models.multi_mnist import MODEL", "import probscene.inference.lstm",
         "from probscene.app.cli import main",
     ],
     "inference/x.py": [
-        "import taichi", "from probscene.models.multi_mnist import MODEL", "import probscene.renderers.engine",
-        "from probscene.app.cli import main",
+        "import taichi", "import quadrants", "from probscene.models.multi_mnist import MODEL",
+        "import probscene.renderers.engine", "from probscene.app.cli import main",
     ],
-    "probscene/app/x.py": ["import taichi"],
-    "tests/x.py": ["import taichi"],
-    "examples/x.py": ["import taichi"],
-    "benchmarks/x.py": ["import taichi"],
+    "probscene/app/x.py": ["import taichi", "import quadrants"],
+    "tests/x.py": ["import taichi", "import quadrants"],
+    "examples/x.py": ["import taichi", "import quadrants"],
+    "benchmarks/x.py": ["import taichi", "import quadrants"],
 }  # fmt: skip
 EVERYWHERE = ["import models.multi_mnist", "from renderers.engine import render", "from inference import lstm",
               "import examples.tabletop", "from tests.reference import parse", "import benchmarks.render"]  # fmt: skip
@@ -199,7 +204,7 @@ RIGHT = {
     "probscene/x.py": "import pyro\nimport torch\n\nfrom probscene.grammar import Grammar\n\npyro.sample('x', None)\n",
     "models/x.py": "import pyro\n\nfrom probscene.grammar import Grammar\nfrom probscene.models.y import z\n",
     "renderers/x.py": "import numpy\n\nfrom probscene.drawing import Drawing\nimport probscene.renderers.engine\n",
-    "renderers/engine.py": "import taichi as ti\n\nfrom probscene.drawing import Drawing\n",
+    "renderers/engine.py": "import quadrants\nimport taichi as ti\n\nfrom probscene.drawing import Drawing\n",
     "inference/x.py": "import torchvision\n\nfrom probscene.policy import Policy\nimport probscene.inference.y\n",
     "probscene/app/x.py": "import probscene.inference.y\nimport probscene.models.y\nimport probscene.renderers.y\n",
     "tests/x.py": "import probscene.app.cli\nimport probscene.inference.y\nimport probscene.renderers.engine\n",
@@ -280,7 +285,17 @@ def test_no_tracked_file_names_a_registry_or_a_home():
         assert not (found := named.search(path.read_bytes())), f"{path.relative_to(ROOT)} names {found[0]!r}"
 
 
+def test_builds_for_the_cpu_alone_satisfy_requirements_and_pins():
+    required = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    for line in [*required, *(ROOT / "constraints.txt").read_text().splitlines()[1:]]:
+        one = Requirement(line)
+        if one.name in PAIR:
+            assert one.specifier.contains(f"{PAIR[one.name]}+cpu"), line
+    command = " ".join(["pip install", *(f"{name}=={version}+cpu" for name, version in PAIR.items())])
+    assert all(command in (ROOT / file).read_text(encoding="utf-8") for file in ("README.md", "docs/start/install.md"))
+
+
 def test_constraints_only_pin():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
-    assert {"torch==2.14.1", "torchvision==0.29.1"} <= set(lines)
+    assert {f"{name}=={version}" for name, version in PAIR.items()} <= set(lines)

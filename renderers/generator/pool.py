@@ -7,6 +7,7 @@ where it was killed.
 
 import os
 import shutil
+import socket
 import tempfile
 import threading
 from collections import Counter
@@ -67,7 +68,7 @@ class Pool:
         self._lock, self._owner = threading.RLock(), os.getpid()
         try:
             self.folder = Path(tempfile.mkdtemp(prefix="probscene-"))
-            if len(str(self.folder)) > _MAX_PATH_LENGTH:
+            if hasattr(socket, "AF_UNIX") and len(str(self.folder)) > _MAX_PATH_LENGTH:
                 self.folder.rmdir()
                 self.folder = Path(tempfile.mkdtemp(prefix="probscene-", dir="/tmp"))
             shutil.copyfile(worker.__file__, self.folder / "probscene_worker.py")

@@ -75,7 +75,7 @@ class MeshRenderer:
         Raises:
             ModelError: it is a drawing in 2D; the world holds what cannot be rendered, see ``instances``, or more than
                 2**22 triangles in sight of one scene.
-            ProbsceneError: in a process forked from one in which Taichi ran.
+            ProbsceneError: in a process forked from one in which the engine ran.
         """
         if not isinstance(drawing, World):
             raise ModelError(f"expected a World of meshes, got a {type(drawing).__name__}; take SpriteRenderer.")

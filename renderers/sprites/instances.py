@@ -66,7 +66,7 @@ def instances(drawing: Drawing, sheet: Sheet, canvas: tuple[int, int], coloured:
     values = {name: _joined(drawing, name)[present] for name in ("sprite", *_REAL)}
     _check(values)
     labelled = np.array([layer.labelled for layer in drawing.layers], bool)[layer]
-    rows = max(1, len(scene))  # Taichi takes no empty array
+    rows = max(1, len(scene))  # the engine takes no empty array
     whole, real = np.zeros((rows, kernel.INTEGERS), np.int64), np.zeros((rows, kernel.REALS))
     if len(scene):
         whole[:, kernel.NODE] = np.where(labelled, node, -1)

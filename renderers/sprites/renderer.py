@@ -52,7 +52,7 @@ class SpriteRenderer:
 
         Raises:
             ModelError: it is a world; the drawing holds what cannot be drawn, see ``instances``.
-            ProbsceneError: in a process forked from one in which Taichi ran.
+            ProbsceneError: in a process forked from one in which the engine ran.
         """
         return self._rendered(drawing, True)
 

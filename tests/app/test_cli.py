@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer
@@ -18,6 +19,7 @@ from probscene.app.cli.options import PresetName
 from probscene.app.fitting import pipeline as fit
 from probscene.app.fitting.config import DIVERGENCES
 from probscene.app.fitting.presets import PRESETS, QUICK
+from probscene.app.versions import versions_record
 from probscene.errors import ProbsceneError
 from probscene.inference.guides.lstm import GUIDES
 
@@ -30,7 +32,7 @@ def test_help_is_quick_because_it_imports_nothing_heavy():
     program = (
         "import sys\nfrom probscene.app.cli import main\nsys.argv = ['probscene', 'fit', '--help']\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        "heavy = {'torch', 'pyro', 'taichi', 'numpy', 'cv2', 'scipy', 'matplotlib'} & set(sys.modules)\n"
+        "heavy = {'torch', 'pyro', 'taichi', 'quadrants', 'numpy', 'cv2', 'scipy', 'matplotlib'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
@@ -41,6 +43,12 @@ def test_help_is_quick_because_it_imports_nothing_heavy():
 def test_it_can_be_called_as_a_module():
     run = subprocess.run([sys.executable, "-m", "probscene", "version"], cwd=ROOT, capture_output=True, text=True)
     assert (run.returncode, run.stdout.strip()) == (0, f"probscene {probscene.__version__}"), run.stderr
+
+
+def test_an_unknown_engine_is_named_in_one_line():
+    command, environment = [sys.executable, "-m", "probscene", "check"], {**os.environ, "PROBSCENE_ENGINE": "warp"}
+    run = subprocess.run([*command, "multi_mnist"], cwd=ROOT, capture_output=True, text=True, env=environment)
+    check_fault(SimpleNamespace(code=run.returncode, err=run.stderr), 2, "expected taichi or quadrants", "got 'warp'")
 
 
 def test_version_and_help(call):
@@ -108,6 +116,7 @@ def test_a_fit_leaves_a_run_that_says_how_it_was_made(fitted, discs, target, cal
     features = record["config"]["features"]
     assert features["schedule"]["steps"] == 48 and features["width"] == [4, 8, 8]
     assert record["seed"] == 0 and record["target"] == str(target.images) and record["model"] == str(discs.file)
+    assert record == record | versions_record()
     log = [json.loads(line) for line in (fitted / "log.jsonl").read_text().splitlines()]
     assert [line.get("step", line.get("batch")) for line in log] == [16, 32, 48, 1, 2, 3, 4]
     assert set(json.loads((fitted / "timing.json").read_text())) >= {"reading", "features", "target", "structure"}

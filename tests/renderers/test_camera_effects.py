@@ -278,7 +278,7 @@ digest = hashlib.sha256(found.contiguous().numpy().tobytes()).hexdigest()
 """
 
 
-def test_a_users_own_taichi_gives_the_same_bytes():
+def test_a_users_own_engine_gives_the_same_bytes():
     """Where whole numbers have 64 bits, and real ones as well."""
     command = [sys.executable, "-W", "error", "-c", f"{OWN}{DIGEST}print(digest)"]
     done = subprocess.run(command, capture_output=True, text=True)

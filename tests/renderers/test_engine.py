@@ -1,9 +1,15 @@
-"""How Taichi starts: in silence, beside a user's own, and where nothing can be written."""
+"""Which engine there is, and how it starts: in silence, beside a user's own, and where nothing can be written."""
 
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
+
+import pytest
+
+from probscene.errors import MachineError, ProbsceneError
+from probscene.renderers.engine_choice import engine_name, engine_version
 
 ENGINE = """
 import os, torch
@@ -26,6 +32,9 @@ def child(expected):
     assert os.waitpid(pid, 0)[1] == 0
 """
 
+QUICK = {f"{prefix}_{option}": "0" for prefix in ("TI", "QD") for option in ("ADVANCED_OPTIMIZATION", "OPT_LEVEL")}
+"""To compile, which is most of what some tests do."""
+
 
 def _run(code, **environment):
     command = [sys.executable, "-W", "error", "-c", ENGINE + code]
@@ -34,11 +43,53 @@ def _run(code, **environment):
     return done.stdout
 
 
-def test_taichi_starts_in_silence_in_the_process_that_renders():
+@pytest.fixture
+def installed(monkeypatch):
+    """Has no other engines installed than those named."""
+
+    def only(*names):
+        for name in {"taichi", "quadrants"} - {*names}:
+            monkeypatch.setitem(sys.modules, name, None)
+
+    monkeypatch.delenv("PROBSCENE_ENGINE", raising=False)
+    return only
+
+
+@pytest.mark.parametrize(
+    ("named", "names", "expected"),
+    [
+        ("", ("taichi", "quadrants"), "taichi"),
+        ("", ("quadrants",), "quadrants"),
+        ("quadrants", ("taichi", "quadrants"), "quadrants"),
+        ("taichi", ("taichi", "quadrants"), "taichi"),
+    ],
+)
+def test_the_variable_chooses_or_what_is_installed(named, names, expected, installed, monkeypatch):
+    installed(*names)
+    monkeypatch.setenv("PROBSCENE_ENGINE", named)
+    assert engine_name() == expected and engine_version() == f"{expected} {version(expected)}"
+
+
+@pytest.mark.parametrize(
+    ("named", "names", "kind", "message"),
+    [
+        ("Taichi", ("taichi",), ProbsceneError, "expected taichi or quadrants in the variable .*, got 'Taichi'; corr"),
+        ("quadrants", ("taichi",), MachineError, "got none; pip install quadrants, or unset PROBSCENE_ENGINE."),
+        ("", (), MachineError, "expected the package taichi or quadrants, .* got none; pip install taichi.$"),
+    ],
+)
+def test_an_engine_that_is_not_there_is_named(named, names, kind, message, installed, monkeypatch):
+    installed(*names)
+    monkeypatch.setenv("PROBSCENE_ENGINE", named)
+    with pytest.raises(kind, match=message):
+        engine_name()
+
+
+def test_it_starts_in_silence_in_the_process_that_renders():
     assert _run("child(True)\nrenderer(drawing)\nassert engine.started()\nchild(False)") == ""
 
 
-def test_a_users_own_taichi_is_left_alone():
+def test_a_users_own_is_left_alone():
     code = """
 engine.ti.init(arch=engine.ti.cpu, default_ip=engine.ti.i64, default_fp=engine.ti.f64, offline_cache=False)
 field = engine.ti.field(engine.ti.i32, shape=3)
@@ -48,7 +99,7 @@ assert renderer(drawing).pixels.item() > 0 and field[1] == 7
     assert "Starting" in _run(code)
 
 
-def test_taichi_works_where_no_cache_can_be_written(tmp_path):
+def test_it_works_where_no_cache_can_be_written(tmp_path):
     (tmp_path / "file").touch()
     _run("renderer(drawing)", XDG_CACHE_HOME=str(tmp_path / "file"))
 
@@ -67,7 +118,7 @@ from probscene.world import Camera, Light, Meshes, World, resolve_meshes, resolv
 function, called = engine.ti.lang.kernel_impl.Func, defaultdict(set)
 call = function.func_call_rvalue
 def recorded(self, key, args):
-    called[id(engine.get_runtime().compiling_callable)].add(self.func.__name__)
+    called[id(engine.ti.lang.impl.get_runtime().compiling_callable)].add(self.func.__name__)
     return call(self, key, args)
 function.func_call_rvalue = recorded
 
@@ -85,11 +136,10 @@ print(*(" ".join(sorted(names)) for names in called.values()), sep=",")
 
 
 def test_a_second_process_compiles_nothing(tmp_path):
-    """Taichi finds a kernel of two real functions only where they happen to have the same order of addresses."""
-    folder, compiled = tmp_path / "taichi", []
-    quick = {"TI_ADVANCED_OPTIMIZATION": "0", "TI_OPT_LEVEL": "0"}  # to compile, which is most of it
+    """The engine finds a kernel of two real functions only where they happen to have the same order of addresses."""
+    folder, compiled = tmp_path / engine_name(), []
     for _ in range(2):
-        called = _run(EVERY_KERNEL, PROBSCENE_CACHE=str(tmp_path), **quick).strip().split(",")
-        compiled.append(sorted(path.name for path in folder.glob("*.tic")))
+        called = _run(EVERY_KERNEL, PROBSCENE_CACHE=str(tmp_path), **QUICK).strip().split(",")
+        compiled.append(sorted(path.name for path in folder.rglob("T*.*")))
         assert all(" " not in names for names in called), called
     assert len(compiled[0]) == len(set(compiled[0])) >= len(KERNELS) and compiled[0] == compiled[1]

@@ -306,7 +306,7 @@ def test_renderers_that_cannot_be_are_named(options):
         MeshRenderer(*options)
 
 
-def test_a_users_own_taichi_is_left_alone():
+def test_a_users_own_engine_is_left_alone():
     code = """
 import torch
 from probscene.renderers import engine
@@ -317,7 +317,8 @@ parts = {k: resolve_scene(v, 1) for k, v in dict(camera=Camera(), light=Light(),
 batch = MeshRenderer((20, 20), threads=1)(World(torch.zeros(1, 0, dtype=torch.int64), (), (), ground=None, **parts))
 assert batch.image.float().mean() > 100
 """
-    quick = {"TI_ADVANCED_OPTIMIZATION": "0", "TI_OPT_LEVEL": "0"}  # to compile, which is most of it
+    # Quick to compile, which is most of it.
+    quick = {f"{prefix}_{option}": "0" for prefix in ("TI", "QD") for option in ("ADVANCED_OPTIMIZATION", "OPT_LEVEL")}
     environment = {**os.environ, **quick}
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr

@@ -23,6 +23,7 @@ from probscene.errors import ModelError, ProbsceneError
 from probscene.keypoints import Keypoints, keypoints
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.renderers.engine_choice import engine_version
 from probscene.request import Renderable
 from probscene.sampling import Scenes
 
@@ -230,7 +231,7 @@ class Job:
         self.origin = {"seed": seed, "model": model.name, "guide": guide_hash, "version": probscene.__version__}
         self.origin |= options.record()
         self.folder = DatasetFolder(out, self.origin, num, formats, options.flat)
-        self._renderer = renderer_for(model, threads=1)
+        self._renderer, self._engine = renderer_for(model, threads=1), engine_version()
 
     def run(
         self, work: Callable[[list[int], Callable[[int], None]], None], progress: ProgressCallback | None
@@ -294,7 +295,8 @@ class Job:
         record: dict[str, Any] = {"annotations": [], "keypoints": {}}
         if self.formats != ("images",):
             record |= self._annotated(scenes, drawing, batch, first)
-        record["provenance"] = provenance(self.model, scenes, first, self.origin, self.folder.flat)[:size]
+        origin = {**self.origin, "engine": self._engine}
+        record["provenance"] = provenance(self.model, scenes, first, origin, self.folder.flat)[:size]
         files, links = self._files(drawing, batch, first, record)
         if "panoptic" in self.formats:
             found = panoptic.segments(self.model, batch, record["annotations"], first, self.options.min_visible)

@@ -57,8 +57,8 @@ class SceneDataset(IterableDataset):
     sprites name keypoints, ``keypoints`` ``(n, K, 3)`` float32 are x, y and visibility, in the order of the class's
     names, see ``probscene.keypoints``; zeros where a class has fewer than K.
 
-    Worker processes start Taichi themselves: give the loader ``multiprocessing_context="spawn"``. Several ranks of a
-    distributed training take seeds of their own.
+    Worker processes start the engine themselves: give the loader ``multiprocessing_context="spawn"``. Several ranks of
+    a distributed training take seeds of their own.
 
     Args:
         source: a run or its folder, for the learnt structures; or a model, its built-in name or its file, for the

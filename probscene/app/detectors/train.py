@@ -22,7 +22,6 @@ import torch
 from rich.console import Console
 from torchvision.models.detection.fcos import FCOS
 
-import probscene
 from probscene.dataset import range_of
 from probscene.decoding import read_rgb
 from probscene.device import chosen_device, device_of
@@ -50,6 +49,7 @@ from ..trial.sets import Example, LabelledSet, digest_of
 from ..trial.training import Checkpoint, Checkpoints
 from ..trial.training import train as train_stages
 from ..trial.trial import SIDE_MULTIPLE, TrainingBudget, check_same, read_labelled, recipe_of, size_for
+from ..versions import versions_record
 from .export import check_can_export, export
 from .folder import FORMAT, ONNX, RECORD, SETTINGS, WEIGHTS, TrainedDetector
 from .scores import record_of
@@ -360,7 +360,7 @@ class _Job(NamedTuple):
         write_whole(self.out / WEIGHTS, lambda temporary: safetensors.torch.save_file(state, temporary))
         record = {
             **self.settings,
-            "version": probscene.__version__,
+            **versions_record(),
             "device": str(device_of(network)),
             "generated_sha256": digest_of(self.made),
             "photographs": _named(self.photographs),

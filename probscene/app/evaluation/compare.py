@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import probscene
 from probscene.dataset import Images
 from probscene.errors import ProbsceneError, RunError
 from probscene.inference.statistics.count_metrics import (
@@ -28,6 +27,7 @@ from probscene.inference.statistics.count_metrics import (
 from ..fitting.pipeline import Progress
 from ..fitting.run import RunFolder
 from ..loading import drawn_alike
+from ..versions import versions_record
 from .evaluate import Evaluation, network_counts, renders_read
 from .labels import Labels
 from .likelihood import Likelihood, likelihood
@@ -80,7 +80,7 @@ class Comparison(Evaluation):
     def record(self) -> dict[str, Any]:
         """Everything, for JSON."""
         return {
-            "version": probscene.__version__,
+            **versions_record(),
             "model": self.run.record["model"],
             "target": str(self.target),
             "classes": list(self.classes),

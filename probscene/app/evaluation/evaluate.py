@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import torch
 
-import probscene
 from probscene.dataset import Images
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import objects_counted
@@ -32,6 +31,7 @@ from ..fitting.run import RunFolder
 from ..fitting.scene_features import features_in, features_of, kept_features, own_net
 from ..labels.boxes import Boxes
 from ..progress import Display
+from ..versions import versions_record
 from .count_errors import CountErrors, count_errors
 from .estimate import class_counts, counted_classes, estimate_counts
 from .image_distances import MAX_IMAGES, Distances, image_distances
@@ -159,7 +159,7 @@ class Evaluation:
     def record(self) -> dict[str, Any]:
         """Everything, for JSON."""
         return {
-            "version": probscene.__version__,
+            **versions_record(),
             "run": str(self.run.path),
             "guide_sha256": self.run.guide_hash(),
             "model": self.run.record["model"],

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import probscene
 from probscene.dataset import Images
 from probscene.decoding import checked_range
 from probscene.errors import DataError, ModelError, ProbsceneError, RunError
@@ -27,6 +26,7 @@ from ..modules import file_digest, module_digests
 from ..neighbours import neighbours
 from ..progress import Display
 from ..targets import TargetImages, lasting_target, open_images, say_notes
+from ..versions import versions_record
 from .config import Auto, FitConfig, takers_of_labels
 from .pipeline import Begun, check_target, open_target
 from .plugins import in_memory, is_file_part, part_file
@@ -124,7 +124,7 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
     if note := cost(loaded, config.images):
         show.say(note)
     record = {
-        "version": probscene.__version__,
+        **versions_record(),
         "target": lasting_target(target.source),
         "target_sha256": images.fingerprint,
         "skip_bad": bool(target.skip_bad),

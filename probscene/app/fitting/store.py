@@ -242,7 +242,7 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
         RunError: it is damaged.
     """
     try:
-        return safetensors.torch.load_file(file)
+        return safetensors.torch.load(file.read_bytes())  # a file that is mapped cannot be replaced on Windows
     except (safetensors.SafetensorError, OSError) as error:
         raise RunError(f"expected tensors in {file}, got a damaged file ({error}); delete it.") from error
 

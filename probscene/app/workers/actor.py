@@ -7,16 +7,18 @@ from typing import Any
 
 import probscene
 from probscene.errors import ProbsceneError
+from probscene.renderers.engine_choice import engine_version
 from probscene.renderers.generator.pool import close_pools
 from probscene.threads import use_threads
 
-DECIDING = ("torch", "numpy", "taichi", "pyro-ppl", "opencv-python-headless")
-"""Packages of which another version may give other bytes."""
+DECIDING = ("torch", "numpy", "pyro-ppl", "opencv-python-headless")
+"""Packages, beside the engine, of which another version may give other bytes."""
 
 
 def versions() -> dict[str, str]:
     """Of the library and of what its bytes depend on, here."""
-    return {"probscene": probscene.__version__, **{name: version(name) for name in DECIDING}}
+    packages = {name: version(name) for name in DECIDING}
+    return {"probscene": probscene.__version__, "engine": engine_version(), **packages}
 
 
 class Actor:
@@ -26,8 +28,9 @@ class Actor:
     def __init__(self):
         self._work: Callable[[Any], Any] | None = None
 
-    def versions(self) -> dict[str, str]:
-        return versions()
+    def versions(self) -> tuple[str, Any]:
+        """Answers with ``versions``."""
+        return _answer(versions)
 
     def prepare(self, prepare: Callable[..., Callable[[Any], Any]], arguments: tuple, threads: int) -> tuple[str, Any]:
         """Answers with None."""

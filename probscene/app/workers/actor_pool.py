@@ -199,15 +199,15 @@ class ActorPool:
                     f"{first_line(error, 'No module named')}; install it in the environment that Ray runs in there."
                 ) from error
             return None
-        if request == "versions":
-            self._check_versions(member, result)
-            self._ask(member, "prepare", member.handle.prepare.remote(*self._preparation))
-            return (None,)
         kind, value = result
         if kind == "fault":
             where = f"On node {self._names[member.node]}: "
             shared = f" {SHARED_PATHS}" if request == "prepare" else ""
             raise type(value)(f"{where}{value}{shared}") if isinstance(value, ProbsceneError) else value
+        if request == "versions":
+            self._check_versions(member, value)
+            self._ask(member, "prepare", member.handle.prepare.remote(*self._preparation))
+            return (None,)
         return (value,)
 
     def _check_versions(self, member: Worker, remote: dict[str, str]) -> None:

@@ -1,7 +1,7 @@
 """Worker processes: tasks by number, shared out one at a time.
 
-They are spawned, because Taichi and torch do not survive a fork, and hold no state worth saving: the parent kills them
-when it is interrupted, and a worker whose parent is gone ends after its task.
+They are spawned, because the engine and torch do not survive a fork, and hold no state worth saving: the parent kills
+them when it is interrupted, and a worker whose parent is gone ends after its task.
 
 A process that is spawned first imports the script that started it. A script whose calls are not under a main guard
 would begin again there.

@@ -1,1 +1,1 @@
-"""The mesh renderer's Taichi kernels."""
+"""The mesh renderer's kernels."""

@@ -38,7 +38,7 @@ class MeshAtlas:
         self._surfaces: WeakKeyDictionary[Surface, int] = WeakKeyDictionary()
         self._covers = 0  # surfaces that were ever added
         self._rows, self._bounds = np.zeros((0, 6), np.int64), np.zeros((0, 2, 3))
-        self.positions, self.corners = np.zeros(3, np.float32), np.zeros(3, np.int32)  # Taichi takes no empty array
+        self.positions, self.corners = np.zeros(3, np.float32), np.zeros(3, np.int32)  # the engine takes no empty array
         self.faces = np.zeros(FACE, np.float32)
         self.textures = TextureAtlas()
 

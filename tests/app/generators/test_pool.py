@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from contextlib import suppress
@@ -96,13 +97,17 @@ def test_workers_are_shared_and_as_many_as_are_asked_for(drawn, request_of, comm
     assert 1 <= len(first) <= 2 and pool_for(command(), 1).processes() == first
 
 
-def test_without_unix_sockets_the_bytes_are_the_same(drawn, request_of, fresh, monkeypatch, same):
+def test_without_unix_sockets_the_bytes_are_the_same(drawn, request_of, fresh, command, tmp_path, monkeypatch, same):
+    """In any folder, however long its path."""
     request = request_of(SCENES)
     whole = drawn(request)
     fresh()
     monkeypatch.delattr(socket, "AF_UNIX")
     monkeypatch.delattr(os, "killpg")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / ("long" * 20)))
+    Path(tempfile.tempdir).mkdir()
     assert same(drawn(request, restart_after=7), whole)
+    assert pool_for(command(restart_after=7), 1).folder.parent == Path(tempfile.tempdir)
 
 
 def test_several_threads_draw_at_once(drawn, request_of, same):

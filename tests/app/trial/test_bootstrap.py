@@ -25,7 +25,7 @@ def test_means_over_seeds_are_of_those_drawn():
     np.testing.assert_allclose(over_seeds(each, draws), slow)
 
 
-# Taichi, where a test before has loaded it, has the processor take subnormal numbers for 0.
+# The engine, where a test before has loaded it, has the processor take subnormal numbers for 0.
 SHARES = st.floats(-1, 1, allow_subnormal=False)
 
 

@@ -182,6 +182,12 @@ def test_other_versions_are_refused(nodes, monkeypatch):
         nodes.actor_pool(doubling, ()).run([1], lambda result: None)
 
 
+def test_an_engine_that_a_node_lacks_is_its_answer(monkeypatch):
+    monkeypatch.setenv("PROBSCENE_ENGINE", "none")
+    kind, error = actor_pool.Actor().versions()
+    assert kind == "fault" and isinstance(error, ProbsceneError)
+
+
 def test_the_last_node_is_lost(simulated, nodes):
     while len(simulated.nodes) > 1:
         simulated.kill()
