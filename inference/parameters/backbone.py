@@ -31,10 +31,12 @@ class Backbone(nn.Module):
     Attributes:
         cell: ``(2,)`` pixels of the image that a cell spans, along x and y.
         pretrained_parts: parts that know much already, and are trained slowly.
+        is_random: whether it draws random numbers while it is trained.
     """
 
     cell: Tensor
     pretrained_parts: tuple[nn.Module, ...] = ()
+    is_random = False
 
     def enter(self, images: Tensor) -> Tensor:
         """Of ``(N, 1 or 3, H, W)`` uint8 images."""
@@ -119,6 +121,8 @@ class PhotographBackbone(Backbone):
     Args:
         net: trained.
     """
+
+    is_random = True
 
     def __init__(self, net: FrozenMaps):
         super().__init__()

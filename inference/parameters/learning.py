@@ -15,15 +15,17 @@ References:
     [1] Vandegar et al., *Neural empirical Bayes*, AISTATS 2021.
 """
 
-from collections.abc import Callable
-from functools import cached_property
-from typing import Any, cast
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from functools import cached_property, partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from probscene.model import SceneModel
 from probscene.policy import Policy
+from probscene.prefetch import ahead
 from probscene.sampling import seed_everything
 
 from ..training import Callback, Training, batch_seed, of_prefix
@@ -94,7 +96,7 @@ class ParameterLearning:
         self.guide: ParameterGuide | None = None
         self.missed: MissedObjects | None = None  # during maximum likelihood
         self.inner: Training | None = None
-        self.prefetched: tuple[tuple[int, int], list[SupervisedBatch]] = (-1, -1), []
+        self.batches: Iterator[SupervisedBatch] = iter(())  # of a reader's training
 
     @property
     def learnt(self) -> tuple[Site, ...]:
@@ -122,7 +124,8 @@ class ParameterLearning:
             if callback is not None:
                 callback(self, report)
 
-        self.inner.run(relay)
+        with closing(self._draw_batches(self.inner)) as self.batches:
+            self.inner.run(relay)
         self.inner = self.missed = None
 
     def summary(self) -> dict[str, Any]:
@@ -162,7 +165,7 @@ class ParameterLearning:
         seed = batch_seed(self.seed, 1, self.phase)
         if what == READING:
             rate = schedule.reader_rate / (1 if first else 2)
-            return ReaderTraining(self.calibrated.reader, self._draw, steps, schedule.reader_images, rate, seed)
+            return ReaderTraining(self.calibrated.reader, self._next_batch, steps, schedule.reader_images, rate, seed)
         if what == SCENES:
             rate = schedule.scene_rate / (1 if first else 2)
             head = self.calibrated.reader.scene_head
@@ -195,22 +198,39 @@ class ParameterLearning:
         entered = [self.calibrated.reader.backbone.enter(some.drawn.image) for some in drawn]
         return torch.cat(entered), torch.cat([some.scene_u for some in drawn])
 
-    def _draw(self, num: int) -> SupervisedBatch:
-        """Renders for a step of the reader. Those of several steps are drawn together, which takes hardly longer: a
-        program runs once, and a guide goes from node to node for many scenes as fast as for one."""
-        training, own = cast(ReaderTraining, self.inner), 0 if self.guide is None else round(GUIDE_SHARE * num)
-        part, place = divmod(training.done, PREFETCH_STEPS)
-        if (self.phase, part) != self.prefetched[0]:
-            seed_everything(batch_seed(self.seed, 5, self.phase, part))
-            policy, number = self.model.pretraining_policy, PREFETCH_STEPS * (num - own)
-            drawn = [self.renders.draw_augmented(number, policy, AUGMENTED_SHARE)]
-            if self.guide is not None and own:
-                drawn.append(self.renders.draw_mixed(PREFETCH_STEPS * own, self.guide, PRIOR_PROBABILITY))
-            self.prefetched = (self.phase, part), drawn
-            seed_everything(batch_seed(training.seed, training.done))  # as where they were drawn before
-        parts = zip(self.prefetched[1], (num - own, own), strict=False)
-        # Both in each step, as batch norm is of what a step looks at.
-        return concatenate([some.select(slice(place * n, (place + 1) * n)) for some, n in parts])
+    def _next_batch(self) -> SupervisedBatch:
+        """Renders for a step of the reader."""
+        return next(self.batches)
+
+    def _draw_batches(self, training: Training) -> Generator[SupervisedBatch]:
+        """Renders for the steps of the reader that are left. Those of several steps are drawn together, which takes
+        hardly longer: a program runs once, and a guide goes from node to node for many scenes as fast as for one. The
+        next are drawn in another thread meanwhile, unless steps draw random numbers, too."""
+        if not isinstance(training, ReaderTraining):
+            return
+        num, is_random = training.images, self.calibrated.reader.backbone.is_random
+        own = 0 if self.guide is None else round(GUIDE_SHARE * num)
+        first, skipped = divmod(training.done, PREFETCH_STEPS)
+        numbers = range(first, -(-training.total // PREFETCH_STEPS))
+        draw = partial(self._draw_part, num - own, own)
+        with closing((draw(number) for number in numbers) if is_random else ahead(draw, numbers)) as drawn:
+            for some in drawn:
+                if is_random:
+                    seed_everything(batch_seed(training.seed, training.done))
+                for place in range(skipped, PREFETCH_STEPS):
+                    parts = zip(some, (num - own, own), strict=False)
+                    # Both in each step, as batch norm is of what a step looks at.
+                    yield concatenate([of.select(slice(place * n, (place + 1) * n)) for of, n in parts])
+                skipped = 0
+
+    def _draw_part(self, of_prior: int, of_guide: int, number: int) -> list[SupervisedBatch]:
+        """Renders of the prior and of the guide for several steps, so many a step of each."""
+        seed_everything(batch_seed(self.seed, 5, self.phase, number))
+        policy = self.model.pretraining_policy
+        drawn = [self.renders.draw_augmented(PREFETCH_STEPS * of_prior, policy, AUGMENTED_SHARE)]
+        if self.guide is not None and of_guide:
+            drawn.append(self.renders.draw_mixed(PREFETCH_STEPS * of_guide, self.guide, PRIOR_PROBABILITY))
+        return drawn
 
     def _calibrate(self) -> None:
         """Find which sites the reader can read, by the prior's renders."""

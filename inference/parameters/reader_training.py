@@ -59,7 +59,7 @@ class ReaderTraining(AdamTraining):
 
     Args:
         reader: trained in place.
-        draw: so many valued renders.
+        draw: gives the valued renders of the next step, ``self.images``.
         steps: of AdamW.
         images: a step, at most; see ``Backbone.images_per_step``.
         learning_rate: the largest.
@@ -71,7 +71,7 @@ class ReaderTraining(AdamTraining):
     def __init__(
         self,
         reader: Reader,
-        draw: Callable[[int], SupervisedBatch],
+        draw: Callable[[], SupervisedBatch],
         steps: int = 1000,
         images: int = 12,
         learning_rate: float = 4e-3,
@@ -89,9 +89,14 @@ class ReaderTraining(AdamTraining):
         super().__init__(reader, adam, steps, seed, warmup_steps=30)
         self.reader, self.draw, self.images = reader, draw, reader.backbone.images_per_step(images)
 
+    def seed_step(self) -> None:
+        """Nothing where steps draw no random numbers, as another thread draws renders by its own seeds meanwhile."""
+        if self.reader.backbone.is_random:
+            super().seed_step()
+
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
-        return reader_loss(self.reader, self.draw(self.images))
+        return reader_loss(self.reader, self.draw())
 
 
 class GlobalHeadTraining(AdamTraining):

@@ -110,7 +110,6 @@ def carry_out(
     run, before = begun.run, timing(begun.run)
     if run.is_finished:
         return run.guide
-    _record_device(run, device, show.say)
     if cluster is not None and run.objects:
         raise ProbsceneError(
             f"expected no cluster for a fit with parts in memory alone ({', '.join(run.objects)}); put model and parts "
@@ -142,6 +141,7 @@ def _take_stages(
     begun: Begun, show: Display, cache_in: Path | str | bool, cluster: Cluster | None, device: torch.device
 ) -> Policy:
     run = begun.run
+    _record_device(run, device, show.say)
     images = cache(lambda: open_target(run, show) if begun.images is None else begun.images)
     observer = RenderedFeatures(run.model, run.record["threads"])
     with threads(run.record["threads"]):
