@@ -114,6 +114,31 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     assert learning.calibrated.why_not(site) == "it was read 0 times in the target, fewer than 20"
 
 
+def test_renders_that_are_drawn_meanwhile_are_those_of_before(trays, monkeypatch):
+    """A reader that is interrupted between two draws as well."""
+    counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
+    label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
+    steps = of_images.PREFETCH_STEPS + 3
+    schedule = ParameterSchedule(reader_steps=steps, scene_renders=1, steps=1, rounds=0, reader_images=2)
+    readers = []
+
+    def interrupt(training, report):
+        raise KeyboardInterrupt
+
+    for in_turn, is_interrupted in ((True, False), (False, False), (False, True)):
+        monkeypatch.setattr(RenderBackbone, "is_random", in_turn)
+        torch.manual_seed(0)
+        learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, torch.Tensor, schedule)
+        if is_interrupted:
+            with pytest.raises(KeyboardInterrupt):
+                learning._run_phase(interrupt)
+            assert 0 < learning.inner.done < steps
+        learning._run_phase(None)
+        readers.append(learning.calibrated.reader.state_dict())
+    for other in readers[1:]:
+        assert all(torch.equal(readers[0][key], other[key]) for key in other)
+
+
 def test_only_draws_of_the_prior_supervise_a_reader_in_the_guides_scenes(trays):
     """Half of the values are such draws: uniform, and nothing else in the scene goes by them. The rest are the guide's:
     the second of two siblings is drawn given the guide's own first one, whatever takes its place."""
