@@ -117,7 +117,8 @@ def main():
                 continue
             images, objects, canvas = point.values()
             folder = args.out / f"target-{images}-{objects}-{canvas}"
-            ps.generate(discs(objects, canvas, 0.8), images, folder, format="images", progress=False)
+            options = ps.DatasetOptions(flat=True)
+            ps.generate(discs(objects, canvas, 0.8), images, folder, "images", options, progress=False)
             words = [sys.executable, __file__, "--out", args.out, "--point", images, objects, canvas]
             done = subprocess.run([*map(str, words)], stdout=subprocess.PIPE, text=True, check=True)
             rows.setdefault(what, []).append(json.loads(done.stdout.splitlines()[-1]))

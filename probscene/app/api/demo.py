@@ -83,7 +83,7 @@ TWO_MINUTES = DemoSize(
             "refine.batches": 20,
         }
     ),
-    images=500,
+    images=800,
     generated=200,
     judged=400,
 )
