@@ -1,7 +1,8 @@
 """The device on which networks compute: the one place where a word becomes a ``torch.device``.
 
 Grammars, programs and rendering stay on the CPU. A network that is placed on another device takes there what it is
-given, and gives what it finds back on the CPU. Random numbers of a training are drawn on the CPU, but for dropout's.
+given, and gives what it finds back on the CPU. Trainings draw their random numbers on the CPU, but for dropout's and
+those that torchvision's Mask R-CNN draws.
 """
 
 from itertools import chain
@@ -33,16 +34,18 @@ def chosen_device(name: str) -> torch.device:
     if device is None or device.type not in TYPES:
         raise ProbsceneError(f"expected a device auto, cpu, cuda, cuda:1 or mps, got {name!r}.")
     if (device.index or 0) >= (number := _number(device.type)):
+        remedy = f"name one below {number}" if number else "take cpu, or install a build of torch for it"
         raise MachineError(
             f"expected a device that torch finds on this machine, got {name}, where it finds {number} of type "
-            f"{device.type}; take cpu, or install a build of torch for that device."
+            f"{device.type}; {remedy}."
         )
-    return device
+    return device if device.index else torch.device(device.type)  # the first one has one name
 
 
 def device_of(module: nn.Module) -> torch.device:
-    """Where a module's parameters are, or its buffers where it has none."""
-    return next(chain(module.parameters(), module.buffers())).device
+    """Where a module's parameters are, or its buffers where it has none; the CPU where it has neither."""
+    first = next(chain(module.parameters(), module.buffers()), None)
+    return CPU if first is None else first.device
 
 
 def _number(kind: str) -> int:

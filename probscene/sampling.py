@@ -180,10 +180,10 @@ def log_prob(policy: Policy, scenes: Scenes) -> Tensor:
 
 def seed_everything(seed: int) -> None:
     """Seed torch, numpy and ``random``, as ``pyro.set_rng_seed`` does."""
-    if torch.cuda.is_available():
+    if torch.cuda.is_available() or torch.backends.mps.is_available():
         pyro.set_rng_seed(seed)
         return
-    # Without CUDA torch.manual_seed takes down the whole stack each time, for when there is one.
+    # Without a GPU torch.manual_seed takes down the whole stack each time, for when there is one.
     torch.default_generator.manual_seed(seed)
     random.seed(seed)
     np.random.seed(seed)

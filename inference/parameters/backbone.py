@@ -144,7 +144,8 @@ class PhotographBackbone(Backbone):
         if self.training:
             shifted = (some + SHIFT * torch.randn(*some.shape[:2], 1, 1).to(some.device) for some in maps)
             maps = [F.dropout2d(some, DROPPED) for some in shifted]
-        seen = self.colours(cell_colours(x, size))
+        # On the CPU: MPS does not pool to parts of unequal size.
+        seen = self.colours(cell_colours(x.cpu(), size).to(net.device))
         for side, some in zip(self.sides, maps, strict=True):
             seen = seen + F.interpolate(side(some), size, mode="bilinear")
         return self.both(seen)

@@ -147,7 +147,8 @@ class Reader(nn.Module):
         return Detections(*(part.cpu() for part in found))
 
     def _read_scene(self, entered: Tensor) -> Tensor:
-        return self.scene_head.from_features(global_features(entered))
+        # On the CPU: MPS does not pool to parts of unequal size.
+        return self.scene_head.from_features(global_features(entered.cpu()).to(entered.device))
 
 
 def find_objects(mass: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:

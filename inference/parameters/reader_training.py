@@ -127,11 +127,10 @@ class GlobalHeadTraining(AdamTraining):
 
     def loss(self) -> Tensor:
         """See ``AdamTraining``."""
-        state = torch.get_rng_state()
         number = min(len(self.u), RENDERS_PER_DRAW * (1 + self.done // STEPS_PER_DRAW))
         while self.drawn < number:  # a training that was resumed draws all of them again
             self._draw()
-        torch.set_rng_state(state)
+        self.seed_step()  # as where nothing was drawn
         rows, device = torch.randint(self.drawn, (SCENE_IMAGES,)), device_of(self.head)
         u = self.u[rows].to(device)
         loss = value_loss(self.head.from_features(self.features[rows].to(device)), u.nan_to_num(0.5))

@@ -24,13 +24,25 @@ def test_another_word_is_refused(word):
         chosen_device(word)
 
 
-@pytest.mark.parametrize("word", ["cuda:2", "cpu:1"])
-def test_a_device_that_is_not_there_is_refused(word, monkeypatch):
+@pytest.mark.parametrize(
+    ("word", "gpus", "remedy"), [("cuda:2", 2, "below 2"), ("cpu:1", 0, "below 1"), ("cuda", 0, "take")]
+)
+def test_a_device_that_is_not_there_is_refused(word, gpus, remedy, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    with pytest.raises(MachineError, match=remedy):
+        chosen_device(word)
+
+
+def test_a_device_has_one_name(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(MachineError, match="take cpu"):
-        chosen_device(word)
-    assert chosen_device("cuda:1") == torch.device("cuda", 1)
+    assert [str(chosen_device(word)) for word in ("cuda", "cuda:0", "cuda:1", "cpu:0")] == [
+        "cuda",
+        "cuda",
+        "cuda:1",
+        "cpu",
+    ]
 
 
 @pytest.fixture

@@ -1,7 +1,8 @@
 """A second device without a GPU: tensors that say they are on it, with their numbers in the CPU's memory.
 
 An operation of tensors on both devices fails as it would on a GPU, and everything else gives the CPU's own bytes, with
-its gradients. Torch calls the device ``lazy``, a type that no build of torch computes on.
+its gradients. Torch calls the device ``lazy``, a type that no build of torch computes on. Unlike on a GPU, numbers on
+the CPU may meet any tensor, random numbers are the CPU's, and there is no pinned memory.
 """
 
 from contextlib import contextmanager

@@ -105,8 +105,8 @@ class CountBatch(NamedTuple):
     group_cells: Tensor | None
 
     def to(self, device: torch.device) -> "CountBatch":
-        """On a device."""
-        return self._each(lambda part: part.to(device, non_blocking=True))
+        """On a device; what is pinned is copied while the CPU goes on."""
+        return self._each(lambda part: part.to(device, non_blocking=part.is_pinned()))
 
     def pinned(self) -> "CountBatch":
         """In memory that a CUDA GPU copies from while the CPU goes on."""

@@ -11,7 +11,7 @@ from probscene.errors import ProbsceneError
 
 from ..arguments import checked_seed, range_given
 from .application import command, command_line
-from .options import Assets, Cache, ClusterAddress, Device, NoCache, PresetName, Seed, ValueRange
+from .options import Assets, Cache, ClusterAddress, NoCache, PresetName, Seed, ValueRange
 
 
 @command()
@@ -98,7 +98,14 @@ def fit(
         int | None,
         typer.Option(metavar="N", help="OMP_NUM_THREADS, or all cores, if not given.", rich_help_panel="Computing"),
     ] = None,
-    device: Device = "cpu",
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEVICE",
+            help="Where networks compute: cpu (if not given), cuda, cuda:1, mps or auto.",
+            rich_help_panel="Computing",
+        ),
+    ] = None,
     cluster: ClusterAddress = None,
     cache: Cache = None,
     no_cache: NoCache = False,

@@ -231,7 +231,7 @@ class Job:
         self.origin = {"seed": seed, "model": model.name, "guide": guide_hash, "version": probscene.__version__}
         self.origin |= options.record()
         self.folder = DatasetFolder(out, self.origin, num, formats, options.flat)
-        self._renderer, self._engine = renderer_for(model, threads=1), engine_version()
+        self._renderer = renderer_for(model, threads=1)
 
     def run(
         self, work: Callable[[list[int], Callable[[int], None]], None], progress: ProgressCallback | None
@@ -295,7 +295,8 @@ class Job:
         record: dict[str, Any] = {"annotations": [], "keypoints": {}}
         if self.formats != ("images",):
             record |= self._annotated(scenes, drawing, batch, first)
-        origin = {**self.origin, "engine": self._engine}
+        own = self.model.generator is None  # another program's images have no engine of ours
+        origin = {**self.origin, **({"engine": engine_version()} if own else {})}
         record["provenance"] = provenance(self.model, scenes, first, origin, self.folder.flat)[:size]
         files, links = self._files(drawing, batch, first, record)
         if "panoptic" in self.formats:

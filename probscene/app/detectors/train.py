@@ -102,6 +102,7 @@ class TrainOptions:
             MachineError: a package for ONNX is not installed.
         """
         recipe = recipe_of(self.detector, self.budget)
+        chosen_device(self.budget.device)
         checked_seed(self.seed)
         positive(self.generate, "images to generate")
         if self.budget.warm_start:
@@ -181,7 +182,7 @@ def train(
         "format": FORMAT, "detector": fingerprint(options.detector), "classes": list(names),
         "size": list(size), "recipe": recipe._asdict(),
         "finetune_fraction": options.budget.finetune_fraction, "seed": seed,
-        "value_range": None if used is None else list(used),
+        "value_range": None if used is None else list(used), **options.budget.device_record(),
         "generated": {
             **origin.record, "source": options.source, "images": options.generate, "min_visible": options.min_visible,
             "box_margin": checked_box_margin(options.box_margin),
@@ -216,10 +217,10 @@ def train(
         (out / name).unlink(missing_ok=True)
     if (out / GENERATED).is_dir():
         shutil.rmtree(out / GENERATED)
-    trained = TrainedDetector.at(out)
+    trained = TrainedDetector.at(out, options.budget.device)
     if options.onnx and not (out / ONNX).is_file():
         with threads(1):
-            export(cast(FCOS, trained.network), trained.size, out / ONNX)
+            export(cast(FCOS, TrainedDetector.at(out).network), trained.size, out / ONNX)
     return trained
 
 
@@ -382,7 +383,7 @@ class _Job(NamedTuple):
         if not file.is_file():
             return None
         try:
-            return Checkpoint(**torch.load(file, weights_only=True))
+            return Checkpoint(**torch.load(file, map_location="cpu", weights_only=True))
         except (RuntimeError, ValueError, TypeError, EOFError, pickle.UnpicklingError) as error:
             raise RunError(f"expected a checkpoint in {file}, got a damaged file; delete it to begin anew.") from error
 

@@ -125,6 +125,7 @@ def begin(request: FitRequest, out: Path, show: Display, make: type[RunFolder] =
         show.say(note)
     record = {
         **versions_record(),
+        "devices": [],
         "target": lasting_target(target.source),
         "target_sha256": images.fingerprint,
         "skip_bad": bool(target.skip_bad),

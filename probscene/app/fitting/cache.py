@@ -56,7 +56,7 @@ class NetworkCache:
             "code": _code_digest(),
             "torch": torch.__version__,
             "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability(), record["threads"]],
-            **({"devices": record["devices"]} if record.get("devices", ["cpu"]) != ["cpu"] else {}),
+            **({"devices": [*map(_named, devices)]} if (devices := record.get("devices", ["cpu"])) != ["cpu"] else {}),
             "model": [record["model"], record["model_sha256"], record["assets"], list(run.model.canvas)],
             **({"modules": record["modules"]} if "modules" in record else {}),
             "assets": folder_digest(assets_folder(run.model, record.get("assets_folder"))),
@@ -100,6 +100,11 @@ class NetworkCache:
     def _log(self) -> Path:
         """The log of the network's training, under a digest of both."""
         return self.file.with_suffix(".jsonl")
+
+
+def _named(device: str) -> str:
+    """A device with its processor, whose kind decides about bytes."""
+    return f"{device} {torch.cuda.get_device_name(device)}" if device.startswith("cuda") else device
 
 
 def _digest(tensors: dict[str, Tensor], lines: Sequence[str] = ()) -> str:

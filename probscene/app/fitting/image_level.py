@@ -3,9 +3,11 @@ labelled ones, M boxes of one, C H W."""
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from probscene.dataset import Images
+from probscene.device import CPU
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.meta_sim.learning import MetaSimLearning
 from probscene.inference.parameters.meta_sim.schedule import MetaSimSchedule
@@ -25,17 +27,23 @@ MAX_BOXED_IMAGES = 500
 
 
 def meta_sim_learning(
-    run: RunFolder, observer: RenderedFeatures, guide: Guide, images: Tensor, schedule: MetaSimSchedule
+    run: RunFolder,
+    observer: RenderedFeatures,
+    guide: Guide,
+    images: Tensor,
+    schedule: MetaSimSchedule,
+    device: torch.device = CPU,
 ) -> MetaSimLearning:
     """Meta-Sim's training, by EfficientNet's pooled features.
 
     Args:
         guide: of the structures.
         images: ``(L, C, H, W)`` uint8 of the target.
+        device: of EfficientNet.
     """
     from probscene.inference.features.pretrained import EfficientNetLite  # torchvision takes seconds to import
 
-    look = EfficientNetLite(schedule.feature_size)
+    look = EfficientNetLite(schedule.feature_size).to(device)
     seed = batch_seed(run.record["seed"], 5)
     return MetaSimLearning(run.model, guide, observer.observe(look), look.embed(images), schedule, seed)
 
@@ -47,6 +55,7 @@ def tilting_learning(
     images: Tensor,
     schedule: TiltingSchedule,
     objects: Objects | None,
+    device: torch.device = CPU,
 ) -> TiltingLearning:
     """The training that tilts, by the same features and by image statistics; other arguments as of
     ``meta_sim_learning``.
@@ -57,7 +66,7 @@ def tilting_learning(
     from probscene.inference.features.pretrained import EfficientNetLite
 
     seed = batch_seed(run.record["seed"], 5)
-    looks = EfficientNetLite(schedule.feature_size).embed, image_statistics
+    looks = EfficientNetLite(schedule.feature_size).to(device).embed, image_statistics
     real = tuple(look(images) for look in looks)
     return TiltingLearning(run.model, guide, observer.labelled, looks, real, schedule, seed, objects)
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from probscene.dataset import Images
+from probscene.device import CPU
 from probscene.inference.features.base import FeatureNet
 from probscene.inference.guides.base import Guide
 from probscene.inference.parameters.backbone import Backbone, RenderBackbone
@@ -49,6 +50,7 @@ def learn_parameters(
     images: Callable[[], Images],
     progress: Progress,
     say: Callable[[str], None],
+    device: torch.device = CPU,
 ) -> None:
     """Learn the parameters of the model's sites; from now on the guide's scenes have them, where they are kept.
 
@@ -57,6 +59,7 @@ def learn_parameters(
         guide: of the structures; its scenes are rendered.
         images: opens the target.
         say: is told which sites were learnt.
+        device: of the networks that whole images are compared by.
 
     Raises:
         ProbsceneError: a loss is no longer finite.
@@ -88,7 +91,7 @@ def learn_parameters(
                 batch_seed(run.record["seed"], 5),
             )
         elif isinstance(schedule, MetaSimSchedule):
-            learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule)
+            learning = meta_sim_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule, device)
         else:
             assert isinstance(schedule, TiltingSchedule)
             boxes = given_boxes(run, target)
@@ -97,7 +100,8 @@ def learn_parameters(
                 say(margins_said(margins))
                 boxes = without_margins(boxes, margins)
             objects = labelled_objects(run, boxes, target)
-            learning = tilting_learning(run, observer, guide, _some(target, ~held, schedule.images), schedule, objects)
+            some = _some(target, ~held, schedule.images)
+            learning = tilting_learning(run, observer, guide, some, schedule, objects, device)
         keep = Checkpointer(run, NAME, learning)
 
         def each(training: Training, line: dict[str, float]) -> None:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from probscene.dataset import ImageFolder, Images
-from probscene.device import CPU
+from probscene.device import CPU, chosen_device
 from probscene.errors import DataError, ProbsceneError, RunError
 from probscene.inference.features.base import Detections, EmbedsTarget, FeatureNet, Placeable, embed_all
 from probscene.inference.statistics.energy import MIN_IMAGES, check_features
@@ -75,15 +75,25 @@ class Execution:
         cache: whether trained feature networks are taken from the user's cache folder and kept there; or another
             folder.
         progress: show it, on stderr.
-        device: of networks: ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"mps"``, or ``"auto"``, see ``chosen_device``.
-            Programs and rendering stay on the CPU, as do the networks of a cluster's nodes. Another rounds differently.
+        device: of networks: ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"mps"``, or ``"auto"``, see ``chosen_device``; the
+            CPU where None, or the device that a resumed run was computed on last. Programs and rendering stay on the
+            CPU, as do the networks of a cluster's nodes. Another device rounds differently.
     """
 
     threads: int | None = None
     cluster: str | None = None
     cache: Path | str | bool = True
     progress: bool = True
-    device: str = "cpu"
+    device: str | None = None
+
+    def device_of(self, run: RunFolder) -> torch.device:
+        """Where the run's networks compute.
+
+        Raises:
+            ProbsceneError: see ``chosen_device``.
+        """
+        before = run.record.get("devices") or [str(CPU)]
+        return chosen_device(before[-1] if self.device is None else self.device)
 
 
 def carry_out(
@@ -126,11 +136,11 @@ def carry_out(
 
 def _record_device(run: RunFolder, device: torch.device, say: Callable[[str], None]) -> None:
     """Add the device to the run's, and say so where it is another."""
-    devices = run.record.setdefault("devices", [])
+    devices = run.record.setdefault("devices", [str(CPU)])
     if devices and devices[-1] != str(device):
         say(
-            f"Note: the run was computed on {devices[-1]} and goes on on {device}, which rounds differently: its bytes "
-            "are not those of either alone."
+            f"Note: this run was computed on {devices[-1]} so far and continues on {device}, which rounds differently; "
+            "its bytes are those of neither alone."
         )
     if not devices or devices[-1] != str(device):
         devices.append(str(device))
@@ -157,7 +167,7 @@ def _take_stages(
             guide = learn_structure(run, observer, net.net, real, show, cluster, device)
             if run.config.parameters is not None:
                 with threads(run.record["threads"]):
-                    learn_parameters(run, observer, net.net, guide, images, show, show.say)
+                    learn_parameters(run, observer, net.net, guide, images, show, show.say, device)
                 refine_structure(run, net.net, real, guide, images, show, cluster, device)
             message = conclude(run, observer, net.net, real[: len(images())], guide, begun.labels, show)
     for name in (f"{FIRST}-checkpoint", f"{REFINEMENT}-checkpoint", READER):

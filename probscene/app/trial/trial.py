@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from probscene.dataset import range_of
-from probscene.device import chosen_device
+from probscene.device import CPU, chosen_device
 from probscene.errors import DataError, ProbsceneError, RunError
 
 from ..arguments import BoxMargin, checked_box_margin, checked_seed, positive
@@ -63,6 +63,11 @@ class TrainingBudget(NamedTuple):
     finetune_fraction: float = 0.5
     warm_start: bool = False
     device: str = "cpu"
+
+    def device_record(self) -> dict[str, str]:
+        """The device, where it is not the CPU: detectors of two devices do not belong together."""
+        device = chosen_device(self.device)
+        return {} if device == CPU else {"device": str(device)}
 
 
 @dataclass(frozen=True)
@@ -197,7 +202,7 @@ def trial(
     shared = {
         "format": FORMAT, "classes": list(names), "detector": fingerprint(options.detector),
         "recipe": [recipe.num_images, *recipe[1:]], "last": budget.finetune_fraction, "chain": budget.warm_start,
-        "size": list(size), "seed": seed, "test": digest_of(tested),
+        "size": list(size), "seed": seed, "test": digest_of(tested), **budget.device_record(),
     }  # fmt: skip
     if value_range is None and generated is not None:
         value_range = generated.opened.record.get("value_range")
@@ -254,9 +259,8 @@ def recipe_of(choice: str, budget: TrainingBudget) -> Recipe:
     """What a detector is trained with.
 
     Raises:
-        ProbsceneError: a budget that makes no sense; see also ``checked`` and ``chosen_device``.
+        ProbsceneError: a budget that makes no sense; see also ``checked``.
     """
-    chosen_device(budget.device)
     if not 0 < budget.finetune_fraction < 1:
         raise ProbsceneError(f"expected a fine-tuning fraction between 0 and 1, got {budget.finetune_fraction}.")
     recipe = RECIPES[checked(choice)]

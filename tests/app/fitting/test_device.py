@@ -2,6 +2,7 @@
 
 import json
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 import safetensors.torch
@@ -34,7 +35,8 @@ FITS = {
 @pytest.fixture
 def second(monkeypatch) -> str:
     """The word of the second device is taken."""
-    monkeypatch.setattr("probscene.app.api.fit.chosen_device", torch.device)
+    for module in ("api.fit", "fitting.pipeline"):
+        monkeypatch.setattr(f"probscene.app.{module}.chosen_device", torch.device)
     return str(SECOND)
 
 
@@ -64,11 +66,24 @@ def test_a_fit_there_has_the_bytes_of_one_on_the_cpu(name, second, discs, target
 def test_a_run_goes_on_on_another_device_and_says_so(second, discs, target, tmp_path, capsys):
     config = configuration(ps.preset("quick"), "count", parameters="none", settings=STRUCTURE)
     run = ps.fit(discs.file, target.images, config, out=tmp_path / "run", execution=EXECUTION)
-    for name in ("guide.safetensors", "run-finished"):
-        (run.path / name).unlink(missing_ok=True)
+    (run.path / "guide.safetensors").unlink()
     execution = ps.Execution(1, cache=False, device=second)
     with second_device():
         ps.fit(out=run.path, resume=True, execution=execution)
-    assert f"computed on cpu and goes on on {second}" in " ".join(capsys.readouterr().err.split())
+    assert f"computed on cpu so far and continues on {second}" in " ".join(capsys.readouterr().err.split())
     assert json.loads((run.path / "run.json").read_text())["devices"] == ["cpu", second]
     assert RunFolder.at(run.path).is_finished
+
+
+def test_a_resumed_run_stays_where_it_was(second):
+    def run(**record):
+        return SimpleNamespace(record=record)
+
+    assert str(ps.Execution().device_of(run(devices=["cpu", second]))) == second
+    assert str(ps.Execution(device="cpu").device_of(run(devices=[second]))) == "cpu"
+    assert [str(ps.Execution().device_of(each)) for each in (run(), run(devices=[]))] == ["cpu", "cpu"]
+
+
+def test_a_device_that_there_is_not_is_said(call, discs, target, tmp_path):
+    done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--device", "tpu")
+    assert done.code == 2 and "a device auto, cpu, cuda, cuda:1 or mps" in done.err and not (tmp_path / "run").exists()

@@ -5,18 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 import safetensors.torch
 import torch
 from second_device import SECOND, second_device
 from torchvision.models import resnet50
 
 import probscene as ps
+from probscene.app.detectors.train import TrainOptions
 from probscene.app.trial.detector import RECIPES, build
 from probscene.app.trial.sets import read_set
 from probscene.app.trial.training import Pictures, Stage, augmented, detect, draw_augmentation, fitted, order, train
 from probscene.app.trial.trial import TrainingBudget, TrialOptions, trial
 from probscene.decoding import read_rgb
-from probscene.errors import DataError
+from probscene.errors import DataError, RunError
 
 SMALL = {"budget": TrainingBudget(iterations=2), "seeds": 2, "resamples": 20, "size": (64, 64)}
 
@@ -98,3 +100,32 @@ def test_a_detector_on_another_device_has_the_bytes_of_one_on_the_cpu(drawn, mon
             train(detector, [Stage((examples[:4],), 8)], recipe, (64, 64), (0,))
             found.append(detect(detector, examples[0].path, (64, 64), recipe.first_label))
     assert len(found[0].scores) and all((one == other).all() for one, other in zip(*found, strict=True))
+
+
+def test_trials_and_kept_detectors_on_another_device_are_those_of_the_cpu(drawn, discs, tmp_path, monkeypatch):
+    adam, word = torch.optim.Adam, str(SECOND)
+    monkeypatch.setattr(torch.optim, "Adam", lambda groups, fused: adam(groups))
+    for module in ("trial.trial", "detectors.train", "detectors.folder"):
+        monkeypatch.setattr(f"probscene.app.{module}.chosen_device", torch.device)
+    image, seen = read_rgb(next((drawn / "test" / "images").glob("*.png"))), []
+    for device in ("cpu", word):
+        budget = TrainingBudget(iterations=2, device=device)
+        with second_device():
+            options = TrialOptions(seeds=1, resamples=20, size=(64, 64), budget=budget)
+            trial(drawn / "test", tmp_path / f"trial-{device}", {"two": f"{drawn / 'train'}:2"}, options)
+            options = TrainOptions(generate=4, size=(64, 64), budget=budget)
+            trained = ps.train(discs.file, None, None, tmp_path / device, options, progress=False)
+            found = trained(image), ps.predict(trained, drawn / "test" / "images", tmp_path / f"{device}.json").found[0]
+        assert trained.record["device"] == device == trained.device
+        seen.append([*found[0], *found[1]])
+    assert all((one == other).all() for one, other in zip(*seen, strict=True))
+    for name in (f"trainings/{file.name}" for file in (tmp_path / "trial-cpu" / "trainings").iterdir()):
+        one, other = (safetensors.numpy.load_file(tmp_path / f"trial-{device}" / name) for device in ("cpu", word))
+        assert one.keys() == other.keys() and all((one[key] == other[key]).all() for key in one)
+    with pytest.raises(RunError, match="device"):
+        trial(
+            drawn / "test",
+            tmp_path / "trial-cpu",
+            {"two": f"{drawn / 'train'}:2"},
+            TrialOptions(seeds=1, resamples=20, size=(64, 64), budget=TrainingBudget(iterations=2, device=word)),
+        )
