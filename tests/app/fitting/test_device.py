@@ -26,7 +26,8 @@ FITS = {
     "count, parameters": ("count", "likelihood", {**SHORT, **LEARN}),
     "count=efficientnet, parameters": (
         "count=efficientnet", "likelihood",
-        {**GUIDE, **LEARN, "features.pairs": 8, "features.epochs": 1, "parameters.rounds": 0},
+        {**GUIDE, **LEARN, "parameters.rounds": 0, "features.pairs": 8, "features.photographs": 8,
+         "features.epochs": 1},
     ),
     "presence": ("presence", "none", {**GUIDE, "features.images": 40, "features.epochs": 2}),
 }  # fmt: skip
@@ -44,7 +45,8 @@ def second(monkeypatch) -> str:
 def test_a_fit_there_has_the_bytes_of_one_on_the_cpu(name, second, discs, target, tmp_path, monkeypatch):
     anything_is_read(monkeypatch)
     monkeypatch.setattr(reader, "MAX_OBJECTS", 3)
-    monkeypatch.setattr(learning, "CALIBRATION_RENDERS", 12)
+    for renders in ("CALIBRATION_RENDERS", "MISSED_RENDERS"):
+        monkeypatch.setattr(learning, renders, 12)
     monkeypatch.setattr(net, "HEADS", 2)
     monkeypatch.setattr(net.PretrainedCountNet.__init__, "__defaults__", ((), 30, (96, 96)))
     features, parameters, settings = FITS[name]
