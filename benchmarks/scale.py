@@ -30,6 +30,7 @@ from given import out_option
 import probscene as ps
 from probscene.app.files import write_json
 from probscene.app.fitting.store import timing
+from probscene.app.memory import tune_malloc
 
 GRAMMAR = ps.Grammar("""
     Scene -> Discs
@@ -66,6 +67,7 @@ def discs(objects: int, canvas: int, reds: float) -> ps.SceneModel:
 
 def measured(images: int, objects: int, canvas: int, out: Path) -> dict[str, Any]:
     """A point's row."""
+    tune_malloc()  # as the command line does
     name = f"{images}-{objects}-{canvas}"
     target = out / f"target-{name}"
     execution = ps.Execution(1, cache=False)
