@@ -108,7 +108,7 @@ def fit_and_diagnose(
             from ..detectors.source_comparison import compare_and_keep  # torchvision takes seconds to import
 
             images = images or open_target(done.run, show)
-            compare_and_keep(done.run, images, show, show.say, str(execution.device_of(done.run)))
+            compare_and_keep(done.run, images, show, show.say, str(execution.device_for(done.run)))
         if verdict and done.unfinished:
             found = diagnose(done.run, images or open_target(done.run, show), show)
     return FitAndDiagnostics(done.run, found)
@@ -140,7 +140,7 @@ def carried_out(request: FitRequest, out: Path, show: Display, resume: bool, exe
         begun: Begun = (beginning.resume if resume else beginning.begin)(request, out, show, Run)
         run, unfinished = begun.run, not begun.run.is_finished
         assert isinstance(run, Run)
-        carry_out(begun, show, execution.cache, nodes, execution.device_of(run))
+        carry_out(begun, show, execution.cache, nodes, execution.device_for(run))
     if unfinished:
         warn_of_saturated_lists(run, show)
     return Done(run, begun.images, unfinished)

@@ -86,7 +86,7 @@ class Execution:
     progress: bool = True
     device: str | None = None
 
-    def device_of(self, run: RunFolder) -> torch.device:
+    def device_for(self, run: RunFolder) -> torch.device:
         """Where the run's networks compute.
 
         Raises:

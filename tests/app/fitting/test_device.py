@@ -81,9 +81,9 @@ def test_a_resumed_run_stays_where_it_was(second):
     def run(**record):
         return SimpleNamespace(record=record)
 
-    assert str(ps.Execution().device_of(run(devices=["cpu", second]))) == second
-    assert str(ps.Execution(device="cpu").device_of(run(devices=[second]))) == "cpu"
-    assert [str(ps.Execution().device_of(each)) for each in (run(), run(devices=[]))] == ["cpu", "cpu"]
+    assert str(ps.Execution().device_for(run(devices=["cpu", second]))) == second
+    assert str(ps.Execution(device="cpu").device_for(run(devices=[second]))) == "cpu"
+    assert [str(ps.Execution().device_for(each)) for each in (run(), run(devices=[]))] == ["cpu", "cpu"]
 
 
 def test_a_device_that_there_is_not_is_said(call, discs, target, tmp_path):
