@@ -375,12 +375,17 @@ def embed_all(
     Raises:
         ProbsceneError: a feature is not finite.
     """
-    out = []
+    features, done = torch.zeros(0, len(net.names)), 0
     for images in batches:
-        out.append(embed_real(net, images) if real else net.embed(images))
+        some = embed_real(net, images) if real else net.embed(images)
+        if done + len(some) > len(features):  # small tensors that stay would keep the large ones' memory in pieces
+            more = features.new_empty(max(done, 16 * len(some)), len(net.names))
+            features = torch.cat([features[:done], more])
+        features[done : done + len(some)] = some
+        done += len(some)
         if callback is not None:
             callback(len(images))
-    features = torch.cat(out)
+    features = features[:done].clone()
     if not torch.isfinite(features).all():
         raise ProbsceneError("expected finite features, got NaN or infinity; train the feature network again.")
     return features
