@@ -232,6 +232,8 @@ class Job:
         self.origin |= options.record()
         self.folder = DatasetFolder(out, self.origin, num, formats, options.flat)
         self._renderer = renderer_for(model, threads=1)
+        # Another program's images have no engine of ours.
+        self._engine = {"engine": engine_version()} if model.generator is None else {}
 
     def run(
         self, work: Callable[[list[int], Callable[[int], None]], None], progress: ProgressCallback | None
@@ -295,8 +297,7 @@ class Job:
         record: dict[str, Any] = {"annotations": [], "keypoints": {}}
         if self.formats != ("images",):
             record |= self._annotated(scenes, drawing, batch, first)
-        own = self.model.generator is None  # another program's images have no engine of ours
-        origin = {**self.origin, **({"engine": engine_version()} if own else {})}
+        origin = self.origin | self._engine
         record["provenance"] = provenance(self.model, scenes, first, origin, self.folder.flat)[:size]
         files, links = self._files(drawing, batch, first, record)
         if "panoptic" in self.formats:
