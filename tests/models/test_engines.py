@@ -38,7 +38,7 @@ print(sorted({"taichi", "quadrants"} & {*sys.modules}))
 """
 
 
-def _drawn(engine):
+def _digests(engine):
     command, environment = [sys.executable, "-c", DIGESTS], {**os.environ, "PROBSCENE_ENGINE": engine}
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
@@ -47,7 +47,7 @@ def _drawn(engine):
 
 def test_both_engines_draw_the_same_bytes():
     with ThreadPoolExecutor() as pool:
-        drawn = dict(zip(ENGINES, pool.map(_drawn, ENGINES), strict=True))
+        drawn = dict(zip(ENGINES, pool.map(_digests, ENGINES), strict=True))
     assert len(drawn["taichi"]) > 28 and {engine: lines.pop() for engine, lines in drawn.items()} == {
         engine: f"['{engine}']" for engine in ENGINES
     }

@@ -52,7 +52,7 @@ class OnSecond(torch.Tensor):
                     raise RuntimeError(f"expected all tensors on the second device, got one on the CPU in {name}")
         if device == SECOND:
             kwargs["device"] = torch.device("cpu")
-        found = func(*pytree.tree_map(_held, args), **pytree.tree_map(_held, kwargs))
+        found = func(*pytree.tree_map(_to_cpu, args), **pytree.tree_map(_to_cpu, kwargs))
         if name == COPY_INTO:
             return args[0]
         if device != SECOND if device is not None else not on_second:
@@ -91,5 +91,5 @@ class _Numbers(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
-def _held(x):
+def _to_cpu(x):
     return x.held if isinstance(x, OnSecond) else x

@@ -140,7 +140,8 @@ def carried_out(request: FitRequest, out: Path, show: Display, resume: bool, exe
         begun: Begun = (beginning.resume if resume else beginning.begin)(request, out, show, Run)
         run, unfinished = begun.run, not begun.run.is_finished
         assert isinstance(run, Run)
-        carry_out(begun, show, execution.cache, nodes, execution.device_for(run))
+        if unfinished:
+            carry_out(begun, show, execution.cache, nodes, execution.device_for(run))
     if unfinished:
         warn_of_saturated_lists(run, show)
     return Done(run, begun.images, unfinished)

@@ -89,3 +89,11 @@ def test_a_resumed_run_stays_where_it_was(second):
 def test_a_device_that_there_is_not_is_said(call, discs, target, tmp_path):
     done = call("fit", discs.file, "--target", target.images, "--out", tmp_path / "run", "--device", "tpu")
     assert done.code == 2 and "a device auto, cpu, cuda, cuda:1 or mps" in done.err and not (tmp_path / "run").exists()
+
+
+def test_a_finished_run_opens_where_its_device_is_missing(discs, target, tmp_path):
+    config = configuration(ps.preset("quick"), "count", parameters="none", settings=SHORT)
+    run = ps.fit(discs.file, target.images, config, out=tmp_path / "run", execution=EXECUTION)
+    record = json.loads((run.path / "run.json").read_text())
+    (run.path / "run.json").write_text(json.dumps(record | {"devices": ["cuda:99"]}))
+    assert ps.fit(out=run.path, resume=True, execution=EXECUTION).is_finished
