@@ -104,7 +104,8 @@ class NetworkCache:
 
 def _named(device: str) -> str:
     """A device with its processor, whose kind decides about bytes."""
-    return f"{device} {torch.cuda.get_device_name(device)}" if device.startswith("cuda") else device
+    there = device.startswith("cuda") and torch.cuda.is_available()  # a run may have left the machine with its GPU
+    return f"{device} {torch.cuda.get_device_name(device)}" if there else device
 
 
 def _digest(tensors: dict[str, Tensor], lines: Sequence[str] = ()) -> str:
