@@ -190,6 +190,8 @@ def train(
         "photographs_sha256": None if photographs is None else digest_of(photographs),
         "held_out_sha256": None if tested is None else digest_of(tested),
     }  # fmt: skip
+    if photographs is not None:
+        settings["averages_weights"] = True  # earlier versions did not
     if not _bind(out, settings):
         for note in notes:
             callback(f"Note: {note}")

@@ -179,14 +179,14 @@ def stages_of(
     Args:
         parts: of each stage, see ``Stage``.
         finetune_fraction: the share of the images that the last of several stages is shown.
-        rate: of the first, a factor of the recipe's; later ones have ``FINETUNE_RATE`` times that.
+        rate: of the first, a factor of the recipe's; later ones have ``FINETUNE_RATE`` times that, and average weights.
     """
     last = round(finetune_fraction * num_images) if len(parts) > 1 else num_images
     before = [(num_images - last) // max(1, len(parts) - 1)] * (len(parts) - 1)
     if before:
         before[0] += num_images - last - sum(before)
     return [
-        Stage(part, number, rate * (FINETUNE_RATE if i else 1.0))
+        Stage(part, number, rate * (FINETUNE_RATE if i else 1.0), averages_weights=i > 0)
         for i, (part, number) in enumerate(zip(parts, [*before, last], strict=True))
     ]
 

@@ -2,7 +2,14 @@
 
 Everything random comes from the training's seed: the same bytes on one thread, whatever the number of processes, and
 whether a training goes on from a checkpoint or was never interrupted.
+
+Fine-tuning on few photographs forgets part of what many generated images have taught. So the weights after fine-tuning
+are averaged with those before (WiSE-FT [1], with its mixing coefficient of 0.5).
+
 Axis letters: N objects, H W.
+
+References:
+    [1] Wortsman et al., *Robust Fine-Tuning of Zero-Shot Models*, CVPR 2022.
 """
 
 import math
@@ -41,11 +48,13 @@ class Stage(NamedTuple):
         parts: examples by set; each part has the same share of the images shown.
         num_images: how many images are shown.
         rate_factor: of the recipe's learning rate.
+        averages_weights: at its end the weights are the mean of those before and after it.
     """
 
     parts: tuple[tuple[Example, ...], ...]
     num_images: int
     rate_factor: float = 1.0
+    averages_weights: bool = False
 
 
 class Detections(NamedTuple):
@@ -64,6 +73,7 @@ class Checkpoint(NamedTuple):
         stage: its number.
         steps: of this stage that are done.
         weights: the detector's state.
+        weights_before: that before this stage; empty where they are not averaged.
         optimizer: the state of this stage's.
         random: the state of torch's random numbers.
     """
@@ -71,6 +81,7 @@ class Checkpoint(NamedTuple):
     stage: int
     steps: int
     weights: dict[str, Tensor]
+    weights_before: dict[str, Tensor]
     optimizer: dict[str, Any]
     random: Tensor
 
@@ -256,10 +267,13 @@ def _train_stage(
     rates = (rate, rate * recipe.backbone_factor)
     adam = torch.optim.Adam([{"params": g, "lr": r} for g, r in zip(groups, rates, strict=True)], fused=True)
     steps = math.ceil(stage.num_images / recipe.batch_size)
-    start, before = checkpoints.start, 0
+    start, done_before, weights_before = checkpoints.start, 0, {}
+    if stage.averages_weights:
+        weights_before = {key: value.clone() for key, value in detector.state_dict().items()}
     if start is not None and start.stage == number:
         adam.load_state_dict(start.optimizer)
-        before = start.steps
+        done_before = start.steps
+        weights_before = {key: value.to(device_of(detector)) for key, value in start.weights_before.items()}
     detector.train()
     device = device_of(detector)
     examples, left = order(stage.parts, stage.num_images, random), stage.num_images
@@ -267,7 +281,7 @@ def _train_stage(
         batch = [next(examples) for _ in range(min(recipe.batch_size, left))]
         how = [draw_augmentation(random) for _ in batch]
         left -= len(batch)
-        if step < before:  # all that is drawn is drawn again
+        if step < done_before:  # all that is drawn is drawn again
             continue
         for group, highest in zip(adam.param_groups, rates, strict=True):
             group["lr"] = highest * _schedule((step + 1) / steps)
@@ -287,9 +301,14 @@ def _train_stage(
         adam.step()
         done = step + 1
         checkpoints.after_step(
-            lambda done=done: Checkpoint(number, done, detector.state_dict(), adam.state_dict(), torch.get_rng_state())
+            lambda done=done: Checkpoint(
+                number, done, detector.state_dict(), weights_before, adam.state_dict(), torch.get_rng_state()
+            )
         )
         shown(len(batch))
+    for key, value in detector.state_dict().items():
+        if key in weights_before and value.is_floating_point():
+            value.lerp_(weights_before[key], 0.5)
 
 
 def _schedule(progress: float) -> float:

@@ -358,7 +358,8 @@ def _digests(planned: Plan, loaded: Mapping[str, LabelledSet], shared: Mapping[s
 
     def one(row: Row) -> str:
         stages = [[(of_source[part.source], part.number) for part in stage] for stage in row.stages]
-        return hashlib.sha256(repr((stages, shared)).encode()).hexdigest()
+        averages = ["weights averaged"] * (len(stages) > 1)  # earlier versions did not
+        return hashlib.sha256(repr((stages, shared, *averages)).encode()).hexdigest()
 
     digests: dict[str, str] = {}
     for row in planned.rows:

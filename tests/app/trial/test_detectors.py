@@ -89,6 +89,21 @@ def test_parts_are_shown_in_turn_and_all_of_each():
     assert sorted(shown[1::2]) == sorted("XY" * 3)
 
 
+def test_weights_after_fine_tuning_are_averaged_with_those_before(drawn):
+    examples, recipe, states = read_set(drawn / "train").examples, RECIPES["efficientnet"], []
+    torch.manual_seed(0)
+    detector = build("efficientnet", 2, (64, 64))
+    initial = {key: value.clone() for key, value in detector.state_dict().items()}
+    for averages in (False, True):
+        detector.load_state_dict(initial)
+        train(detector, [Stage((examples[:4],), 8, averages_weights=averages)], recipe, (64, 64), (0,))
+        states.append({key: value.clone() for key, value in detector.state_dict().items()})
+    tuned, averaged = states
+    assert any((tuned[key] != initial[key]).any() for key in tuned)
+    for key, value in averaged.items():
+        assert torch.allclose(value, ((initial[key] + tuned[key]) / 2).to(value.dtype), atol=1e-6)
+
+
 def test_a_detector_on_another_device_has_the_bytes_of_one_on_the_cpu(drawn, monkeypatch):
     adam = torch.optim.Adam
     monkeypatch.setattr(torch.optim, "Adam", lambda groups, fused: adam(groups))  # torch fuses on devices that it knows
