@@ -31,6 +31,10 @@ def begin(
     ignore: Annotated[
         str, typer.Option(metavar="NAME,...", help="Classes to draw without a label, such as dirt.")
     ] = "ignore",
+    detections: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="What a detector found, for more backgrounds and for what misleads it."),
+    ] = None,
     seed: Seed = 0,
     value_range: ValueRange = None,
 ) -> str:
@@ -44,6 +48,7 @@ def begin(
         canvas=size_given(canvas),
         turn=turn,
         ignore=tuple(words_given(ignore)),
+        detections=detections,
         value_range=range_given(value_range),
         seed=seed,
     )

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -34,8 +33,6 @@ from probscene.image_bytes import Fault
 
 from ..arguments import checked_seed
 from ..files import machine_error, make_folder, write_json, write_text
-from ..labels.annotations import Annotated, Annotation
-from ..labels.boxes import place_on_canvas
 from ..labels.kitti import DONT_CARE
 from ..labels.naming import composed, matched
 from ..labels.reading import read_annotations
@@ -43,6 +40,7 @@ from ..progress import Display, Progress
 from ..trial.begun_photographs import FILE
 from ..trial.sets import digest_of_pixels
 from .cutouts import Cutout, Object, are_whole, covered, cut_out, inside, overlaps, parents, turned
+from .detections import Photograph, placed, read_detections
 from .grounds import ground_of, light_of
 from .model_file import ClassPart, ModelPart, model_text
 
@@ -69,6 +67,9 @@ class BeginOptions:
         canvas: height and width of its scenes, pixels; that of most photographs, reduced to ``AREA``, where None.
         turn: whether objects lie in any direction; by class as their cut-outs do where None.
         ignore: classes of what looks like an object and is none, drawn without a label.
+        detections: what a detector has found in the photographs, see ``predict``. Those without labels become grounds,
+            too, filled in where something was found. What was found in labelled ones where no label is becomes a
+            distractor, of the first class of ``ignore``.
         value_range: of photographs of 16 bits, see ``ImageFolder``.
         seed: of the noise in grounds, and of the choice among many cut-outs.
     """
@@ -77,6 +78,7 @@ class BeginOptions:
     canvas: tuple[int, int] | None = None
     turn: bool | None = None
     ignore: tuple[str, ...] = (IGNORE,)
+    detections: Path | str | None = None
     value_range: Sequence[float] | None = None
     seed: int = 0
 
@@ -107,6 +109,7 @@ class _Photographs(NamedTuple):
     there: list[NDArray[np.bool_]]  # (H, W), where objects or crowds are
     folder: ImageFolder
     notes: tuple[str, ...]
+    others: dict[Path, Photograph]  # without labels, in which a detector has looked for objects
 
 
 class _Roles(NamedTuple):
@@ -160,7 +163,13 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
         f"{n}: every object is cut by the border or covered by another, and is drawn as it is." for n in sorted(always)
     ]
     cut: dict[str, list[Cutout]] = {name: [] for name in kinds}
-    grounds, covers = [], []
+    empty: list[Photograph] = []  # their ``there`` is what was filled in
+
+    def fill(image: NDArray[np.uint8], there: NDArray[np.bool_]) -> None:
+        gain = light / max(light_of(image, there), 1.0)
+        filled = np.clip(ground_of(image, there, rng) * gain, 0, 255).round().astype(np.uint8)
+        empty.append(Photograph(filled, there))
+
     for i, (image, objects, there) in enumerate(zip(found.images, found.objects, found.there, strict=True)):
         which = np.array(
             [is_whole or one.name in always for one, is_whole in zip(objects, whole[i], strict=True)], bool
@@ -168,34 +177,35 @@ def _begin(photos: Path, labels: Path, out: Path, options: BeginOptions, show: P
         for one, cutout in zip(objects, cut_out(image, objects, which, light), strict=True):
             if cutout is not None:
                 cut[one.name].append(cutout)
-        gain = light / max(light_of(image, there), 1.0)
-        grounds.append(np.clip(ground_of(image, there, rng) * gain, 0, 255).round().astype(np.uint8))
-        covers.append(float(there.mean()))
+        fill(image, there)
         show("cutting", i + 1, len(found.images))
+    for other in found.others.values():
+        fill(*other)
     if renamed := [f"{name} is {kind}" for name, kind in kinds.items() if name != kind]:
         notes.append(f"Classes are renamed in the model and in labels.json: {', '.join(renamed)}.")
     ignored = {name for name in kinds if composed(name) in map(composed, options.ignore)}
     chosen = {name: _chosen(name, some, rng, notes) for name, some in cut.items()}
-    empty = [name for name, some in chosen.items() if not some]
-    if len(empty) == len(chosen) or not set(chosen) - ignored - set(empty):
+    lacking = [name for name, some in chosen.items() if not some]
+    if len(lacking) == len(chosen) or not set(chosen) - ignored - set(lacking):
         raise DataError(
             f"expected objects in {labels} that can be cut out, got none of {', '.join(kinds) or 'any class'}; label "
             "some that are at least a few pixels wide."
         )
-    for name in empty:
+    for name in lacking:
         notes.append(f"{name}: no object could be cut out, so that the model has no such class; label larger ones.")
-    if len(grounds) == 1:
+    if len(empty) == 1:
         notes.append("Only one photograph is labelled, so scenes have one background. Label a few more.")
-    best = np.argsort(covers, kind="stable")[:MAX_GROUNDS]
+    best = sorted(np.argsort([each.there.mean() for each in empty], kind="stable")[:MAX_GROUNDS])
     usable = {n: on for n, on in relation.items() if chosen[n] and chosen[on] and not {n, on} & ignored}
     model = _model(found, chosen, kinds, _Roles(ignored, usable), options, out)
-    _write(out, model, {kinds[n]: c for n, c in chosen.items() if c}, [grounds[i] for i in sorted(best)], found, kinds)
+    grounds = [empty[i].image for i in best]
+    _write(out, model, {kinds[n]: c for n, c in chosen.items() if c}, grounds, found, kinds)
     number = Counter(one.name for each in found.objects for one in each)
     return BegunModel(
         out / "model.py",
         {name: len(some) for name, some in chosen.items()},
         {name: number[name] for name in kinds},
-        len(best),
+        len(grounds),
         tuple(notes),
     )
 
@@ -210,13 +220,14 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
             "of its file."
         )
     named = [files[i] for i in pairs.entries]
+    detections = None if options.detections is None else read_detections(options.detections, files, photos)
     sizes = ImageFolder(named, (64, 64), 3, value_range=options.value_range).sizes
     folder = ImageFolder(named, options.canvas or _canvas(sizes), 3, value_range=options.value_range)
     images = [folder.load(i).permute(1, 2, 0).contiguous().numpy() for i in range(len(folder))]
     objects, there, dropped = [], [], Counter[str]()
     for i, entry in enumerate(pairs.entries.values()):
         each = [one for one in labels.read(entry, folder.sizes[i]) if one.name != DONT_CARE]
-        mine = [_object(one, folder, i, labels) for one in each]
+        mine = [placed(one, folder, i, labels) for one in each]
         crowds = [o for one, o in zip(each, mine, strict=True) if one.crowd and o is not None]
         kept = []
         for one, o in zip(each, mine, strict=True):
@@ -226,13 +237,23 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
                 dropped["cover the whole photograph"] += 1
             elif not one.crowd:
                 kept.append(o)
+        if detections is not None and options.ignore:
+            labelled = [o for o in mine if o is not None]
+            kept += detections.distractors(folder, i, labelled, options.ignore[0])
         objects.append(kept)
         there.append(covered([*kept, *crowds], folder.canvas))
-    notes = [*pairs.notes, *folder.notes]
+    notes, others = [*pairs.notes, *folder.notes], dict[Path, Photograph]()
+    if detections is not None:
+        unlabelled = [file for file in files if file in detections.entries and file not in named]
+        if len(unlabelled) > MAX_GROUNDS:
+            some = np.random.default_rng([options.seed, 1]).choice(len(unlabelled), MAX_GROUNDS, replace=False)
+            unlabelled = [unlabelled[i] for i in sorted(some)]
+        others = dict(zip(unlabelled, detections.photographs(unlabelled, folder), strict=True))
+        notes += detections.notes
     notes += [f"Left out: {number} objects that {why}." for why, number in dropped.items()]
     if not any(objects):
         raise DataError(f"expected objects in {path}, got none in {len(named)} photographs; label some.")
-    return _Photographs(images, objects, there, folder, tuple(dict.fromkeys(notes)))
+    return _Photographs(images, objects, there, folder, tuple(dict.fromkeys(notes)), others)
 
 
 def _canvas(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
@@ -243,20 +264,6 @@ def _canvas(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
     )
     scale = min(1.0, (AREA / (height * width)) ** 0.5)
     return max(8, round(height * scale)), max(8, round(width * scale))
-
-
-def _object(one: Annotation, folder: ImageFolder, i: int, labels: Annotated) -> Object | None:
-    """As the canvas has it; None where its middle is not on it."""
-    box = place_on_canvas(one, folder, i, 1.0 if labels.kitti else 0.0)
-    if box is None:
-        return None
-    mask = None
-    if one.mask is not None:
-        (H, W), (top, left, height, width) = folder.canvas, folder.windows[i] or (0, 0, *folder.sizes[i])
-        part = one.mask()[top : top + height, left : left + width].astype(np.uint8)
-        mask = cv2.resize(part, (W, H), interpolation=cv2.INTER_NEAREST).astype(bool)
-        mask = mask if mask.any() else None
-    return Object(composed(one.name), box, mask)
 
 
 def _kinds(objects: Iterable[Iterable[Object]]) -> dict[str, str]:
@@ -375,7 +382,8 @@ def _write(
         Image.fromarray(_sheet(cutouts)).save(aside / "cutouts.png")
         write_text(aside / "model.py", model_text(model))
         write_json(aside / "labels.json", _labels(found, kinds))
-        write_json(aside / FILE, {"format": 1, "photographs": [_known(file) for file in found.folder.paths]})
+        seen = [_known(file) for file in (*found.folder.paths, *found.others)]
+        write_json(aside / FILE, {"format": 1, "photographs": seen})
         aside.chmod(0o755)
         if out.is_dir():
             out.rmdir()

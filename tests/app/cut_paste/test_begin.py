@@ -207,6 +207,30 @@ def test_what_is_no_object_is_drawn_without_a_label(tmp_path):
     assert empty.any() and float(batch.image[empty].float().amax((1, 2, 3)).max()) > 190
 
 
+def test_what_a_detector_found_makes_grounds_and_distractors(tmp_path):
+    """Of six photographs of a small and a large disc three are labelled; a detector finds all discs and 0.png's corner.
+    In one of the labelled ones the small disc's label is missing."""
+    whole = json.loads(photographs(tmp_path).read_text())
+    seen = [{**one, "score": 0.9} for one in whole["annotations"]]
+    seen.append({**seen[0], "id": 99, "bbox": [0, 0, 8, 8], "score": 0.2})  # too unsure
+    (tmp_path / "found.json").write_text(json.dumps({**whole, "annotations": seen}))
+    some = [one for one in whole["annotations"] if one["image_id"] <= 3]
+    small = next(one for one in some if one["category_id"] == 1)
+    some = {"images": whole["images"][:3], "annotations": [one for one in some if one is not small]}
+    (tmp_path / "labels.json").write_text(json.dumps(whole | some))
+    first, second = made(tmp_path), made(tmp_path, "second", detections=tmp_path / "found.json")
+    assert (first.grounds, second.grounds) == (3, 6)
+    assert second.cutouts == {**first.cutouts, "ignore": 1} and second.objects == {**first.objects, "ignore": 1}
+    for file in (tmp_path / "second" / "grounds").iterdir():
+        assert np.asarray(Image.open(file)).max() < 170
+    assert load_model(str(second.path)).classes == load_model(str(first.path)).classes
+    record = json.loads((second.path.parent / "begun.json").read_text())
+    assert [each["name"] for each in record["photographs"]] == [f"{i}.png" for i in range(6)]
+    model = load_model(str(second.path))
+    labelled = ImageFolder([tmp_path / "photos" / f"{i}.png" for i in range(3)], model.canvas, 3)
+    assert read_boxes(second.path.parent / "labels.json", model, labelled).counts.sum() == 5
+
+
 def test_what_lies_on_something_is_drawn_on_it(tmp_path):
     """Small discs lie on large ones, which are drawn from those that have none."""
     file = photographs(tmp_path, number=8, each=2, names=("Big Disc",))
