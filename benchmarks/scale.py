@@ -77,6 +77,16 @@ def measured(images: int, objects: int, canvas: int, out: Path) -> dict[str, Any
     return {"images": images, "objects": objects, "canvas": canvas, "megabytes": megabytes, **timing(run)}
 
 
+def in_a_process(images: int, objects: int, canvas: int, out: Path) -> dict[str, Any]:
+    """A point's row, measured in a process of its own."""
+    folder = out / f"target-{images}-{objects}-{canvas}"
+    options = ps.DatasetOptions(flat=True)
+    ps.generate(discs(objects, canvas, 0.8), images, folder, "images", options, progress=False)
+    words = [sys.executable, __file__, "--out", out, "--point", images, objects, canvas]
+    done = subprocess.run([*map(str, words)], stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def exponent(x: np.ndarray, y: np.ndarray) -> float:
     """The slope of log y against log x, over the upper half of the range of log x."""
     upper = np.log(x) >= (np.log(x[0]) + np.log(x[-1])) / 2 - 1e-9
@@ -112,19 +122,17 @@ def main():
         return
     single = {what: values[0] for what in BASE if len(values := getattr(args, what)) == 1}
     rows: dict[str, list[dict[str, Any]]] = {}
+    done: dict[tuple[int, ...], dict[str, Any]] = {}
     for what in BASE:
         for value in getattr(args, what):
             point = BASE | single | {what: value}
             if what in single and rows:
                 continue
-            images, objects, canvas = point.values()
-            folder = args.out / f"target-{images}-{objects}-{canvas}"
-            options = ps.DatasetOptions(flat=True)
-            ps.generate(discs(objects, canvas, 0.8), images, folder, "images", options, progress=False)
-            words = [sys.executable, __file__, "--out", args.out, "--point", images, objects, canvas]
-            done = subprocess.run([*map(str, words)], stdout=subprocess.PIPE, text=True, check=True)
-            rows.setdefault(what, []).append(json.loads(done.stdout.splitlines()[-1]))
-            print(json.dumps(rows[what][-1]), flush=True)
+            values = tuple(point.values())
+            if values not in done:
+                done[values] = in_a_process(*values, args.out)
+                print(json.dumps(done[values]), flush=True)
+            rows.setdefault(what, []).append(done[values])
             write_json(args.out / "results.json", rows)
     for what, points in rows.items():
         if len(points) > 1:

@@ -35,7 +35,7 @@ from .values import Values
 
 ALPHA = 0.05  # probability of learning any site that has the prior
 PARTICLES = 32
-MAX_PARTICLES = 10_000  # looked at together
+MAX_PARTICLES, MAX_PAIRS = 10_000, 16_000_000  # particles, and pairs of their nodes, looked at together
 
 
 def log_threshold(sites: int, alpha: float = ALPHA) -> float:
@@ -58,7 +58,8 @@ def log_e_values(net: ParameterNet, values: Values, particles: int = PARTICLES) 
         particles: P.
     """
     total, S = torch.zeros(net.node_sites + net.scene_sites, dtype=torch.float64), net.node_sites
-    for rows in torch.arange(len(values.kind)).split(max(1, MAX_PARTICLES // particles)):
+    at_once = min(MAX_PARTICLES, MAX_PAIRS // max(1, values.kind.shape[1]) ** 2)
+    for rows in torch.arange(len(values.kind)).split(max(1, at_once // particles)):
         some = values.select(rows.repeat_interleave(particles))
         readings = Readings.from_values(some)
         nodes, scene = readings.unflatten(readings.draw(1)[0])

@@ -2,6 +2,8 @@
 
 import torch
 
+from probscene.inference.parameters import split_likelihood_ratio
+from probscene.inference.parameters.graph import SceneGraph
 from probscene.inference.parameters.net import ParameterNet
 from probscene.inference.parameters.split_likelihood_ratio import log_e_values, significant
 from probscene.inference.parameters.stochastic_em import StochasticEM
@@ -52,3 +54,18 @@ def test_sites_that_have_the_prior_are_not_learnt_and_others_are():
     net = ParameterNet(1, 5, 5, hidden=16)
     StochasticEM(net, images(250), 120, learning_rate=1e-2).run()
     assert significant(log_e_values(net, images(120))).tolist() == [True, True, False, False, True] * 2
+
+
+def test_pairs_of_nodes_that_are_looked_at_together_are_bounded(monkeypatch):
+    """Memory grows by them."""
+    pairs, from_nodes = [], SceneGraph.from_nodes
+    monkeypatch.setattr(split_likelihood_ratio, "MAX_PAIRS", 4 * 12**2)
+
+    def seen(kind, parent):
+        pairs.append(kind.shape[0] * kind.shape[1] ** 2)
+        return from_nodes(kind, parent)
+
+    monkeypatch.setattr(SceneGraph, "from_nodes", seen)
+    values = read(torch.rand(3, 12, 1), torch.rand(3, 0), 0.1)
+    log_e_values(ParameterNet(1, 1, 0, hidden=8), values, particles=4)
+    assert pairs == [4 * 12**2] * 3
