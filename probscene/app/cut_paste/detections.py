@@ -55,6 +55,8 @@ class Detections(NamedTuple):
 
     def photographs(self, files: list[Path], like: ImageFolder) -> list[Photograph]:
         """Photographs on the canvas of others."""
+        if not files:
+            return []
         folder = ImageFolder(files, like.canvas, 3, value_range=like.value_range)
         images = [folder.load(i).permute(1, 2, 0).contiguous().numpy() for i in range(len(folder))]
         return [Photograph(image, covered(self.objects(folder, i), folder.canvas)) for i, image in enumerate(images)]

@@ -21,6 +21,7 @@ def test_each_command_takes_what_the_one_before_has_written(tmp_path, call, few_
         ("fit", model / "model.py", "--target", photos, "--out", run, "--no-cache", *settings),
         ("train", run, "--real", photos, "--labels", own, "--out", detector, *small),
         ("predict", detector, photos, "--out", tmp_path / "predicted.json", "--min-score", 0),
+        ("begin", photos, "--labels", labels, "--detections", tmp_path / "predicted.json", "--out", tmp_path / "again"),
     ):
         done = call(*words)
         assert done.code == 0, done.err
