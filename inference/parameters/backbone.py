@@ -17,7 +17,7 @@ from probscene.device import device_of
 
 from ..features.base import FeatureNet, enter
 from ..features.counting.batches import images_per_step
-from ..features.counting.net import CountNet, conv, layers
+from ..features.counting.net import IMAGES_AT_ONCE, CountNet, conv, images_at_once, layers
 
 WIDTH = 64  # channels
 STRIDE = 4  # pixels of a reduced image a cell
@@ -32,11 +32,13 @@ class Backbone(nn.Module):
         cell: ``(2,)`` pixels of the image that a cell spans, along x and y.
         pretrained_parts: parts that know much already, and are trained slowly.
         is_random: whether it draws random numbers while it is trained.
+        at_once: how many images it is shown together when it does not learn.
     """
 
     cell: Tensor
     pretrained_parts: tuple[nn.Module, ...] = ()
     is_random = False
+    at_once = IMAGES_AT_ONCE
 
     def enter(self, images: Tensor) -> Tensor:
         """Of ``(N, 1 or 3, H, W)`` uint8 images."""
@@ -65,6 +67,7 @@ class RenderBackbone(Backbone):
         self.side, self.down = nn.Conv2d(b, WIDTH, 1, bias=False), nn.Conv2d(c, WIDTH, 1, bias=False)
         self.both = nn.Sequential(nn.BatchNorm2d(WIDTH), nn.ReLU(inplace=True), *conv(WIDTH, WIDTH, 3, 1))
         self.cell = torch.full((2,), float(STRIDE * self.reduce))
+        self.at_once = images_at_once(self.area)
         self.pretrained_parts = self.fine, self.coarse
         self.to(device_of(counts))
 

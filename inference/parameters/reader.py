@@ -109,18 +109,19 @@ class Reader(nn.Module):
     @torch.no_grad()
     def detect_all(self, images: Tensor) -> Detections:
         """Detections with scores above the first of ``thresholds``."""
-        parts = [self._detect(some, i * 64) for i, some in enumerate(images.split(64))]
+        at_once = self.backbone.at_once
+        parts = [self._detect(some, i * at_once) for i, some in enumerate(images.split(at_once))]
         return Detections(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
     @torch.no_grad()
     def count(self, images: Tensor) -> Tensor:
         """How many objects of each class it detects, ``(N, C)``, in ``(N, 1 or 3, H, W)`` uint8 images."""
-        counts, device = torch.zeros(len(images), self.classes), device_of(self)
-        for i, some in enumerate(images.split(64)):
+        counts, device, at_once = torch.zeros(len(images), self.classes), device_of(self), self.backbone.at_once
+        for i, some in enumerate(images.split(at_once)):
             mass = self(self.backbone.enter(some.to(device)))[1].softmax(1)[:, 1:]
             n, y, x, inside = find_objects(mass.sum(1), float(self.score_threshold))
             label = held(mass, n, y, x)[0]
-            counts.index_put_((n.cpu() + 64 * i, label.cpu()), torch.ones(len(n)), accumulate=True)
+            counts.index_put_((n.cpu() + at_once * i, label.cpu()), torch.ones(len(n)), accumulate=True)
         return counts
 
     def _detect(self, images: Tensor, first: int) -> Detections:

@@ -26,6 +26,7 @@ from ..base import enter
 from .grouping import tally_groups
 
 STRIDE = 8  # pixels of the reduced image a cell
+IMAGES_AT_ONCE, PIXELS_AT_ONCE = 64, 64 * 256**2  # images, and pixels of reduced ones, looked at together
 BORDER = STRIDE // 2  # clear pixels around a reduced image, so that objects at its edge have cells on either side
 
 
@@ -137,7 +138,7 @@ class CountNet(nn.Module):
         if self._fused is None:
             self._fused = _fuse(self.body)
         out, device = [], device_of(self)
-        for some in images.split(64):
+        for some in images.split(images_at_once(self.area)):
             x = self.enter(some.to(device)).contiguous(memory_format=torch.channels_last)
             out.append(self._read(self._fused(x)).cpu())
         soft = torch.cat(out) if out else torch.zeros(0, len(self.names))
@@ -148,7 +149,7 @@ class CountNet(nn.Module):
         """How many objects of each class each cell is expected to hold, ``(N, C, h, w)``, of ``(N, 1 or 3, H, W)``
         uint8 images, in the order of ``classes``; of a group, what part of an ordinary one."""
         number, out, device = 1 + len(self.objects), [], device_of(self)
-        for some in images.split(64):
+        for some in images.split(images_at_once(self.area)):
             logits = self(self.enter(some.to(device)))
             found = dict(zip(self.objects, logits[:, :number].softmax(1)[:, 1:].unbind(1), strict=True))
             if self.groups is not None:
@@ -175,6 +176,11 @@ class CountNet(nn.Module):
         """As in torch; what inference has fused is made anew."""
         self._fused = None
         return super().train(mode)
+
+
+def images_at_once(area: float) -> int:
+    """How many images a network that does not learn is shown together: fewer where reduced ones have a large area."""
+    return max(1, min(IMAGES_AT_ONCE, int(PIXELS_AT_ONCE / area)))
 
 
 def toward_whole(counts: Tensor) -> Tensor:

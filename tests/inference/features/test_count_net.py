@@ -11,6 +11,7 @@ from probscene import load_model
 from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.features.base import enter
+from probscene.inference.features.counting import net as counting
 from probscene.inference.features.counting.batches import FULL_AREA, MIN_IMAGES, CountBatches, CountSchedule, cells
 from probscene.inference.features.counting.net import STRIDE, CountNet, toward_whole
 from probscene.inference.features.counting.training import CountFeatures, CountTraining, count_loss
@@ -260,3 +261,19 @@ def test_cells_hold_what_is_counted(groups):
             counts = net._read(net(net.enter(images))).clamp(min=0)
         of_a = counts[:, [i for i, name in enumerate(net.names) if name.startswith("a ")]].sum(1)
         torch.testing.assert_close(sums[:, 0], of_a, atol=1e-3, rtol=1e-3)
+
+
+@given(st.floats(1.0, 1e8))
+def test_few_large_images_are_looked_at_together(area):
+    number = counting.images_at_once(area)
+    assert 1 <= number <= 64 and (number == 1 or number * area <= counting.PIXELS_AT_ONCE)
+    assert number == 64 or area > 256**2
+
+
+def test_large_images_are_counted_like_others(monkeypatch):
+    torch.manual_seed(0)
+    net, images = CountNet(("a", "b"), 3, (64, 96), (4, 8, 8)).eval(), torch.randint(0, 256, (7, 3, 64, 96)).byte()
+    features, maps = net.embed(images), net.cells(images)
+    monkeypatch.setattr(counting, "PIXELS_AT_ONCE", 2 * 64 * 96)
+    torch.testing.assert_close(net.embed(images), features)
+    torch.testing.assert_close(net.cells(images), maps)
