@@ -73,7 +73,7 @@ class Checkpoint(NamedTuple):
         stage: its number.
         steps: of this stage that are done.
         weights: the detector's state.
-        weights_before: that before this stage; empty where they are not averaged.
+        weights_before: its state before this stage; empty where the stage does not average weights.
         optimizer: the state of this stage's.
         random: the state of torch's random numbers.
     """
