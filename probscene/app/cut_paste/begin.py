@@ -40,7 +40,7 @@ from ..progress import Display, Progress
 from ..trial.begun_photographs import FILE
 from ..trial.sets import digest_of_pixels
 from .cutouts import Cutout, Object, are_whole, covered, cut_out, inside, overlaps, parents, turned
-from .detections import Photograph, placed, read_detections
+from .detections import Photograph, object_on_canvas, read_detections
 from .grounds import ground_of, light_of
 from .model_file import ClassPart, ModelPart, model_text
 
@@ -226,8 +226,9 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
     images = [folder.load(i).permute(1, 2, 0).contiguous().numpy() for i in range(len(folder))]
     objects, there, dropped = [], [], Counter[str]()
     for i, entry in enumerate(pairs.entries.values()):
-        each = [one for one in labels.read(entry, folder.sizes[i]) if one.name != DONT_CARE]
-        mine = [placed(one, folder, i, labels) for one in each]
+        found = labels.read(entry, folder.sizes[i])
+        each = [one for one in found if one.name != DONT_CARE]
+        mine = [object_on_canvas(one, folder, i, labels) for one in each]
         crowds = [o for one, o in zip(each, mine, strict=True) if one.crowd and o is not None]
         kept = []
         for one, o in zip(each, mine, strict=True):
@@ -238,8 +239,9 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
             elif not one.crowd:
                 kept.append(o)
         if detections is not None and options.ignore:
-            labelled = [o for o in mine if o is not None]
-            kept += detections.distractors(folder, i, labelled, options.ignore[0])
+            labelled = [object_on_canvas(one, folder, i, labels) for one in found]  # DontCare, too
+            labelled = [o for o in labelled if o is not None]
+            kept += detections.distractors(folder, i, labelled, composed(options.ignore[0]))
         objects.append(kept)
         there.append(covered([*kept, *crowds], folder.canvas))
     notes, others = [*pairs.notes, *folder.notes], dict[Path, Photograph]()

@@ -25,7 +25,7 @@ class Photograph(NamedTuple):
     there: NDArray[np.bool_]
 
 
-class Detections(NamedTuple):
+class PhotographDetections(NamedTuple):
     """What was found in photographs.
 
     Attributes:
@@ -43,7 +43,9 @@ class Detections(NamedTuple):
         if folder.paths[i] not in self.entries:
             return []
         each = self.labels.read(self.entries[folder.paths[i]], folder.sizes[i])
-        found = [placed(one, folder, i, self.labels) for one in each if one.score is None or one.score >= min_score]
+        found = [
+            object_on_canvas(one, folder, i, self.labels) for one in each if one.score is None or one.score >= min_score
+        ]
         return [one for one in found if one is not None]
 
     def distractors(self, folder: ImageFolder, i: int, labelled: list[Object], name: str) -> list[Object]:
@@ -62,7 +64,7 @@ class Detections(NamedTuple):
         return [Photograph(image, covered(self.objects(folder, i), folder.canvas)) for i, image in enumerate(images)]
 
 
-def read_detections(path: Path | str, files: list[Path], photos: Path) -> Detections:
+def read_detections(path: Path | str, files: list[Path], photos: Path) -> PhotographDetections:
     """Detections in photographs.
 
     Args:
@@ -74,10 +76,10 @@ def read_detections(path: Path | str, files: list[Path], photos: Path) -> Detect
     """
     labels = read_annotations(Path(path))
     pairs = matched(labels.images, files, photos, stems=labels.stems)
-    return Detections(labels, {files[i]: entry for i, entry in pairs.entries.items()}, pairs.notes)
+    return PhotographDetections(labels, {files[i]: entry for i, entry in pairs.entries.items()}, pairs.notes)
 
 
-def placed(one: Annotation, folder: ImageFolder, i: int, labels: Annotated) -> Object | None:
+def object_on_canvas(one: Annotation, folder: ImageFolder, i: int, labels: Annotated) -> Object | None:
     """An object of photograph i as the canvas has it; None where its middle is not on it."""
     box = place_on_canvas(one, folder, i, 1.0 if labels.kitti else 0.0)
     if box is None:

@@ -231,6 +231,23 @@ def test_what_a_detector_found_makes_grounds_and_distractors(tmp_path):
     assert read_boxes(second.path.parent / "labels.json", model, labelled).counts.sum() == 5
 
 
+def test_what_kitti_does_not_care_about_is_no_distractor(tmp_path):
+    """A detector finds all discs; the small ones have no label, but stand in such regions."""
+    whole = json.loads(photographs(tmp_path).read_text())
+    (tmp_path / "found.json").write_text(json.dumps(whole))
+    (tmp_path / "label_2").mkdir()
+    for image in whole["images"]:
+        lines = []
+        for one in (one for one in whole["annotations"] if one["image_id"] == image["id"]):
+            x, y, width, height = one["bbox"]
+            kind = "Disc" if one["category_id"] == 2 else "DontCare"
+            lines.append(f"{kind} 0 0 0 {x} {y} {x + width} {y + height} -1 -1 -1 -1000 -1000 -1000 -10\n")
+        (tmp_path / "label_2" / f"{Path(image['file_name']).stem}.txt").write_text("".join(lines))
+    options = BeginOptions(detections=tmp_path / "found.json")
+    found = begin(tmp_path / "photos", tmp_path / "label_2", tmp_path / "model", options, progress=False)
+    assert dict(found.objects) == {"Disc": 6}
+
+
 def test_what_lies_on_something_is_drawn_on_it(tmp_path):
     """Small discs lie on large ones, which are drawn from those that have none."""
     file = photographs(tmp_path, number=8, each=2, names=("Big Disc",))

@@ -61,11 +61,11 @@ def test_pairs_of_nodes_that_are_looked_at_together_are_bounded(monkeypatch):
     pairs, from_nodes = [], SceneGraph.from_nodes
     monkeypatch.setattr(split_likelihood_ratio, "MAX_PAIRS", 4 * 12**2)
 
-    def seen(kind, parent):
+    def counting_pairs(kind, parent):
         pairs.append(kind.shape[0] * kind.shape[1] ** 2)
         return from_nodes(kind, parent)
 
-    monkeypatch.setattr(SceneGraph, "from_nodes", seen)
+    monkeypatch.setattr(SceneGraph, "from_nodes", counting_pairs)
     values = read(torch.rand(3, 12, 1), torch.rand(3, 0), 0.1)
     log_e_values(ParameterNet(1, 1, 0, hidden=8), values, particles=4)
     assert pairs == [4 * 12**2] * 3
