@@ -7,7 +7,8 @@ Scenes are discs of two colours anywhere; the target has more of one. From 1,000
 10 objects one quantity grows at a time. Fits are short: 160 steps of the count network, 4 batches of structure, and 60
 steps of parameters, each fit in a process of its own. Printed are seconds of each stage and the process's largest
 memory in megabytes; then exponents: the slope of log seconds against the log of what grows, over the upper half of its
-range. ``scale.png`` shows them. 100,000 images of 256 x 256 are ``--images 100000 --canvas 256 --objects``.
+range. ``scale.png`` shows them. A point that the folder's ``results.json`` has is not measured again. 100,000 images of
+256 x 256 are ``--images 100000 --canvas 256 --objects``.
 """
 
 import argparse
@@ -101,9 +102,11 @@ def draw(rows: dict[str, list[dict[str, Any]]], file: Path) -> None:
         for stage in STAGES:
             axis.loglog([p[what] for p in points], [max(p.get(stage, 0.0), 1e-2) for p in points], "o-", label=stage)
         axis.set_xlabel({"images": "target images", "objects": "objects a scene", "canvas": "canvas, pixels"}[what])
+        axis.set_xticks([p[what] for p in points], [f"{p[what]:,}" for p in points])
+        axis.minorticks_off()
         axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("seconds")
-    axes[0][-1].legend(fontsize=8)
+    axes[0][-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     figure.tight_layout()
     figure.savefig(file, dpi=110)
 
@@ -122,7 +125,9 @@ def main():
         return
     single = {what: values[0] for what in BASE if len(values := getattr(args, what)) == 1}
     rows: dict[str, list[dict[str, Any]]] = {}
-    done: dict[tuple[int, ...], dict[str, Any]] = {}
+    results = args.out / "results.json"
+    before = json.loads(results.read_text()) if results.is_file() else []
+    done = {tuple(point[what] for what in BASE): point for point in before}
     for what in BASE:
         for value in getattr(args, what):
             point = BASE | single | {what: value}
@@ -132,8 +137,8 @@ def main():
             if values not in done:
                 done[values] = in_a_process(*values, args.out)
                 print(json.dumps(done[values]), flush=True)
+                write_json(results, list(done.values()))
             rows.setdefault(what, []).append(done[values])
-            write_json(args.out / "results.json", rows)
     for what, points in rows.items():
         if len(points) > 1:
             x = np.array([point[what] for point in points], float)

@@ -41,11 +41,9 @@ MAX_PHOTOGRAPHS = 300
 SCORES = np.linspace(0.05, 0.9, 35)
 MIN_SD = 0.05  # objects, of what is read of a class: with less, all photographs read alike
 FIRST = ("learnt", "prior")  # others are tested only where the prior is better than what was learnt
-NUM_IMAGES, MIN_VISIBLE, SEEDS = (
-    300,
-    0.2,
-    2,
-)  # generated for each detector; of a labelled object; of ``compare_and_keep``
+NUM_IMAGES = 300  # that ``compare_and_keep`` generates for each detector
+MIN_VISIBLE = 0.2  # of a labelled object there
+SEEDS = 2  # detectors there of each source
 RESULT = "agreement.json"
 
 Array = NDArray[np.float64]

@@ -220,15 +220,15 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     truth = dots(True)
     generate_scenes(truth, truth.prior, 200, tmp_path / "target", format="images")
     settings = {
-        "features.schedule.steps": 150,
+        "features.schedule.steps": 80,
         "features.schedule.images": 8,
         "features.width": "8,16,32",
         "structure.batches": 4,
         "structure.num_scenes": 60,
     }
     settings |= {"pretrain.derivations": 300}
-    settings |= {"parameters.reader_steps": 200, "parameters.reader_images": 6, "parameters.steps": 120}
-    settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 30, "parameters.round_steps": 40}
+    settings |= {"parameters.reader_steps": 140, "parameters.reader_images": 6, "parameters.steps": 80}
+    settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 10, "parameters.round_steps": 20}
     settings |= {"refine.batches": 2}
     config = preset("quick").set("features=count", settings)
     execution = Execution(1, cache=False, progress=False)
