@@ -7,8 +7,8 @@ Scenes are discs of two colours anywhere; the target has more of one. From 1,000
 10 objects one quantity grows at a time. Fits are short: 160 steps of the count network, 4 batches of structure, and 60
 steps of parameters, each fit in a process of its own. Printed are seconds of each stage and the process's largest
 memory in megabytes; then exponents: the slope of log seconds against the log of what grows, over the upper half of its
-range. ``scale.png`` shows them. A point that the folder's ``results.json`` has is not measured again. 100,000 images of
-256 x 256 are ``--images 100000 --canvas 256 --objects``.
+range. ``scale.png`` shows them, and has no point where a stage had nothing to do. A point that the folder's
+``results.json`` has is not measured again. 100,000 images of 256 x 256 are ``--images 100000 --canvas 256 --objects``.
 """
 
 import argparse
@@ -89,10 +89,10 @@ def in_a_process(images: int, objects: int, canvas: int, out: Path) -> dict[str,
 
 
 def exponent(x: np.ndarray, y: np.ndarray) -> float:
-    """The slope of log y against log x, over the upper half of the range of log x."""
+    """The slope of log y against log x, over the upper half of the range of log x; NaN where some of y is."""
     upper = np.log(x) >= (np.log(x[0]) + np.log(x[-1])) / 2 - 1e-9
     upper[-2:] = True
-    return float(np.polyfit(np.log(x[upper]), np.log(np.maximum(y[upper], 1e-3)), 1)[0])
+    return float(np.polyfit(np.log(x[upper]), np.log(y[upper]), 1)[0]) if np.isfinite(y[upper]).all() else np.nan
 
 
 def draw(rows: dict[str, list[dict[str, Any]]], file: Path) -> None:
@@ -100,7 +100,7 @@ def draw(rows: dict[str, list[dict[str, Any]]], file: Path) -> None:
     figure, axes = plt.subplots(1, len(rows), figsize=(4.5 * len(rows), 4), sharey=True, squeeze=False)
     for axis, (what, points) in zip(axes[0], rows.items(), strict=True):
         for stage in STAGES:
-            axis.loglog([p[what] for p in points], [max(p.get(stage, 0.0), 1e-2) for p in points], "o-", label=stage)
+            axis.loglog([p[what] for p in points], [p.get(stage, np.nan) for p in points], "o-", label=stage)
         axis.set_xlabel({"images": "target images", "objects": "objects a scene", "canvas": "canvas, pixels"}[what])
         axis.set_xticks([p[what] for p in points], [f"{p[what]:,}" for p in points])
         axis.minorticks_off()
@@ -142,7 +142,7 @@ def main():
     for what, points in rows.items():
         if len(points) > 1:
             x = np.array([point[what] for point in points], float)
-            each = {s: exponent(x, np.array([p.get(s, 0.0) for p in points])) for s in (*STAGES, "megabytes")}
+            each = {s: exponent(x, np.array([p.get(s, np.nan) for p in points])) for s in (*STAGES, "megabytes")}
             print(f"{what}: " + ", ".join(f"{name} {value:.2f}" for name, value in each.items()))
     draw(rows, args.out / "scale.png")
 
