@@ -226,12 +226,11 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
     images = [folder.load(i).permute(1, 2, 0).contiguous().numpy() for i in range(len(folder))]
     objects, there, dropped = [], [], Counter[str]()
     for i, entry in enumerate(pairs.entries.values()):
-        found = labels.read(entry, folder.sizes[i])
-        each = [one for one in found if one.name != DONT_CARE]
-        mine = [object_on_canvas(one, folder, i, labels) for one in each]
-        crowds = [o for one, o in zip(each, mine, strict=True) if one.crowd and o is not None]
+        found = [(one, object_on_canvas(one, folder, i, labels)) for one in labels.read(entry, folder.sizes[i])]
+        mine = [(one, o) for one, o in found if one.name != DONT_CARE]
+        crowds = [o for one, o in mine if one.crowd and o is not None]
         kept = []
-        for one, o in zip(each, mine, strict=True):
+        for one, o in mine:
             if o is None:
                 dropped["lie where photographs are cut to the canvas"] += 1
             elif not one.crowd and o.size**2 > WHOLE_IMAGE * folder.canvas[0] * folder.canvas[1]:
@@ -239,8 +238,7 @@ def _photographs(photos: Path, path: Path, options: BeginOptions) -> _Photograph
             elif not one.crowd:
                 kept.append(o)
         if detections is not None and options.ignore:
-            labelled = [object_on_canvas(one, folder, i, labels) for one in found]  # DontCare, too
-            labelled = [o for o in labelled if o is not None]
+            labelled = [o for _, o in found if o is not None]  # DontCare, too
             kept += detections.distractors(folder, i, labelled, composed(options.ignore[0]))
         objects.append(kept)
         there.append(covered([*kept, *crowds], folder.canvas))

@@ -50,10 +50,11 @@ def test_the_target_is_seen_as_the_fit_has_seen_it(run, target):
     assert torch.allclose(seen.features_in(run, images, seen.own_net(run)), kept, atol=1e-4)
 
 
-def test_other_structures_and_layouts_do_not_look_unlike_and_photographs_do(monkeypatch):
+@pytest.mark.parametrize("name", ["multi_mnist", "aerial2d"])
+def test_other_structures_and_layouts_do_not_look_unlike_and_photographs_do(name, monkeypatch):
     """Of these rows of upright digits each image's nearest neighbour is another one, not a render."""
     monkeypatch.setattr(EfficientNetLite.__init__, "__defaults__", (224,))
-    model = load_model("multi_mnist")
+    model = load_model(name)
     target = model.target(0)
     drawn = torch.cat(list(seen.images_of(target, target.prior, seen.ASKED, seed=2)))
     same = ImageArray(drawn.permute(0, 2, 3, 1).numpy(), model.canvas, model.channels)
