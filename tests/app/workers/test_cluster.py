@@ -98,13 +98,15 @@ def test_each_task_is_done_once_though_nodes_die_and_freeze(simulated, nodes, me
 
 
 def test_a_dataset_has_the_bytes_of_one_process(simulated, nodes, fitted, alone, tmp_path):
-    simulated.whole(2)
+    simulated.whole(3)
     run, made = RunFolder.at(fitted), []
 
     def progress(number, _):
         made.append(number)
         if len(made) == 3:
             simulated.kill()
+        if len(made) == 5:
+            simulated.freeze()
 
     dataset = generate(run, 400, tmp_path / "out", 3, format="coco,yolo", progress=progress, workers=nodes)
     assert dataset.made == 400 and dataset.finished and made[-1] == 400
