@@ -51,6 +51,7 @@ test: install
 # which files of few tests come last, however long these take. Three for two cores: tests of clusters mostly wait.
 pytest: export OMP_NUM_THREADS := 1
 pytest: install
+	@$(BIN)/python tests/renderers/every_kernel.py >/dev/null  # once, as the engine keeps kernels when a process ends
 	$(BIN)/python -m pytest --quiet --numprocesses 3 --dist loadfile --no-loadscope-reorder
 
 # What draws, with the other engine; a test of tests/models compares bytes. Without what takes long, and memory, which

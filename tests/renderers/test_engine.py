@@ -106,33 +106,7 @@ def test_it_works_where_no_cache_can_be_written(tmp_path):
 
 RENDERERS = Path(__file__).resolve().parents[2] / "renderers"
 KERNELS = [path for path in RENDERERS.rglob("*.py") for _ in range(path.read_text().count("@ti.kernel"))]
-EVERY_KERNEL = """
-from collections import defaultdict
-import numpy as np
-from probscene.mesh import Mesh
-from probscene.camera_effects import CameraEffects
-from probscene.renderers.meshes import MeshRenderer
-from probscene.renderers.camera.effects import apply_camera_effects
-from probscene.world import Camera, Light, Meshes, World, resolve_meshes, resolve_scene
-
-function, called = engine.ti.lang.kernel_impl.Func, defaultdict(set)
-call = function.func_call_rvalue
-def recorded(self, key, args):
-    called[id(engine.ti.lang.impl.get_runtime().compiling_callable)].add(self.func.__name__)
-    return call(self, key, args)
-function.func_call_rvalue = recorded
-
-renderer(drawing)
-effects = CameraEffects(contrast=0.5, blur=1.0, noise=1.0, jpeg_quality=50.0)
-apply_camera_effects(resolve_scene(effects, 1), torch.zeros(1, 3, 20, 20, dtype=torch.uint8))
-mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]), (9, 9, 9))
-camera, light, photo = (resolve_scene(part, 1) for part in (Camera(), Light(), CameraEffects()))
-layer = resolve_meshes(Meshes("a", (mesh,), 0, 9.0, 0.0), one > 0)
-world = World(drawing.kind, ("a",), (layer,), camera=camera, light=light, photo=photo, ground=None)
-for samples in (1, 4):
-    MeshRenderer((20, 20), samples=samples)(world)
-print(*(" ".join(sorted(names)) for names in called.values()), sep=",")
-"""
+EVERY_KERNEL = Path(__file__).with_name("every_kernel.py").read_text()
 
 
 def test_a_second_process_compiles_nothing(tmp_path):
