@@ -65,15 +65,16 @@ def fit(
     end_if_starting()
     execution = execution or Execution()
     request = fit_request(model, target, config, seed, labels, execution.threads)
-    if request.config is None and not resume:
-        request = replace(request, config=preset(DEFAULT))
     temporary, folder = None, None if out is None else Path(out)
     if folder is None:
         temporary = tempfile.mkdtemp(prefix="probscene-")
         folder = Path(temporary) / "run"
+    resume = resume and (folder / "run.json").exists()
+    if request.config is None and not resume:
+        request = replace(request, config=preset(DEFAULT))
     with display(execution.progress) as show:
         try:
-            run = carried_out(request, folder, show, resume and (folder / "run.json").exists(), execution).run
+            run = carried_out(request, folder, show, resume, execution).run
         except BaseException:
             if temporary is not None:
                 shutil.rmtree(temporary, ignore_errors=True)

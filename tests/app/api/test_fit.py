@@ -193,6 +193,11 @@ def test_resuming_takes_what_the_run_was_begun_with(quick, discs, target, python
         quick(discs.file, target.images, out=python_run.path)
 
 
+def test_resuming_where_no_run_is_begins_one(discs, tmp_path):
+    with pytest.raises(ps.DataError, match="got an empty list of files"):  # not that the configuration is missing
+        ps.fit(discs.file, [], out=tmp_path / "run", resume=True)
+
+
 def test_resuming_names_the_setting_that_differs(quick, discs, target, python_run):
     out, begun = python_run.path, python_run.config
     again = quick(discs.file, target.images, preset=begun, settings=(), out=out, resume=True)
