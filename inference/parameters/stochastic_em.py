@@ -53,6 +53,7 @@ from .values import SiteConditioning, Values, images_per_step
 INITIAL_SHARE = 0.5  # of the steps of a guide that is the prior
 POOL = 8  # draws from a reading that a value is chosen from, beside itself
 MIN_SPREAD = 0.01  # least standard deviation of a combination of values under the normal approximation
+MIN_PART = 1e-3  # least share of a variance that nodes share, and least one that they do not
 FLAT_VARIANCE = 1 / 12  # of a uniform number
 MIN_INFORMATION = 32.0  # readings, without errors, by which a variance is known to a quarter of itself
 MAX_JOINT = 80  # values of nodes that are proposed from the normal approximation together
@@ -186,10 +187,12 @@ class NormalApproximation(NamedTuple):
         def of_pairs(part: Tensor) -> Tensor:  # of nodes of an image, none with itself
             return part.sum(1).T @ part.sum(1) - products(part)
 
-        same = _mean(products(away) - error.sum((0, 1)).diag(), products(weight))
-        shared = _mean(of_pairs(away), of_pairs(weight))
-        shared[S:], shared[:, S:] = same[S:], same[:, S:]  # a scene's value has the same error at all of its nodes
-        return NormalApproximation(known, mean, _positive(shared), _positive((same - shared)[:S, :S]))
+        total = _positive(_mean(products(away) - error.sum((0, 1)).diag(), products(weight)))
+        shared, nodes, scene = total.clone(), slice(S), slice(S, None)
+        by_scene = total[nodes, scene] @ torch.linalg.solve(total[scene, scene], total[scene, nodes])
+        across = _mean(of_pairs(away), of_pairs(weight))[nodes, nodes] - by_scene
+        shared[nodes, nodes] = by_scene + _part(across, total[nodes, nodes] - by_scene)
+        return NormalApproximation(known, mean, shared, (total - shared)[nodes, nodes])
 
     def covariance(self, nodes: int) -> Tensor:
         """``(D, D)`` of so many nodes, float64."""
@@ -215,6 +218,18 @@ def _positive(covariance: Tensor) -> Tensor:
         return covariance
     value, vector = torch.linalg.eigh((covariance + covariance.T) / 2)
     return vector * value.clamp(min=MIN_SPREAD**2) @ vector.T
+
+
+def _part(covariance: Tensor, total: Tensor) -> Tensor:
+    """The matrix nearest to a covariance of which, and of the rest of ``total``, each variance is ``MIN_PART`` of the
+    whole at least; nearest where the whole is 1."""
+    if not len(total):
+        return total
+    root = torch.linalg.cholesky(total)
+    whitened = torch.linalg.solve_triangular(root, covariance, upper=False)
+    whitened = torch.linalg.solve_triangular(root, whitened.T, upper=False)
+    value, vector = torch.linalg.eigh((whitened + whitened.T) / 2)
+    return root @ (vector * value.clamp(MIN_PART, 1 - MIN_PART)) @ vector.T @ root.T
 
 
 class StochasticEM(AdamTraining):

@@ -171,6 +171,21 @@ def test_moments_are_those_of_u_and_not_of_its_readings():
     assert torch.allclose(found.own.float(), 0.0025 * sign[:2] * sign[:2, None], atol=2e-3)
 
 
+@pytest.mark.parametrize("nodes", [1, 5])
+def test_what_nodes_do_not_share_adds_nothing_to_their_variance(nodes):
+    """A part's noise is cut where it would be negative; what is cut is taken from the other part."""
+    torch.manual_seed(0)
+    first = bounded(0.5, 0.15, 1000, nodes, 1)
+    u = torch.cat([first, first + 0.04 * torch.randn(first.shape)], -1)
+    readings = u + 0.1 * torch.randn(u.shape)
+    kind, of_scene, circles = torch.zeros(1000, nodes, dtype=torch.int64), torch.zeros(1000, 0), torch.zeros(2).bool()
+    sd = torch.full_like(readings, 0.1)
+    values = Values(kind, torch.full_like(kind, -1), readings, sd, of_scene, of_scene, circles)
+    covariance = NormalApproximation.from_values(values).covariance(nodes)[:2, :2]
+    expected = torch.cov(readings.flatten(0, 1).double().T) - 0.01 * torch.eye(2)
+    assert torch.allclose(covariance, expected, rtol=2e-3)
+
+
 class Interrupted(Exception):
     pass
 
