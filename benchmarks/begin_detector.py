@@ -14,10 +14,12 @@ each draw a model is begun, and scenes of its prior are generated. A trial then 
     learnt        scenes of the model as fitted to all photographs but the held-out ones, with the labels of the few
     learnt_then   these scenes, then the photographs
 
-each with several seeds. Printed are the average precisions at an overlap of 0.5 of each draw, and the mean over draws
-of what the others have more than ``alone``, with two 95 % intervals: Student's t over the draws, which share the
-held-out photographs; and a bootstrap over held-out photographs, draws and, within a draw, seeds. Photographs are near
-duplicates where their pixels, at 32 x 32, correlate by more than 0.95.
+each with several seeds. Printed are the average precisions at an overlap of 0.5 of each draw; in the mean over draws,
+what each has more than ``alone``, and learnt scenes more than those of the prior. These have two 95 % intervals:
+Student's t over the draws, which share the held-out photographs; and a bootstrap over held-out photographs, draws and,
+within a draw, seeds. With learnt scenes, the total variation of each class's counts from those of the held-out
+photographs is printed, too: of scenes of the prior and of the fit, of the few labelled photographs, and of as many as
+are held out, drawn anew. Photographs are near duplicates where their pixels, at 32 x 32, correlate by more than 0.95.
 """
 
 import argparse
@@ -27,6 +29,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from given import needed, out_option
+from learn_labelled import apart, floor
 from safetensors.numpy import load_file
 from scipy.stats import t as student
 
@@ -41,6 +44,7 @@ from probscene.app.trial.bootstrap import draw as drawn
 from probscene.app.trial.bootstrap import estimate
 from probscene.app.trial.results import MEAN, precisions
 from probscene.app.trial.scoring import MAIN
+from probscene.app.trial.sets import LabelledSet
 from probscene.app.trial.training import Detections
 from probscene.app.trial.trial import TrialOptions, read_labelled, trial
 from probscene.decoding import read_rgb
@@ -100,19 +104,39 @@ def learnt_set(args: argparse.Namespace, pool: list[str], out: Path, seed: int) 
     return out / "learnt"
 
 
+def read(path: Path | str) -> LabelledSet:
+    """A labelled set; nothing is said of it."""
+    return read_labelled(Path(path), None, lambda *_: None)
+
+
+def count_distances(test: str, sets: dict[str, Path | str]) -> dict[str, dict[str, float]]:
+    """Of each class, the total variation of a set's counts from those of the photographs to test on."""
+    counts = {}
+    for name, path in {"test": test, **sets}.items():
+        one = read(path)
+        counts[name] = {c: np.array([(e.classes == i).sum() for e in one.examples]) for i, c in enumerate(one.classes)}
+    truth = counts.pop("test")
+    return {
+        c: {name: apart(of[c], true)[0] for name, of in counts.items()} | {"floor": floor(true)[0]}
+        for c, true in truth.items()
+    }
+
+
 def measured(args: argparse.Namespace, draw: int, pool: list[str], test: Path) -> dict[str, dict[str, float]]:
     """The precisions of a draw's rows, of each class and of their mean, over seeds."""
     out = args.out / f"draw-{draw}"
     names = sorted(np.random.default_rng([args.seed, 1, draw]).choice(pool, args.labelled, replace=False).tolist())
     made = begun_set(args, names, out, draw)
     (out / "labelled.txt").write_text("\n".join(names) + "\n")
+    few, held_out = (f"{args.photographs}@{listed}" for listed in (out / "labelled.txt", test))
     sets = {"alone": "real", "begun": f"{made}", "then": f"{made},real", "mixed": f"{made}+real"}
     if {"learnt", "learnt_then"} & {*args.sets}:
         learnt = learnt_set(args, pool, out, draw)
         sets |= {"learnt": f"{learnt}", "learnt_then": f"{learnt},real"}
+        print(draw, json.dumps(count_distances(held_out, {"prior": made, "few": few, "learnt": learnt})), flush=True)
     sets = {name: sets[name] for name in args.sets}
-    options = TrialOptions(real=f"{args.photographs}@{out / 'labelled.txt'}", numbers=[], seeds=args.seeds, seed=draw)
-    found = trial(Path(f"{args.photographs}@{test}"), out / "trial", sets, options, workers=args.workers).record()
+    options = TrialOptions(real=few, numbers=[], seeds=args.seeds, seed=draw)
+    found = trial(Path(held_out), out / "trial", sets, options, workers=args.workers).record()
     return {
         name: {of: one["value"] for of, one in row["precision"]["AP50"].items()} for name, row in found["rows"].items()
     }
@@ -120,7 +144,7 @@ def measured(args: argparse.Namespace, draw: int, pool: list[str], test: Path) -
 
 def resampled(args: argparse.Namespace, test: Path, name: str) -> np.ndarray:
     """``(1 + B,)`` the mean precision of a set over draws and seeds, then its resamples, the same for all sets."""
-    tested = read_labelled(Path(f"{args.photographs}@{test}"), None, lambda *_: None)
+    tested = read(f"{args.photographs}@{test}")
     draws = drawn(len(tested.examples), args.draws, RESAMPLES, args.seed)
     total = np.zeros(1 + RESAMPLES)
     for number in range(args.draws):
@@ -133,6 +157,18 @@ def resampled(args: argparse.Namespace, test: Path, name: str) -> np.ndarray:
         weight = draws.seeds[:, number] / draws.seeds.sum(1)
         total += weight * (of_mean.T * seeds).sum(1) / seeds.sum(1)
     return total
+
+
+def gain(args: argparse.Namespace, each: list[dict[str, dict[str, float]]], name: str, base: str) -> str:
+    """What one set has more than another one in the mean of the draws, in words."""
+    more = 100 * np.array([rows[name]["mean"] - rows[base]["mean"] for rows in each])
+    line = f"{name}: {more.mean():+.1f} points over {base}"
+    if len(more) > 1:
+        half = student.ppf(0.975, len(more) - 1) * more.std(ddof=1) / len(more) ** 0.5
+        line += f" ({more.mean() - half:+.1f} to {more.mean() + half:+.1f}, t over draws)"
+    one, other = (resampled(args, args.out / "test.txt", some) for some in (name, base))
+    over = estimate(100 * (one - other))
+    return line + f" ({over.low:+.1f} to {over.high:+.1f}, bootstrap over photographs, draws and seeds)"
 
 
 def detections(file: Path, images: int) -> list[Detections]:
@@ -168,16 +204,9 @@ def main():
         each.append(measured(args, draw, pool, args.out / "test.txt"))
         print(draw, json.dumps(each[-1]), flush=True)
         write_json(args.out / "results.json", each)
-    base = resampled(args, args.out / "test.txt", "alone")
-    for name in args.sets[1:]:
-        more = 100 * np.array([rows[name]["mean"] - rows["alone"]["mean"] for rows in each])
-        line = f"{name}: {more.mean():+.1f} points over the photographs alone"
-        if len(more) > 1:
-            half = student.ppf(0.975, len(more) - 1) * more.std(ddof=1) / len(more) ** 0.5
-            line += f" ({more.mean() - half:+.1f} to {more.mean() + half:+.1f}, t over draws)"
-        over = estimate(100 * (resampled(args, args.out / "test.txt", name) - base))
-        line += f" ({over.low:+.1f} to {over.high:+.1f}, bootstrap over photographs, draws and seeds)"
-        print(line)
+    for name, base in [*((name, "alone") for name in args.sets[1:]), ("learnt", "begun"), ("learnt_then", "then")]:
+        if {name, base} <= {*args.sets}:
+            print(gain(args, each, name, base), flush=True)
 
 
 if __name__ == "__main__":
