@@ -18,6 +18,9 @@ posterior, in proportion to p(x | u) g(u), as it is; then Adam takes one step on
   from the normal distributions of the proposal. A value that is read badly and is tied to one that
   is read well, or to those of siblings, seldom moves otherwise.
 
+In both kernels g has weights that are averaged over some steps, as stochastic approximation averages its statistics:
+the chains follow g, so what a step's gradient has by chance would stay in them.
+
 EM goes slowly where a dependence is much narrower than the errors of readings: a variance D under errors of variance N
 falls as N / sqrt(2 t) with the number t of iterations, even of exact ones. So chains begin at draws of n, whose
 covariance is the readings' without that of their errors (``NormalApproximation``), a consistent start [3].
@@ -40,8 +43,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.distributions import Categorical
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from ..training import AdamTraining, batch_seed
+from ..training import AdamTraining, batch_seed, of_prefix
 from .graph import SceneGraph
 from .mixture import LogisticMixture
 from .net import ParameterNet
@@ -52,6 +56,7 @@ from .values import SiteConditioning, Values, images_per_step
 
 INITIAL_SHARE = 0.5  # of the steps of a guide that is the prior
 POOL = 8  # draws from a reading that a value is chosen from, beside itself
+DECAY = 0.9  # of the moving average of weights, a step
 MIN_SPREAD = 0.01  # least standard deviation of a combination of values under the normal approximation
 MIN_PART = 1e-3  # least share of a variance that nodes share, and least one that they do not
 FLAT_VARIANCE = 1 / 12  # of a uniform number
@@ -263,6 +268,7 @@ class StochasticEM(AdamTraining):
     ):
         super().__init__(net, torch.optim.Adam(net.parameters(), lr=learning_rate), steps, seed, max_grad_norm=10.0)
         self.net, self.values, self.images = net, values, images
+        self.averaged = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(DECAY))
         self.normal = NormalApproximation.from_values(values)
         self.initial_steps = round(INITIAL_SHARE * steps) if from_prior else 0
         self.nodes, self.scene = values.nodes.clone(), values.scene.clone()
@@ -289,20 +295,32 @@ class StochasticEM(AdamTraining):
         else:
             u = flatten(self.nodes[rows, :M], self.scene[rows]).nan_to_num(0.5)
             with torch.no_grad():
-                given = conditionals(self.net, readings, u)
+                given = self._averaged_conditionals(readings, u)
                 u, given = self._redraw(readings, u, given)
                 u, _ = self._correlated_redraw(readings, u, given)
         self.nodes[rows, :M], self.scene[rows] = readings.unflatten(u)
         return -(readings.weight * conditionals(self.net, readings, u).log_prob(u)).sum(1).mean()
 
+    def step(self) -> float:
+        """See ``AdamTraining``."""
+        loss = super().step()
+        self.averaged.update_parameters(self.net)
+        return loss
+
     def state(self) -> dict[str, Tensor]:
         """See ``Training``."""
-        return super().state() | {"chains.nodes": self.nodes.clone(), "chains.scene": self.scene.clone()}
+        averaged = {f"averaged.{name}": tensor.clone() for name, tensor in self.averaged.state_dict().items()}
+        return super().state() | averaged | {"chains.nodes": self.nodes.clone(), "chains.scene": self.scene.clone()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """See ``Training``."""
         super().restore(tensors)
+        self.averaged.load_state_dict(of_prefix(tensors, "averaged."))
         self.nodes, self.scene = tensors["chains.nodes"].clone(), tensors["chains.scene"].clone()
+
+    def _averaged_conditionals(self, readings: Readings, u: Tensor) -> LogisticMixture:
+        """``conditionals`` of the net with averaged weights."""
+        return conditionals(self.averaged.module, readings, u)
 
     def _initial_draw(self, readings: Readings) -> Tensor:
         """u ``(L, D)`` from the normal approximation; from its reading where that is outside of 0..1."""
@@ -316,7 +334,7 @@ class StochasticEM(AdamTraining):
         forth = readings.weight * given.log_prob(pool)
         which = Categorical(logits=forth.movedim(0, -1)).sample().where(moved, 0).unsqueeze(0)
         new = pool.gather(0, which)[0]
-        after = conditionals(self.net, readings, new)
+        after = self._averaged_conditionals(readings, new)
         back = readings.weight * after.log_prob(pool)
         there, here = back.gather(0, which)[0], forth[0]
         choice = back.log_softmax(0)[0] - forth.log_softmax(0).gather(0, which)[0]
@@ -330,7 +348,7 @@ class StochasticEM(AdamTraining):
         new, ratio = self._proposal(readings, u, _some(readings.there))
         inside = ((new > 0) & (new < 1)).all(1)
         new = new.clamp(U_EPS, 1 - U_EPS)
-        after = conditionals(self.net, readings, new)
+        after = self._averaged_conditionals(readings, new)
         ratio = ratio + (readings.weight * (after.log_prob(new) - given.log_prob(u))).sum(1)
         if readings.outliers.any():
             old, other = (readings.log_density(at) + readings.squared_error(at) / 2 for at in (u, new))
