@@ -38,7 +38,7 @@ References:
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -320,7 +320,7 @@ class StochasticEM(AdamTraining):
 
     def _averaged_conditionals(self, readings: Readings, u: Tensor) -> LogisticMixture:
         """``conditionals`` of the net with averaged weights."""
-        return conditionals(self.averaged.module, readings, u)
+        return conditionals(cast("ParameterNet", self.averaged.module), readings, u)
 
     def _initial_draw(self, readings: Readings) -> Tensor:
         """u ``(L, D)`` from the normal approximation; from its reading where that is outside of 0..1."""
