@@ -56,7 +56,7 @@ from .values import SiteConditioning, Values, images_per_step
 
 INITIAL_SHARE = 0.5  # of the steps of a guide that is the prior
 POOL = 8  # draws from a reading that a value is chosen from, beside itself
-DECAY = 0.9  # of the moving average of weights, a step
+AVERAGED_SHARE = 0.02  # of the steps, that the moving average of weights is over
 MIN_SPREAD = 0.01  # least standard deviation of a combination of values under the normal approximation
 MIN_PART = 1e-3  # least share of a variance that nodes share, and least one that they do not
 FLAT_VARIANCE = 1 / 12  # of a uniform number
@@ -268,7 +268,8 @@ class StochasticEM(AdamTraining):
     ):
         super().__init__(net, torch.optim.Adam(net.parameters(), lr=learning_rate), steps, seed, max_grad_norm=10.0)
         self.net, self.values, self.images = net, values, images
-        self.averaged = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(DECAY))
+        decay = 1 - 1 / max(1.0, AVERAGED_SHARE * steps)
+        self.averaged = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(decay))
         self.normal = NormalApproximation.from_values(values)
         self.initial_steps = round(INITIAL_SHARE * steps) if from_prior else 0
         self.nodes, self.scene = values.nodes.clone(), values.scene.clone()
