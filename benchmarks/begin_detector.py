@@ -50,7 +50,8 @@ from probscene.app.trial.trial import TrialOptions, read_labelled, trial
 from probscene.decoding import read_rgb
 
 MIN_CORRELATION, SIDE = 0.95, 32  # of near duplicates; pixels
-SETS = "alone", "begun", "then", "mixed", "learnt", "learnt_then"
+WITHOUT_FIT = "alone", "begun", "then", "mixed"
+SETS = *WITHOUT_FIT, "learnt", "learnt_then"
 DATASET = DatasetOptions(min_visible=0.2)
 RESAMPLES = 1000
 
@@ -186,7 +187,7 @@ def main():
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--scenes", type=int, default=600)
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each set and draw")
-    parser.add_argument("--sets", nargs="+", default=SETS[:4], choices=SETS)
+    parser.add_argument("--sets", nargs="+", default=WITHOUT_FIT, choices=SETS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     args = parser.parse_args()

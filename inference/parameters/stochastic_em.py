@@ -226,8 +226,8 @@ def _positive(covariance: Tensor) -> Tensor:
 
 
 def _part(covariance: Tensor, total: Tensor) -> Tensor:
-    """The matrix nearest to a covariance of which, and of the rest of ``total``, each variance is ``MIN_PART`` of the
-    whole at least; nearest where the whole is 1."""
+    """The matrix nearest to ``covariance`` that is at least ``MIN_PART`` and at most ``1 - MIN_PART`` times ``total``;
+    nearest in coordinates in which ``total`` is the identity."""
     if not len(total):
         return total
     root = torch.linalg.cholesky(total)
@@ -251,6 +251,7 @@ class StochasticEM(AdamTraining):
 
     Attributes:
         nodes, scene: ``(L, M, S)`` and ``(L, G)`` u, the chains' present states; NaN where a value is not there.
+        averaged: the net with a moving average of its weights, which the chains follow.
         accepted: share of the proposals of each kernel that were accepted, since the beginning or ``restore``.
     """
 
