@@ -3,13 +3,14 @@
 Axis letters: L photographs, K labelled images, S scopes, R rules, C classes.
 """
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import ImageCallback, Photographs
-from .net import MIN_PIXELS, PretrainedCountNet
+from .net import MIN_PIXELS, MIN_VISIBLE, PretrainedCountNet
 from .readability import Read, Reading, rules_for_renders, with_labels, without_labels
 from .reading import RULES, SCOPES
 
@@ -46,6 +47,13 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
             found = with_labels(read, c, counts[name])
         else:
             found = without_labels(read, c)
+        pixels = math.nan
+        if labelled is not None and labelled.boxes is not None and found.by != "agreement":
+            smallest = _smallest(net, labelled.boxes, labelled.classes.index(name))
+            pixels = min(smallest, SCOPES[found.scope].pixels)  # the smallest of few is larger than that of all
+            because = f"{found.because}; of scenes, objects from {pixels:.0f} pixels count, as they are labelled"
+            found = found._replace(because=because)
+        net.labelled_pixels[c] = pixels
         _keep(net, c, found)
         records[name] = _record(net, c, found)
     net.bind(photographs.fingerprint)
@@ -60,6 +68,12 @@ def _read_images(net: PretrainedCountNet, images: Tensor, done: int, total: int,
         done += len(some)
         callback(done, total)
     return torch.cat(parts)
+
+
+def _smallest(net: PretrainedCountNet, boxes: tuple[Tensor, ...], number: int) -> float:
+    """The longer side of the smallest of a class's boxes, pixels of what enters."""
+    of_class = torch.cat([some[some[:, 0] == number, 1:] for some in boxes])
+    return float(((of_class[:, 2:] - of_class[:, :2]) * net.scale()).amax(1).min())
 
 
 def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:
@@ -77,13 +91,15 @@ def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:
 
 def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:
     """For JSON."""
+    scope, pixels = SCOPES[found.scope], float(net.labelled_pixels[c])
+    by_scope = math.isnan(pixels)
     return {
         "readable": found.readable,
         "because": found.because,
         "by": found.by,
         "rules": [str(RULES[rule]) for rule in found.rules],
-        "visible": SCOPES[found.scope].visible,
-        "from_pixels": SCOPES[found.scope].pixels,
+        "visible": scope.visible if by_scope else MIN_VISIBLE,
+        "from_pixels": scope.pixels if by_scope else pixels,
         "mean": found.mean,
         "disagreement": found.disagreement,
         "spread": found.spread,

@@ -79,13 +79,14 @@ class PretrainedCountFeatures(Features):
 
     def settings(self, config: Any) -> dict[str, Any]:
         """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
-        each structure is drawn once. Photographs' counts are noisy, and few: the prior of a preset that has such a
+        each structure is drawn once. Numbers that no photograph shows cost so much at first that a guide is thrown too
+        far, from where 40 or 80 batches may not bring it back. Photographs' counts are noisy, and few: the prior of a preset that has such a
         weight holds them more. They come in units of their bandwidth, which the kernel takes as they are. Parameters
         are not learnt by what a reader reads in photographs, of which it has seen none."""
         weight = config.structure.prior_kl_weight
         return {
             "parameters": "tilting",
-            "structure.batches": 40,
+            "structure.batches": 120,
             "structure.num_scenes": 250,
             "structure.draws_per_structure": 1,
             "structure.prior_kl_weight": max(weight, 0.1) if weight else 0.0,

@@ -1,5 +1,7 @@
 """Counts from frozen maps: against the package's own layers, a slow sum, and true counts."""
 
+from typing import NamedTuple
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -9,7 +11,9 @@ from efficientnet_lite_pytorch import EfficientNet
 from probscene.app.fitting.rendered_features import RenderedFeatures
 from probscene.errors import ProbsceneError
 from probscene.inference.divergence import bandwidth
+from probscene.inference.features.base import Labelled
 from probscene.inference.features.counting.training import relative_count_loss
+from probscene.inference.features.photographs.adapting import adapt
 from probscene.inference.features.photographs.net import KINDS, MIN_UNIT, STRIDES, PretrainedCountNet
 from probscene.inference.features.photographs.readability import disagreement
 from probscene.inference.features.photographs.reading import LARGE, RULES, SCOPES, Rule, read
@@ -222,6 +226,53 @@ def test_what_is_hidden_or_too_small_is_not_counted(dots, draw_twice):
         assert torch.allclose(target[0, :, 1:].sum((2, 3)), expected[list(kind.scopes)], atol=1e-5)
         row, column = (target[0, 0, 1] == target[0, 0, 1].max()).nonzero()[0].tolist()
         assert abs(row + 0.5 - height / 4) <= 0.5 and abs(column + 0.5 - width / 4) <= 0.5
+
+
+def test_scenes_count_what_people_box(dots, draw_twice):
+    """A class that is read as it is labelled counts objects from the smallest box on; others those of their scope."""
+    net = untrained(dots)
+    net.scope.fill_(LARGE)
+    drawn = draw_twice(1)._replace(
+        label=torch.tensor([[0, 0, 0, 1]]), visible=torch.tensor([[1.0, 1.0, 0.2, 1.0]]),
+        size=(torch.tensor([12.0, 9.0, 30.0, 12.0]) / net.scale()[0])[None, :, None].expand(-1, -1, 2),
+    )  # fmt: skip
+    assert (net.embed_from_labels(drawn) * net.unit).tolist() == [[0, 0]]
+    net.labelled_pixels[0] = 10
+    assert (net.embed_from_labels(drawn) * net.unit).tolist() == [[1, 0]]
+
+
+class Boxed(NamedTuple):
+    """``Photographs`` of which some are labelled."""
+
+    images: torch.Tensor
+    labelled: Labelled
+    fingerprint: str = "00" * 32
+    detections: None = None
+
+    def subset(self, max_images: int) -> torch.Tensor:
+        return self.images[:max_images]
+
+
+def test_the_smallest_box_says_what_is_counted(learnt, draw_twice):
+    """Where a class is read as people label it: not with counts alone, nor where labels say nothing of it; and no more
+    than its scope asks for, as there are few boxes."""
+    net = learnt[0].net
+    before, drawn = {key: value.clone() for key, value in net.state_dict().items()}, draw_twice(30)
+    counts = number(drawn).long()
+    corners = torch.cat([drawn.centre - drawn.size / 2, drawn.centre + drawn.size / 2], 2)
+    boxes = [torch.cat([drawn.label[i, :, None], corners[i]], 1)[drawn.label[i] >= 0] for i in range(len(counts))]
+    for side in (4.0, 300.0):
+        small = torch.tensor([[0.0, 5.0, 5.0, 5.0 + side / net.scale()[0], 6.0]])
+        large = [torch.cat([some[some[:, 0] == 1], small]) for some in boxes]
+        labelled = Labelled(drawn.image, counts, net.classes, torch.arange(len(counts)), tuple(large))
+        found = adapt(net, Boxed(drawn.image, labelled), 500, lambda *_: None)["classes"][net.classes[0]]
+        expected = 4.0 if side == 4 else SCOPES[int(net.scope[0])].pixels
+        assert found["by"] != "agreement" and float(net.labelled_pixels[0]) == pytest.approx(expected)
+        assert found["from_pixels"] == pytest.approx(expected) and "as they are labelled" in found["because"]
+    for unknown in (labelled._replace(boxes=None), labelled._replace(counts=counts[:3], images=drawn.image[:3])):
+        adapt(net, Boxed(drawn.image, unknown), 500, lambda *_: None)
+        assert net.labelled_pixels.isnan().all()
+    net.load_state_dict(before)
 
 
 def test_a_loss_that_is_not_finite_is_said(dots, draw_twice):
