@@ -4,7 +4,7 @@ Axis letters: L images, M nodes, K objects, S sites of nodes, G sites of scenes.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -96,20 +96,21 @@ class CalibratedReader:
         number = [sum(of_class.get(kind, 0) for kind in site.kinds) for site in self.node_sites]
         self.num_readings = torch.tensor([*number, *(len(images) for _ in self.scene_sites)], dtype=torch.int64)
 
-    def recalibrate(self, valued: SupervisedBatch) -> None:
+    def recalibrate(self, batches: Iterable[SupervisedBatch]) -> None:
         """Make readings likelihoods by renders like the target, whose u are draws of the prior where they are known."""
         assert self.skill is not None
-        found = self.reader.detect(valued.drawn.image)
-        which = matched(found, valued)
-        is_it = which >= 0
+        known = []
+        for valued in batches:
+            found = self.reader.detect(valued.drawn.image)
+            which = matched(found, valued)
+            is_it = which >= 0
+            known.append((found.raw[is_it], valued.u[found.image, which][is_it], found.scene_raw, valued.scene_u))
+        raw, u, scene_raw, scene_u = (torch.cat(part) for part in zip(*known, strict=True))
         of_nodes = self.skill.select(slice(0, len(self.node_sites)))
         of_scenes = self.skill.select(slice(len(self.node_sites), None))
         parts = (
             Recalibration.from_readings(*skill.read(raw), u, skill.turns)
-            for skill, raw, u in (
-                (of_nodes, found.raw[is_it], valued.u[found.image, which][is_it]),
-                (of_scenes, found.scene_raw, valued.scene_u),
-            )
+            for skill, raw, u in ((of_nodes, raw, u), (of_scenes, scene_raw, scene_u))
         )
         self.recalibration = Recalibration(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
 
