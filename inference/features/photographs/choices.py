@@ -80,9 +80,9 @@ class PretrainedCountFeatures(Features):
     def settings(self, config: Any) -> dict[str, Any]:
         """Renders need not be read, so that batches may be large; what is hidden in a drawing does not count, so that
         each structure is drawn once. Numbers that no photograph shows cost so much at first that a guide is thrown too
-        far, from where 40 or 80 batches may not bring it back. Photographs' counts are noisy, and few: the prior of a preset that has such a
-        weight holds them more. They come in units of their bandwidth, which the kernel takes as they are. Parameters
-        are not learnt by what a reader reads in photographs, of which it has seen none."""
+        far, from where 40 or 80 batches may not bring it back. Photographs' counts are noisy, and few: the prior of a
+        preset that has such a weight holds them more. They come in units of their bandwidth, which the kernel takes as
+        they are. Parameters are not learnt by what a reader reads in photographs, of which it has seen none."""
         weight = config.structure.prior_kl_weight
         return {
             "parameters": "tilting",
