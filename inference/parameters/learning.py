@@ -45,7 +45,7 @@ from .values import Values
 CALIBRATION_RENDERS = 500  # also the most that are drawn at once, as they take memory
 BUILDER_RENDERS = 200  # for ``fit_scene_graph_builder``
 MISSED_RENDERS = 400  # of the guide, for ``MissedObjects``
-RECALIBRATION_RENDERS = 2000  # of 400, a slope of 0.7 has a standard error of 0.05, and so has what is learnt of spread
+RECALIBRATION_RENDERS = 2000  # by 400, a slope is off by a tenth, and a spread that is learnt as much
 GUIDE_SHARE = 0.65  # of a round's renders; the others are the prior's
 PRIOR_PROBABILITY = 0.5  # of each value in these
 PREFETCH_STEPS = 8  # whose renders are drawn together
