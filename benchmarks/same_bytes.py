@@ -51,6 +51,7 @@ LIKELIHOOD = {
     "parameters.steps": 6,
     "parameters.rounds": 1,
     "parameters.round_reader_steps": 6,
+    "parameters.recalibration_renders": 400,
     "parameters.round_scene_renders": 16,
     "parameters.round_steps": 4,
     "refine.batches": 2,

@@ -42,7 +42,8 @@ BASE = {"images": 1000, "objects": 10, "canvas": 128}
 SETTINGS = {
     "features": "count", "features.schedule.steps": 160, "structure.batches": 4, "pretrain.derivations": 500,
     "pretrain.epochs": 2, "parameters.reader_steps": 20, "parameters.steps": 20, "parameters.rounds": 1,
-    "parameters.round_reader_steps": 10, "parameters.round_steps": 10, "refine.batches": 1,
+    "parameters.round_reader_steps": 10, "parameters.round_steps": 10, "parameters.recalibration_renders": 400,
+    "refine.batches": 1,
 }  # fmt: skip
 STAGES = ("reading", "features", "target", "pretraining", "structure", "parameters", "refinement", "outcome")
 

@@ -45,7 +45,6 @@ from .values import Values
 CALIBRATION_RENDERS = 500  # also the most that are drawn at once, as they take memory
 BUILDER_RENDERS = 200  # for ``fit_scene_graph_builder``
 MISSED_RENDERS = 400  # of the guide, for ``MissedObjects``
-RECALIBRATION_RENDERS = 2000  # by 400, a slope is off by a tenth, and a spread that is learnt as much
 GUIDE_SHARE = 0.65  # of a round's renders; the others are the prior's
 PRIOR_PROBABILITY = 0.5  # of each value in these
 PREFETCH_STEPS = 8  # whose renders are drawn together
@@ -176,7 +175,7 @@ class ParameterLearning:
         if self.missed is None:
             seed_everything(batch_seed(self.seed, 7, self.phase))
             self.missed = self.calibrated.missed_objects(self._guide_scenes(MISSED_RENDERS))
-            sizes = _batch_sizes(RECALIBRATION_RENDERS)
+            sizes = _batch_sizes(self.schedule.recalibration_renders)
             self.calibrated.recalibrate(self.renders.draw_mixed(size, guide, PRIOR_PROBABILITY) for size in sizes)
         images = self.images()
         seed_everything(batch_seed(self.seed, 3, self.phase))

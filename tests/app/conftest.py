@@ -40,6 +40,7 @@ PARAMETERS = {
     "parameters.steps": 4,
     "parameters.rounds": 1,
     "parameters.round_reader_steps": 2,
+    "parameters.recalibration_renders": 100,
     "parameters.round_steps": 2,
 }
 # With the features named, a fit does not ask whether its target looks like renders: 320 images through EfficientNet.

@@ -30,6 +30,7 @@ SHORT = QUICK.set(
         "parameters.rounds": 1,
         "parameters.steps": 2,
         "parameters.round_reader_steps": 2,
+        "parameters.recalibration_renders": 100,
         "parameters.round_steps": 2,
     }
 )

@@ -58,6 +58,7 @@ def test_both_scenarios_learn_what_the_images_have_in_common(tmp_path):
     settings |= {"pretrain.derivations": 300}
     settings |= {"parameters.reader_steps": 150, "parameters.reader_images": 6, "parameters.steps": 100}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 30, "parameters.round_steps": 40}
+    settings |= {"parameters.recalibration_renders": 400}
     settings |= {"parameters.scene_renders": 1200, "parameters.round_scene_renders": 200}
     settings |= {"refine.batches": 2}
     config = preset("quick").set("features=count", settings)

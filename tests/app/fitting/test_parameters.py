@@ -229,6 +229,7 @@ def test_a_row_is_learnt_from_images_alone(tmp_path):
     settings |= {"pretrain.derivations": 300}
     settings |= {"parameters.reader_steps": 140, "parameters.reader_images": 6, "parameters.steps": 80}
     settings |= {"parameters.rounds": 1, "parameters.round_reader_steps": 10, "parameters.round_steps": 20}
+    settings |= {"parameters.recalibration_renders": 400}
     settings |= {"refine.batches": 2}
     config = preset("quick").set("features=count", settings)
     execution = Execution(1, cache=False, progress=False)

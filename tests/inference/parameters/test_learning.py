@@ -101,7 +101,9 @@ def test_few_objects_in_the_target_keep_the_prior(trays, monkeypatch):
     monkeypatch.setattr(reader, "SCORE_THRESHOLDS", (10.0,))  # no object is found
     counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
-    schedule = ParameterSchedule(reader_steps=1, scene_renders=200, steps=2, rounds=0, reader_images=2)
+    schedule = ParameterSchedule(
+        reader_steps=1, scene_renders=200, steps=2, rounds=0, reader_images=2, recalibration_renders=100
+    )
     empty = torch.zeros(30, 3, 64, 64, dtype=torch.uint8)
     learning = ParameterLearning(trays, trays.prior, RenderBackbone(counts), label, lambda: empty, schedule)
     learning.run()
@@ -119,7 +121,9 @@ def test_renders_that_are_drawn_meanwhile_are_those_of_before(trays, monkeypatch
     counts = CountNet(trays.classes, 3, trays.canvas, width=(4, 8, 8))
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     steps = of_images.PREFETCH_STEPS + 3
-    schedule = ParameterSchedule(reader_steps=steps, scene_renders=1, steps=1, rounds=0, reader_images=2)
+    schedule = ParameterSchedule(
+        reader_steps=steps, scene_renders=1, steps=1, rounds=0, reader_images=2, recalibration_renders=100
+    )
     readers = []
 
     def interrupt(training, report):
@@ -193,7 +197,7 @@ def test_learning_of_images_goes_on_to_the_same_bits(trays, monkeypatch):
     label = partial(_labels, SpriteRenderer(trays.canvas), class_table(trays.grammar.kinds, trays.classes))
     schedule = ParameterSchedule(
         reader_steps=1, scene_renders=60, steps=2, step_images=20, rounds=1, round_reader_steps=1,
-        round_scene_renders=60, round_steps=12, reader_images=2,
+        round_scene_renders=60, round_steps=12, reader_images=2, recalibration_renders=100,
     )  # fmt: skip
     images = torch.randint(256, (30, 3, 64, 64), dtype=torch.uint8)
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 from scipy.stats import truncnorm, vonmises
 
-from probscene.inference.parameters.learning import PRIOR_PROBABILITY, RECALIBRATION_RENDERS
+from probscene.inference.parameters.learning import PRIOR_PROBABILITY
 from probscene.inference.parameters.recalibration import MIN_KNOWN, Recalibration, likeliest, negative_log_likelihood
+from probscene.inference.parameters.schedule import ParameterSchedule
 
 LINE, CIRCLE = torch.tensor([False]), torch.tensor([True])
 
@@ -32,7 +33,7 @@ def test_what_was_distorted_is_found(slope, scale):
 
 def test_the_renders_of_a_round_say_a_slope_to_a_twentieth():
     """Of one value a render, read with an error of 0.2; what is learnt of its spread is as far off as the slope."""
-    slopes, known = [], round(RECALIBRATION_RENDERS * PRIOR_PROBABILITY)
+    slopes, known = [], round(ParameterSchedule().recalibration_renders * PRIOR_PROBABILITY)
     for seed in range(20):
         torch.manual_seed(seed)
         u = torch.rand(known)
