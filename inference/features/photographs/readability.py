@@ -186,8 +186,8 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
         because = f"{free.because}; {len(y)} labels confirm it (error {without:.2f} an image, {of_histogram})"
         return free._replace(by="labels", error=without, because=because)
     found = of_all[:, scope, rule]
-    unlike = _unlike(seen[:, scope, rule], found)
-    if _no_worse(error, score, histogram) and unlike is None:
+    differ = unlike(seen[:, scope, rule], found)
+    if _no_worse(error, score, histogram) and differ is None:
         because = (
             f"readable by {len(y)} labels, {found.mean():.1f} an image by {RULES[rule]}, of objects from "
             f"{SCOPES[scope].pixels:.0f} pixels visible by {SCOPES[scope].visible:g} ({figures})"
@@ -213,8 +213,8 @@ def with_labels(read: Read, c: int, labels: Tensor) -> Reading:
         return free._replace(error=error, because=because)
     steps = _steps(of_all[:, scope, 0], y)
     why = f"no rule reads them better ({figures})"
-    if unlike is not None:
-        here, there = unlike
+    if differ is not None:
+        here, there = differ
         why = f"the best rule reads {here:.1f} in these images and {there:.1f} in the others; label some of those"
     because = f"the histogram of {len(y)} labels is learnt, {mean:.1f} an image: {why}"
     return free._replace(
@@ -234,17 +234,6 @@ def _no_worse(error: float, score: float, histogram: float) -> bool:
     return error <= ERROR_RATIO * histogram + ERROR_SLACK and score <= histogram + TIE_SLACK
 
 
-def _unlike(labelled: Array, photographs: Array) -> tuple[float, float] | None:
-    """The mean of what is read in the labelled photographs and in the others, where these differ beyond chance."""
-    number = len(photographs) - len(labelled)
-    if not number:
-        return None
-    mean = (photographs.sum() - labelled.sum()) / number
-    square = ((photographs**2).sum() - (labelled**2).sum()) / number
-    error = math.sqrt(labelled.var(ddof=1) / len(labelled) + max(0.0, square - mean**2) / number)
-    return (labelled.mean(), mean) if abs(labelled.mean() - mean) > MAX_BIAS * error else None
-
-
 def _choose(seen: Array, labels: Array, drawn: Array, first: int) -> tuple[int, int]:
     """The scope, from the ``first`` on, and the rule with the least error on labelled images ``(K, S, R)`` and on
     renders ``(S, R)``; of scopes that do about as well the earliest, which asks least of where objects stand."""
@@ -256,6 +245,17 @@ def _choose(seen: Array, labels: Array, drawn: Array, first: int) -> tuple[int, 
 def _errors(read: Array, true: Array) -> Array:
     """Mean absolute error and Wasserstein-1 distance of counts ``(N, S, R)``, ``(S, R)``."""
     return np.abs(read - true).mean(0) + np.abs(np.sort(read, 0) - np.sort(true, 0)).mean(0)
+
+
+def unlike(labelled: Array, photographs: Array) -> tuple[float, float] | None:
+    """The mean of what is read in the labelled photographs and in the others, where these differ beyond chance."""
+    number = len(photographs) - len(labelled)
+    if not number:
+        return None
+    mean = (photographs.sum() - labelled.sum()) / number
+    # The variance of all: of a rare class, few that show none have next to none of their own.
+    error = photographs.std(ddof=1) * math.sqrt(1 / len(labelled) + 1 / number)
+    return (labelled.mean(), mean) if abs(labelled.mean() - mean) > MAX_BIAS * error else None
 
 
 def histogram_scores(labels: Array) -> Array:

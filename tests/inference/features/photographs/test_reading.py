@@ -17,6 +17,7 @@ from probscene.inference.features.photographs.readability import (
     rules_for_renders,
     scopes_without_labels,
     scores,
+    unlike,
     with_labels,
     without_labels,
 )
@@ -265,3 +266,20 @@ def test_labels_that_choose_nothing_are_said(labels):
     read = made(COUNTS[: len(labels)], COUNTS)
     found = with_labels(read, 0, labels)
     assert found.by == "agreement" and found.because != without_labels(read, 0).because
+
+
+@pytest.mark.parametrize(("number", "share"), [(10, 0.1), (20, 0.2), (20, 1.0)])
+def test_labelled_photographs_drawn_at_random_are_seldom_unlike_the_others(number, share):
+    """In about the 5 % that two standard errors are for, of a rare class as well; few that show none vary little."""
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(3.0, 300) * (rng.uniform(size=300) < share) + rng.uniform(0, 0.1, 300)
+    draws = [unlike(rng.choice(counts, number, replace=False), counts) for _ in range(2000)]
+    assert sum(draw is not None for draw in draws) <= 0.06 * len(draws)
+
+
+def test_photographs_of_another_place_are_unlike():
+    rng = np.random.default_rng(0)
+    here, there = rng.poisson(1.0, 20).astype(float), rng.poisson(3.0, 280).astype(float)
+    found = unlike(here, np.concatenate([here, there]))
+    assert found is not None and found == pytest.approx((here.mean(), there.mean()))
+    assert unlike(here, here) is None
