@@ -51,8 +51,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
         if labelled is not None and labelled.boxes is not None and found.by != "agreement":
             smallest = _smallest(net, labelled.boxes, labelled.classes.index(name))
             pixels = min(smallest, SCOPES[found.scope].pixels)  # the smallest of few is larger than that of all
-            because = f"{found.because}; of scenes, objects from {pixels:.0f} pixels count, as they are labelled"
-            found = found._replace(because=because)
+            found = found._replace(because=f"{found.because}; in scenes, objects count from {pixels:.0f} pixels")
         net.labelled_pixels[c] = pixels
         _keep(net, c, found)
         records[name] = _record(net, c, found)

@@ -268,7 +268,7 @@ def test_the_smallest_box_says_what_is_counted(learnt, draw_twice):
         found = adapt(net, Boxed(drawn.image, labelled), 500, lambda *_: None)["classes"][net.classes[0]]
         expected = 4.0 if side == 4 else SCOPES[int(net.scope[0])].pixels
         assert found["by"] != "agreement" and float(net.labelled_pixels[0]) == pytest.approx(expected)
-        assert found["from_pixels"] == pytest.approx(expected) and "as they are labelled" in found["because"]
+        assert found["from_pixels"] == pytest.approx(expected) and "in scenes, objects count from" in found["because"]
     for unknown in (labelled._replace(boxes=None), labelled._replace(counts=counts[:3], images=drawn.image[:3])):
         adapt(net, Boxed(drawn.image, unknown), 500, lambda *_: None)
         assert net.labelled_pixels.isnan().all()
