@@ -47,7 +47,7 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
             found = with_labels(read, c, counts[name])
         else:
             found = without_labels(read, c)
-        pixels = math.nan
+        pixels = math.inf
         if labelled is not None and labelled.boxes is not None and found.by != "agreement":
             smallest = _smallest(net, labelled.boxes, labelled.classes.index(name))
             pixels = min(smallest, SCOPES[found.scope].pixels)  # the smallest of few is larger than that of all
@@ -91,7 +91,7 @@ def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:
 def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:
     """For JSON."""
     scope, pixels = SCOPES[found.scope], float(net.labelled_pixels[c])
-    by_scope = math.isnan(pixels)
+    by_scope = math.isinf(pixels)
     return {
         "readable": found.readable,
         "because": found.because,

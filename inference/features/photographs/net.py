@@ -118,7 +118,7 @@ class PretrainedCountNet(nn.Module):
         rules: ``(2, C, R)`` bool, of ``RULES``, by whose median renders and photographs are read.
         scope: ``(C,)`` of ``SCOPES``.
         labelled_pixels: ``(C,)``, where a class is read as people label it and they drew boxes, the longer side of the
-            objects that they label, at least, pixels of what enters; NaN of others.
+            objects that they label, at least, pixels of what enters; infinite for others.
         apart: ``(S, R, C)``, how far heads were apart in those images before they learnt from them, see
             ``readability.disagreement``; infinite where they did not.
         steps: ``(C, MAX_COUNT)``, see ``readability.by_steps``; infinite for none.
@@ -165,7 +165,7 @@ class PretrainedCountNet(nn.Module):
         self.register_buffer("taught_by", torch.zeros(32, dtype=torch.uint8))
         self.register_buffer("rules", torch.ones(2, C, len(RULES), dtype=torch.bool))
         self.register_buffer("scope", torch.zeros(C, dtype=torch.int64))
-        self.register_buffer("labelled_pixels", torch.full((C,), math.nan))
+        self.register_buffer("labelled_pixels", torch.full((C,), math.inf))
         self.register_buffer("apart", torch.full((len(SCOPES), len(RULES), C), math.inf))
         self.register_buffer("steps", torch.full((C, MAX_COUNT), math.inf))
         self.register_buffer("read", torch.ones(len(self.names), dtype=torch.bool))
@@ -350,7 +350,7 @@ class PretrainedCountNet(nn.Module):
 
     def embed_from_labels(self, drawn: Examples) -> Tensor:
         """``(N, D)`` features of renders by their labels. What is read as people label it counts what they would."""
-        C, by_scope = torch.arange(len(self.scope)), self.labelled_pixels.isnan()
+        C, by_scope = torch.arange(len(self.scope)), self.labelled_pixels.isinf()
         boxed = self._spans(drawn).unsqueeze(-1) >= self.labelled_pixels
         boxed &= (drawn.visible >= MIN_VISIBLE).unsqueeze(-1) & (drawn.label.unsqueeze(-1) == C)
         return self._features(self.true_counts(drawn)[:, self.scope, C].where(by_scope, boxed.sum(1)))
