@@ -241,7 +241,7 @@ def test_scenes_count_what_people_box(dots, draw_twice):
     assert (net.embed_from_labels(drawn) * net.unit).tolist() == [[1, 0]]
 
 
-class Boxed(NamedTuple):
+class LabelledPhotographs(NamedTuple):
     """``Photographs`` of which some are labelled."""
 
     images: torch.Tensor
@@ -265,12 +265,12 @@ def test_the_smallest_box_says_what_is_counted(learnt, draw_twice):
         small = torch.tensor([[0.0, 5.0, 5.0, 5.0 + side / net.scale()[0], 6.0]])
         large = [torch.cat([some[some[:, 0] == 1], small]) for some in boxes]
         labelled = Labelled(drawn.image, counts, net.classes, torch.arange(len(counts)), tuple(large))
-        found = adapt(net, Boxed(drawn.image, labelled), 500, lambda *_: None)["classes"][net.classes[0]]
+        found = adapt(net, LabelledPhotographs(drawn.image, labelled), 500, lambda *_: None)["classes"][net.classes[0]]
         expected = 4.0 if side == 4 else SCOPES[int(net.scope[0])].pixels
         assert found["by"] != "agreement" and float(net.labelled_pixels[0]) == pytest.approx(expected)
         assert found["from_pixels"] == pytest.approx(expected) and "in scenes, objects count from" in found["because"]
     for unknown in (labelled._replace(boxes=None), labelled._replace(counts=counts[:3], images=drawn.image[:3])):
-        adapt(net, Boxed(drawn.image, unknown), 500, lambda *_: None)
+        adapt(net, LabelledPhotographs(drawn.image, unknown), 500, lambda *_: None)
         assert net.labelled_pixels.isinf().all()
     net.load_state_dict(before)
 
