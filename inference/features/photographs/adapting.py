@@ -3,18 +3,18 @@
 Axis letters: L photographs, K labelled images, S scopes, R rules, C classes.
 """
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import ImageCallback, Photographs
-from .net import MIN_PIXELS, MIN_VISIBLE, PretrainedCountNet
+from .net import MIN_PIXELS, PretrainedCountNet
 from .readability import Read, Reading, rules_for_renders, with_labels, without_labels
 from .reading import RULES, SCOPES
 
 LOOKED_AT_ONCE = 64  # images
+MIN_VISIBLE = min(scope.visible for scope in SCOPES)  # of an object that people are taken to label
 
 
 def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback: ImageCallback) -> dict[str, Any]:
@@ -47,14 +47,14 @@ def adapt(net: PretrainedCountNet, photographs: Photographs, most: int, callback
             found = with_labels(read, c, counts[name])
         else:
             found = without_labels(read, c)
-        pixels = math.inf
+        visible, pixels = SCOPES[found.scope][:2]
         if labelled is not None and labelled.boxes is not None and found.by != "agreement":
             smallest = _smallest(net, labelled.boxes, labelled.classes.index(name))
-            pixels = min(smallest, SCOPES[found.scope].pixels)  # the smallest of few is larger than that of all
+            visible, pixels = MIN_VISIBLE, min(smallest, pixels)  # the smallest of few is larger than that of all
             found = found._replace(because=f"{found.because}; in scenes, objects count from {pixels:.0f} pixels")
-        net.labelled_pixels[c] = pixels
+        net.counted_from[c] = torch.tensor([visible, pixels])
         _keep(net, c, found)
-        records[name] = _record(net, c, found)
+        records[name] = _record(net, c, found) | {"visible": visible, "from_pixels": pixels}
     net.bind(photographs.fingerprint)
     return {"classes": records}
 
@@ -89,16 +89,12 @@ def _keep(net: PretrainedCountNet, c: int, found: Reading) -> None:
 
 
 def _record(net: PretrainedCountNet, c: int, found: Reading) -> dict[str, Any]:
-    """For JSON."""
-    scope, pixels = SCOPES[found.scope], float(net.labelled_pixels[c])
-    by_scope = math.isinf(pixels)
+    """For JSON, but for what counts in scenes."""
     return {
         "readable": found.readable,
         "because": found.because,
         "by": found.by,
         "rules": [str(RULES[rule]) for rule in found.rules],
-        "visible": scope.visible if by_scope else MIN_VISIBLE,
-        "from_pixels": scope.pixels if by_scope else pixels,
         "mean": found.mean,
         "disagreement": found.disagreement,
         "spread": found.spread,

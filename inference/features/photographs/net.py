@@ -34,7 +34,6 @@ from .readability import rules_for_renders, scopes_without_labels
 from .reading import RULES, SCOPES, Rule, Scope, by_steps, read_all, read_each, whole
 
 SIZES = 224, 342  # least and largest square whose area images enter with; a frame of 621 x 188 enters as 608 x 192
-MIN_VISIBLE = min(scope.visible for scope in SCOPES)  # of an object that people are taken to label
 MIN_PIXELS = min(scope.pixels for scope in SCOPES)  # pixels of what enters; what is smaller is not counted
 MIN_SPREAD, MIN_UNIT = 0.3, 0.3  # objects
 HEADS = 4  # of each kind
@@ -117,8 +116,8 @@ class PretrainedCountNet(nn.Module):
         taught_by: fingerprint of the images that heads and rules are suited to, ``(32,)`` uint8; zeros for none.
         rules: ``(2, C, R)`` bool, of ``RULES``, by whose median renders and photographs are read.
         scope: ``(C,)`` of ``SCOPES``.
-        labelled_pixels: ``(C,)``, where a class is read as people label it and they drew boxes, the longer side of the
-            objects that they label, at least, pixels of what enters; infinite for others.
+        counted_from: ``(C, 2)``, from which visible share and which longer side, pixels of what enters, objects of
+            scenes count: those of the scope, or of what people label where a class is read as they label it.
         apart: ``(S, R, C)``, how far heads were apart in those images before they learnt from them, see
             ``readability.disagreement``; infinite where they did not.
         steps: ``(C, MAX_COUNT)``, see ``readability.by_steps``; infinite for none.
@@ -133,7 +132,7 @@ class PretrainedCountNet(nn.Module):
     taught_by: Tensor
     rules: Tensor
     scope: Tensor
-    labelled_pixels: Tensor
+    counted_from: Tensor
     apart: Tensor
     steps: Tensor
     read: Tensor
@@ -165,7 +164,7 @@ class PretrainedCountNet(nn.Module):
         self.register_buffer("taught_by", torch.zeros(32, dtype=torch.uint8))
         self.register_buffer("rules", torch.ones(2, C, len(RULES), dtype=torch.bool))
         self.register_buffer("scope", torch.zeros(C, dtype=torch.int64))
-        self.register_buffer("labelled_pixels", torch.full((C,), math.inf))
+        self.register_buffer("counted_from", torch.tensor([SCOPES[0][:2]] * C))
         self.register_buffer("apart", torch.full((len(SCOPES), len(RULES), C), math.inf))
         self.register_buffer("steps", torch.full((C, MAX_COUNT), math.inf))
         self.register_buffer("read", torch.ones(len(self.names), dtype=torch.bool))
@@ -247,6 +246,7 @@ class PretrainedCountNet(nn.Module):
         self.held_true.copy_(true)
         self.size.copy_(sizes)
         self.scope.copy_(scopes_without_labels(true))
+        self.counted_from.copy_(torch.tensor([SCOPES[s][:2] for s in self.scope.tolist()]))
         C = torch.arange(len(self.scope))
         of_scope = true[:, self.scope, C]
         self.rules.copy_(rules_for_renders(read[:, self.scope, :, C].transpose(0, 1), of_scope).expand(2, -1, -1))
@@ -268,7 +268,7 @@ class PretrainedCountNet(nn.Module):
         Args:
             drawn: their labels.
         """
-        small = self._spans(drawn) < scope.pixels
+        small = self.spans(drawn) < scope.pixels
         return drawn.label.masked_fill((drawn.visible < scope.visible) | small, -1)
 
     def true_counts(self, drawn: Examples) -> Tensor:
@@ -349,13 +349,13 @@ class PretrainedCountNet(nn.Module):
         return torch.cat(out)
 
     def embed_from_labels(self, drawn: Examples) -> Tensor:
-        """``(N, D)`` features of renders by their labels. What is read as people label it counts what they would."""
-        C, by_scope = torch.arange(len(self.scope)), self.labelled_pixels.isinf()
-        boxed = self._spans(drawn).unsqueeze(-1) >= self.labelled_pixels
-        boxed &= (drawn.visible >= MIN_VISIBLE).unsqueeze(-1) & (drawn.label.unsqueeze(-1) == C)
-        return self._features(self.true_counts(drawn)[:, self.scope, C].where(by_scope, boxed.sum(1)))
+        """``(N, D)`` features of renders by their labels."""
+        visible, pixels = self.counted_from.unbind(1)
+        counted = (drawn.visible.unsqueeze(-1) >= visible) & (self.spans(drawn).unsqueeze(-1) >= pixels)
+        counted &= drawn.label.unsqueeze(-1) == torch.arange(len(self.classes))
+        return self._features(counted.sum(1).float())
 
-    def _spans(self, drawn: Examples) -> Tensor:
+    def spans(self, drawn: Examples) -> Tensor:
         """``(N, M)`` the longer side of renders' objects, pixels of what enters."""
         return (drawn.size * self.scale()).amax(-1)
 

@@ -148,7 +148,7 @@ class PretrainedCountTraining(TrainingLoop):
             parts.append([*(some.half().cpu() for some in maps), *targets, self.net.true_counts(drawn)])
             shown = drawn.label.masked_fill(drawn.visible < SCOPES[SMALL].visible, -1)
             for c, of_class in enumerate(sizes):
-                of_class.append((drawn.size * self.net.scale()).amax(-1)[shown == c])
+                of_class.append(self.net.spans(drawn)[shown == c])
             done += number
             if callback is not None:
                 callback(self, {"images": 2 * done, "of": self._images})

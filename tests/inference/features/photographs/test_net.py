@@ -158,12 +158,12 @@ def test_things_come_before_stuff_and_choose_the_unit(dots):
 
 def test_renders_are_known_by_their_labels(learnt, draw_twice):
     net = learnt[0].net
-    drawn, before = draw_twice(20), net.scope.clone()
-    net.scope.copy_(torch.tensor([1, 3]))
+    drawn, before = draw_twice(20), net.counted_from.clone()
+    net.counted_from.copy_(torch.tensor([SCOPES[s][:2] for s in (1, 3)]))
     some = [(drawn.label == c) & (drawn.visible >= SCOPES[s].visible) for c, s in enumerate([1, 3])]
     expected = torch.stack([each.sum(1) for each in some], 1) / net.unit
     assert net.uses_labels and torch.allclose(net.embed_from_labels(drawn._replace(image=torch.zeros(0))), expected)
-    net.scope.copy_(before)
+    net.counted_from.copy_(before)
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +237,7 @@ def test_scenes_count_what_people_box(dots, draw_twice):
         size=(torch.tensor([12.0, 9.0, 30.0, 12.0]) / net.scale()[0])[None, :, None].expand(-1, -1, 2),
     )  # fmt: skip
     assert (net.embed_from_labels(drawn) * net.unit).tolist() == [[0, 0]]
-    net.labelled_pixels[0] = 10
+    net.counted_from[0, 1] = 10
     assert (net.embed_from_labels(drawn) * net.unit).tolist() == [[1, 0]]
 
 
@@ -267,11 +267,11 @@ def test_the_smallest_box_says_what_is_counted(learnt, draw_twice):
         labelled = Labelled(drawn.image, counts, net.classes, torch.arange(len(counts)), tuple(large))
         found = adapt(net, LabelledPhotographs(drawn.image, labelled), 500, lambda *_: None)["classes"][net.classes[0]]
         expected = 4.0 if side == 4 else SCOPES[int(net.scope[0])].pixels
-        assert found["by"] != "agreement" and float(net.labelled_pixels[0]) == pytest.approx(expected)
+        assert found["by"] != "agreement" and float(net.counted_from[0, 1]) == pytest.approx(expected)
         assert found["from_pixels"] == pytest.approx(expected) and "in scenes, objects count from" in found["because"]
     for unknown in (labelled._replace(boxes=None), labelled._replace(counts=counts[:3], images=drawn.image[:3])):
         adapt(net, LabelledPhotographs(drawn.image, unknown), 500, lambda *_: None)
-        assert net.labelled_pixels.isinf().all()
+        assert net.counted_from.tolist() == [pytest.approx(SCOPES[s][:2]) for s in net.scope.tolist()]
     net.load_state_dict(before)
 
 
